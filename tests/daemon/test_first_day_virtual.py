@@ -90,10 +90,7 @@ class Day:
         self._outcomes: list[Any] = []
         self._next = 0
         self._programs = 0
-        for module in ("monstertruck_runtime.clock", "monstertruckd.tools.cli.connection"):
-            monkeypatch.setattr(f"{module}.run_wall", self._run)
-        for module in ("monstertruckd.tools.cli.output", "monstertruckd.tools.cli.usb"):
-            monkeypatch.setattr(f"{module}.run_wall", self._run)
+        monkeypatch.setattr("monstertruck_runtime.clock.run_wall", self._run)
         for module in ("monstertruck_runtime.client", "monstertruckd.tools.status.watch"):
             monkeypatch.setattr(f"{module}.TruckClient", self._client)
         monkeypatch.setattr("monstertruck_drivers.computer.Machine", rig.computer.usb.machine)
