@@ -55,8 +55,11 @@ LINKS: Final = 16
 GIVEN: Final = frozenset({topics.PATH.name, topics.GATE.name})
 """Not computed again, but read by the tracker."""
 ASKED: Final = frozenset(
-    topic.name for topic in (topics.GATE, topics.GROUND, topics.REQ_GOAL, topics.REQ_GOAL_CONTROL, topics.REQ_PATH)
-)
+    topic.name
+    for topic in (
+        topics.GATE, topics.SEEN, topics.GROUND, topics.REQ_GOAL, topics.REQ_GOAL_CONTROL, topics.REQ_PATH,
+    )
+)  # fmt: skip
 """Not computed again, but read by planner and tracker where the robot drives to goals, whose paths are computed. Ground
 and goals have their turns at the same instants, in either order."""
 
