@@ -311,3 +311,17 @@ def test_the_drives_ports_are_cut_once_when_neither_quick_stop_nor_power_off_hel
     assert [action for _, action in cuts] == [DriveAction.DISABLE]
     assert bench.boxes.count(Reason.UNCOMMANDED_MOTION) == 3
     assert not bench.out.steering.last.deadman
+
+
+def test_the_ground_that_was_seen_is_published_about_once_a_second():
+    async def scenario(bench):
+        await bench.clock.sleep(3.5)
+        seen = bench.out.seen.messages
+        assert 2 <= len(seen) <= 4
+        newest = seen[-1]
+        assert (newest.frame, newest.width, newest.height) == ("base", 64, 64)
+        assert newest.resolution * newest.width / 2 == -newest.origin.x == -newest.origin.y
+        assert newest.cells.reshape(64, 64)[32, 32] >= 0, "under the body"
+        assert (newest.cells < 0).any(), "behind it"
+
+    on_bench(scenario)
