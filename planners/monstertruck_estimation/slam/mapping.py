@@ -26,6 +26,7 @@ from monstertruck_estimation.slam.relocation import (
     Relocation,
     contradicts,
     exceeds,
+    led_there,
     prediction_is_certain,
 )
 from monstertruck_estimation.slam.scan_matcher import (
@@ -150,7 +151,9 @@ class Mapper:
             match = self._matched(scan, delta, noise)
         self._since_key = _moved(*self._since_key, delta, noise)
         if self._submap is not None:
-            self._loss.take(match)
+            led = self._motion.by_wheels(delta)
+            driven = math.hypot(delta[0], delta[1]) / self.config.key_distance
+            self._loss.take(match, (driven, self._key_share(delta)) if led else (0.0, 0.0))
         trusted = not self._motion.check.contradicted
         self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
         if trusted and self._motion.check.contradicted:
@@ -195,6 +198,9 @@ class Mapper:
             return rejected(guess, covariance, MatchStatus.EMPTY)
         match = self._front.match(scan, delta, guess, covariance, self._submap)
         suspect, after_gap = self._loss.suspects(match, guess, covariance), self._loss.after_gap and match.accepted
+        if after_gap and not suspect and self._motion.by_wheels(delta) and led_there(match, guess, covariance):
+            self._loss.resolve()
+            return match
         most = PART_CONTRADICTION if suspect else CONTRADICTION
         if match.accepted and (off := self._motion.off(between(self._pose, match.pose))):
             if exceeds(off, OFF_MOTION):
@@ -246,8 +252,12 @@ class Mapper:
 
     def _has_moved(self, pose: Array) -> bool:
         """Whether ``pose``, shape (3,), is as far from the newest keyframe as the next one."""
-        moved = between(self.map.poses[-1], pose)
-        return math.hypot(moved[0], moved[1]) >= self.config.key_distance or abs(moved[2]) >= self.config.key_turn
+        return self._key_share(between(self.map.poses[-1], pose)) >= 1.0
+
+    def _key_share(self, moved: Array) -> float:
+        """The motion ``moved``, shape (3,), as a share of that between keyframes."""
+        way, turned = math.hypot(moved[0], moved[1]), abs(float(moved[2]))
+        return max(way / self.config.key_distance, turned / self.config.key_turn)
 
     def _is_elsewhere(self, scan: Scan) -> bool:
         """Whether a lost robot is not where its motion since the last fit led it."""

@@ -270,6 +270,10 @@ class MotionPredictor:
             return (self._by_motion,)
         return (self._by_motion, self._by_odometry) if any(self.check.kept) else (self._by_odometry,)
 
+    def by_wheels(self, delta: Array) -> bool:
+        """Whether the motion ``delta``, shape (3,), is that by odometry, and nothing contradicts it."""
+        return self.use is OdometryUse.USED and self._by_odometry is not None and delta is self._by_odometry[0]
+
     @property
     def odom(self) -> Array | None:
         """Newest pose of base in odom."""

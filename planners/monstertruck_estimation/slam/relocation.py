@@ -34,6 +34,9 @@ LOST_SCANS: Final = 3
 """Number of scans that do not fit after which the robot is lost."""
 GAP: Final = (5.0, 3.0)
 """A longer pause, s, that is also so many times the usual one, is a gap: the robot may be elsewhere after it."""
+LOST_PATH: Final = 7.0
+"""Distance by wheels that agree with sparse scans, as a multiple of that between keyframes, after which the robot is
+lost: three such scans, or a turn among people, are no more than three looks at a crowd."""
 PERIOD_GAIN: Final = 0.1
 """Weight of one period in the usual one."""
 
@@ -53,6 +56,7 @@ class LossDetector:
         self._period = 0.0
         self._usual = 0.0
         self._misfits = 0
+        self._spacing, self._path = 0.0, 0.0
         self.after_gap = False
         """No scan has fitted since a gap."""
 
@@ -80,7 +84,9 @@ class LossDetector:
     def lost(self) -> bool:
         """Whether scans have not fitted for ``LOST_AFTER``."""
         since = (self._stamp or 0) - self.fitted
-        return self._misfits >= LOST_SCANS and since >= LOST_AFTER * SECOND
+        sparse = self._spacing >= 1.0 and not self.after_gap
+        far = not sparse or self._path >= LOST_PATH
+        return self._misfits >= LOST_SCANS and since >= LOST_AFTER * SECOND and far
 
     def arrive(self, stamp: int) -> None:
         """A scan of ``stamp``, ns, is there, and will be matched."""
@@ -90,8 +96,16 @@ class LossDetector:
             self._period += (dt - self._period) * (PERIOD_GAIN if self._period else 1.0)
         self._stamp = stamp
 
-    def take(self, match: ScanMatch) -> None:
-        """Take the match of the scan that arrived."""
+    def take(self, match: ScanMatch, moved: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Take the match of the scan that arrived.
+
+        Args:
+            match: the match.
+            moved: distance, and motion, since the scan before by wheels that agree with the scans, as multiples of
+                those between keyframes; 0 without such wheels.
+        """
+        self._path += moved[0]
+        self._spacing += (moved[1] - self._spacing) * PERIOD_GAIN
         doubt = self._misfits or self.after_gap
         least = max(LOW_OVERLAP, self._usual - OVERLAP_DROP) if doubt else LOW_OVERLAP
         if not match.accepted or match.overlap < least or (self.after_gap and match.degenerate):
@@ -100,9 +114,14 @@ class LossDetector:
         self._usual += (match.overlap - self._usual) * (OVERLAP_GAIN if self._usual else 1.0)
         self.restart()
 
+    def resolve(self) -> None:
+        """The newest match is where the wheels led over the gap."""
+        self._misfits, self.after_gap, self._path = 0, False, 0.0
+
     def restart(self) -> None:
         """The newest scan fits, for it is part of the map."""
         self._misfits, self.after_gap, self.fitted = 0, False, self._stamp or 0
+        self._path = 0.0
 
 
 CERTAIN_PREDICTION: Final = (0.5, 0.5)
@@ -116,6 +135,22 @@ def prediction_is_certain(covariance: Array) -> bool:
     """
     place, turn = deviations(covariance)
     return place <= CERTAIN_PREDICTION[0] and turn <= CERTAIN_PREDICTION[1]
+
+
+LED: Final = 1.5
+"""Standard deviations from the predicted pose up to which a match is where the wheels led: of a robot that was carried
+one in fifteen is so near, anywhere in the window of three on each axis."""
+
+
+def led_there(match: ScanMatch, guess: Array, covariance: Array) -> bool:
+    """Whether ``match`` is where wheels led over a gap: ``guess``, shape (3,), of ``covariance``, shape (3, 3).
+
+    They must know the position; a turn over the gap may have made the yaw uncertain, which the scan shows.
+    """
+    off = match.pose - guess
+    off[2] = math.remainder(off[2], math.tau)
+    near = float(off @ np.linalg.solve(covariance, off)) <= LED**2
+    return near and deviations(covariance)[0] <= CERTAIN_PREDICTION[0]
 
 
 OFF_MOTION: Final = (0.5, 1.0)

@@ -1,5 +1,7 @@
 """A robot that is carried while it maps: lost, a submap of its own, joined to the map by a verified closure."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from monstertruck_estimation.slam.closure import LoopCloser, opposed
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.mapping import UNKNOWN, Mapper, MappingEvent
-from monstertruck_estimation.slam.relocation import LossDetector, Relocation, contradicts
+from monstertruck_estimation.slam.relocation import LOST_PATH, LossDetector, Relocation, contradicts, led_there
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch, rejected
 from monstertruck_estimation.slam.storage import saved_graph
 from tests.unit.estimation.slam.kit import HALL, WAY, box, drifting, errors, extend, rounds, scan, submaps
@@ -65,8 +67,10 @@ def test_after_a_gap_a_room_of_the_same_outline_is_another_if_it_looks_through_t
     way = np.linspace((-1.4, 0.0, 0.0), (0.2, 0.0, 0.0), 60)
     for k, pose in enumerate(way):
         mapper.step(scan([*outline, *cupboards], pose, noise=0.01, rng=rng), int(k * 1e8), pose)
+    # Not to a centimetre where it was: wheels that stood would say that it is still there.
+    put_down = compose(way[-1], np.array((0.05, -0.05, 0.1)))
     steps = [
-        mapper.step(scan(outline, way[-1], noise=0.01, rng=rng), int((60 + k / 10) * SECOND), way[-1])
+        mapper.step(scan(outline, put_down, noise=0.01, rng=rng), int((60 + k / 10) * SECOND), way[-1])
         for k in range(30)
     ]
     assert not any(step.match.accepted for step in steps[:2])
@@ -210,6 +214,31 @@ def test_single_misfits_are_no_loss():
     assert watched([fit(0.95), NONE, NONE, fit(0.9)]).fits
     assert not watched([*[fit(0.95)] * 5, *[NONE] * 12]).lost
     assert watched([*[fit(0.95)] * 5, *[NONE] * 20]).lost
+
+
+def test_sparse_scans_that_do_not_fit_are_judged_along_the_path():
+    loss = LossDetector()
+    for k in range(40):
+        loss.arrive(2 * (k + 1) * SECOND)
+        loss.take(fit(0.95) if k < 30 else NONE, (0.5, 1.6))
+        assert loss.lost is (k >= 30 and 0.5 * (k - 29) >= LOST_PATH)
+    for _ in range(5):
+        loss.take(NONE, (0.5, 1.6))
+    assert loss.lost
+
+
+@pytest.mark.parametrize(
+    ("off", "deviation", "led"),
+    [
+        pytest.param((0.05, 0.0, 0.5), (0.1, 0.6), True, id="the yaw alone is uncertain"),
+        pytest.param((0.2, 0.0, 0.0), (0.1, 0.1), False, id="beside the prediction"),
+        pytest.param((0.2, 0.0, 0.0), (0.8, 0.1), False, id="the place is uncertain"),
+    ],
+)
+def test_over_a_gap_wheels_lead_to_a_match_within_their_deviation(off, deviation, led):
+    covariance = np.diag(np.square((deviation[0], *deviation)))
+    match = dataclasses.replace(fit(0.5), pose=np.array(off))
+    assert led_there(match, np.zeros(3), covariance) is led
 
 
 def test_after_a_misfit_a_half_fit_is_none():
