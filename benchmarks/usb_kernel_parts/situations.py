@@ -341,6 +341,7 @@ async def hub_pulled() -> dict[str, Any]:
     robot = Robot()
     async with servo_controller(), robot.running():
         await until(lambda: robot.ready("drive"), 60)
+        lower, upper = sorted(str(tty_of(by_serial(f"SN{name}"))) for name in ("s1", "s2"))
         for name in ("s1", "s2", "h1"):
             await ask("device_del", id=name)
         await until(lambda: Reason.HUB_LOST in robot.events.reasons, 20)
@@ -352,7 +353,7 @@ async def hub_pulled() -> dict[str, Any]:
             await until(lambda port=port: tty_of(f"1-{port}") is not None, 20)
         back = await until(lambda: Reason.HUB_RETURNED in robot.events.reasons and robot.ready("drive"), RETURN)
     nodes = {name: str(tty_of(by_serial(f"SN{name}"))) for name in ("s1", "s2")}
-    return {"ok": nodes == {"s1": "/dev/ttyUSB1", "s2": "/dev/ttyUSB0"}, "back_s": back, "nodes": nodes}
+    return {"ok": nodes == {"s1": upper, "s2": lower}, "back_s": back, "nodes": nodes}
 
 
 async def unplugged_in_mid_write() -> dict[str, Any]:
