@@ -462,6 +462,9 @@ class RunawayCheck(Check):
             self._step = max(self._step, Escalation.QUICK_STOP)
 
     def _pulled(self, now: int) -> bool:
+        """Whether a motor may be what moves the body: one that falls over or slides down is moved by its weight."""
+        if self.view.samples.tilt >= self.view.config.tilt.stop:
+            return False
         fresh = bool(self.view.samples.shaft_speeds(now))
         return any(watch.pulls(self._config, fresh=fresh) for watch in self._shafts)
 

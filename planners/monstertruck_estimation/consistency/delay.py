@@ -4,7 +4,8 @@ The places by the scans (distance and yaw since the first one) are compared with
 earlier. What both may be wrong by is the covariance of their difference: ``Errors`` give the scale, slip that changes
 along the way, each place, a constant bend and drift; the registration gives its deviations; the offset is unknown.
 So only motion that changes tells lags apart, as much as its change stands out of these errors. A lag is found where
-the best one beyond the tolerated explains the scans so much better than all tolerated ones that chance does not.
+the best one beyond the tolerated explains the scans so much better than all tolerated ones, and than the longest that
+is tried, that chance does not: the scans have shown the change, and late.
 """
 
 import math
@@ -20,10 +21,11 @@ from monstertruck_runtime.clock import SECOND
 
 SHIFT: Final = SECOND // 10
 """Step of the lags that are tried, ns."""
-LONGEST: Final = 12
+LONGEST: Final = 16
 """Greatest lag that is tried, in ``SHIFT``."""
 SIGMAS: Final = 5.0
-"""Standard deviations by which all tolerated lags must be rejected: chance does it once in 3 million looks."""
+"""Standard deviations by which all tolerated lags and the longest must be rejected: chance does it once in 3 million
+looks."""
 GREATEST: Final = 2.0
 """Greatest errors of a measure that works, in standard deviations."""
 FEWEST: Final = 12
@@ -67,7 +69,7 @@ class Delay(NamedTuple):
 
     seconds: float
     sigmas: float
-    """By which all tolerated lags are rejected."""
+    """By which all tolerated lags and the longest are rejected."""
 
 
 def lag_question(steps: list[ScanStep], others: list[tuple[Errors, MotionTrack]], tolerated: float) -> LagQuestion:
@@ -102,7 +104,9 @@ def scan_delay(question: LagQuestion) -> Delay | None:
         return None
     # Errors that are greater than stated everywhere make every difference less certain.
     inflation = max(1.0, float(squares[best]) / places)
-    sigmas = math.sqrt(float(cost[:allowed].min() - cost[best]) / inflation)
+    # What the scans have not shown up to the longest lag, they may never show: the other measure may be wrong.
+    rejected = min(cost[:allowed].min(), cost[LONGEST]) - cost[best]
+    sigmas = math.sqrt(float(rejected) / inflation)
     return Delay(best * SHIFT / SECOND, sigmas) if sigmas >= SIGMAS else None
 
 

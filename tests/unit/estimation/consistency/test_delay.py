@@ -90,3 +90,17 @@ def test_measures_that_contradict_each_other_find_none():
     others = [(ERRORS[measure], track) for measure, track in tracks.items()]
     assert scan_delay(lag_question(steps[-NEWEST:], others[:1], 0.2)) is not None
     assert scan_delay(lag_question(steps[-NEWEST:], others, 0.2)) is None
+
+
+def test_a_change_that_the_scans_do_not_show_is_no_delay():
+    """Stuck encoders claim a turn that never comes: it may be the other measure that is wrong."""
+
+    def jumping(at):
+        return 0.2 * at, max(0.0, at - 11.4)
+
+    track, steps = MotionTrack(), []
+    for k in range(120):
+        now, before = jumping(k / 10), jumping((k - 1) / 10)
+        track.add(SECOND + k * STEP, (now[0] - before[0], 0.0, now[1] - before[1]))
+        steps.append(ScanStep(SECOND + (k - 1) * STEP, SECOND + k * STEP, (0.02, 0.0), (0.01, 0.003)))
+    assert scan_delay(lag_question(steps[-NEWEST:], [(ERRORS[Measure.ENCODERS], track)], 0.2)) is None
