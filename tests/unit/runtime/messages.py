@@ -141,6 +141,7 @@ PROTOBUF: dict[t.Topic[Any], st.SearchStrategy[Message]] = {
     t.PATH: paths,
     t.MAP: grids,
     t.MAP_TILES: grids,
+    t.SEEN: grids,
     t.GROUND: grounds,
     t.TRANSFORMS: trees,
     t.LOG: st.builds(LogRecord, **header, level=st.sampled_from(LogLevel), line=st.integers(0, 2**32 - 1)),
