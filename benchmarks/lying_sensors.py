@@ -41,10 +41,10 @@ from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.exchange import StepInput
 from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
 from monstertruck_estimation.consistency.scan_odometry import ScanMotionStep
-from monstertruck_estimation.se2 import between
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_estimation.wheel_motion import WheelIncrement
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import fifo

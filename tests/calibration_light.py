@@ -13,7 +13,8 @@ from monstertruck_drivers.srf08.config import Srf08Config
 from monstertruck_estimation.vision.board import BoardReader, BoardSighting
 from monstertruck_estimation.vision.lens import PARAMETERS, Lens, board_pose
 from monstertruck_kinematics.chassis import Dimensions, TruckChassis
-from monstertruck_kinematics.elementary import Array, integrate
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import integrate
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_kinematics.unsteered import SkidSteer
 from monstertruck_runtime.bodies import build_chassis

@@ -12,8 +12,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from monstertruck_kinematics.chassis import TruckChassis
-from monstertruck_kinematics.elementary import Array, to_body
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.polynomials import SERVO_LIMIT
+from monstertruck_kinematics.se2 import to_body
 from monstertruck_kinematics.truck import LinkedAxles
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import FREE, WorldMap

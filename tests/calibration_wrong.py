@@ -10,10 +10,9 @@ import numpy as np
 
 from monstertruck_drivers.ax12.config import Ax12Config
 from monstertruck_drivers.srf08.config import Srf08Config
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
 from monstertruck_estimation.vision.board import BoardReader
-from monstertruck_kinematics.elementary import integrate
+from monstertruck_kinematics.se2 import between, compose, integrate
 from monstertruck_kinematics.unsteered import SkidSteer
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.board import BoardConfig

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, label
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_planners.collision import DistanceField, Footprint
-from monstertruck_planners.goals.exchange import Pose
 from monstertruck_runtime.map_files import FREE, load_map
 from monstertruck_sim.world.raycast import Clearance, cast_rays, clearance
 
@@ -46,7 +46,7 @@ class Arena:
         field = DistanceField(blocked, resolution, (*origin, 0.0))
         return cls(name, resolution, origin, blocked, clearance(blocked), field)
 
-    def start(self, seed: int) -> Pose:
+    def start(self, seed: int) -> Pose2:
         """A random pose with room around in the largest part that the robot can drive in."""
         regions, _ = label(self._open())
         sizes = np.bincount(regions.ravel())
@@ -60,7 +60,7 @@ class Arena:
             if self.truth.free(BODY, pose, ROOM)[0]:
                 return float(x), float(y), float(pose[0, 2])
 
-    def reachable(self, start: Pose) -> tuple[Array, Array]:
+    def reachable(self, start: Pose2) -> tuple[Array, Array]:
         """Middles of the cells that the footprint can cover, x and y, m: flood-filled by the inscribed circle."""
         regions, _ = label(self._open())
         row, column = (
@@ -75,7 +75,7 @@ class Arena:
         away: NDArray[np.bool_] = distance_transform_edt(~self.blocked) * self.resolution > BODY.half_width + 0.02
         return away
 
-    def scan(self, pose: Pose, reach: float, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    def scan(self, pose: Pose2, reach: float, rng: np.random.Generator) -> tuple[Array, Array, Array]:
         """Sensor (2,), returns (n, 2) and ends of beams that met nothing (k, 2), all in map, with the maker's noise."""
         c, s = np.cos(pose[2]), np.sin(pose[2])
         sensor = np.array((pose[0] + c * MOUNT[0], pose[1] + s * MOUNT[0]))

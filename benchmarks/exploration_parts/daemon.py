@@ -19,9 +19,9 @@ from exploration_parts.arena import Arena
 from exploration_parts.rover import SHARES
 from monstertruck_estimation.slam.storage import load
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.explore.frontier import UNKNOWN, FrontierMap
-from monstertruck_planners.goals.exchange import Pose
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
@@ -58,7 +58,7 @@ class RunRecord:
     """Published maps, True, and tiles."""
     true: Array
     """See ``TruthLog``."""
-    start: Pose
+    start: Pose2
     pose_off: float
     """Metres between where it stands and where it believes to be."""
     off_share: float
@@ -76,7 +76,7 @@ class ExploringTruck:
         start: of the truck.
     """
 
-    def __init__(self, rig: VirtualRig, arena: Arena, start: Pose) -> None:
+    def __init__(self, rig: VirtualRig, arena: Arena, start: Pose2) -> None:
         self.rig, self.clock, self.arena, self.start = rig, rig.clock, arena, start
         self.operator = LocalOperator(rig.daemon, rig.clock)
         self.states = rig.bus.subscribe(topics.EXPLORE, latest())
@@ -89,7 +89,7 @@ class ExploringTruck:
         """When something happened, s."""
 
     @property
-    def here(self) -> Pose:
+    def here(self) -> Pose2:
         """Where the truck really is."""
         truth = self.rig.world.truth(self.clock.now())
         return truth.x, truth.y, truth.yaw

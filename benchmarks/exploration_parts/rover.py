@@ -15,14 +15,14 @@ from exploration_parts.arena import BARE, BODY, MOUNT, Arena
 from monstertruck_estimation.slam.config import GridConfig
 from monstertruck_estimation.slam.grid import OccupancyGrid, outline
 from monstertruck_estimation.slam.service import grid_message
+from monstertruck_kinematics.se2 import Pose2, placed, points_relative
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import placed, points_relative
 from monstertruck_planners.explore.config import AuthorConfig, ExplorerConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask, Viewpoint
 from monstertruck_planners.explore.exploration import LEFT, REMEMBERED, STUCK, TRAIL, Attempts
 from monstertruck_planners.explore.explore_step import ExploringStep
 from monstertruck_planners.goals.config import PlannerConfig
-from monstertruck_planners.goals.exchange import PlanTask, Pose, Setup
+from monstertruck_planners.goals.exchange import PlanTask, Setup
 from monstertruck_planners.goals.path_publisher import path_blocked
 from monstertruck_planners.goals.plan_step import PlanningStep
 from monstertruck_planners.route.api import Vehicle
@@ -76,10 +76,10 @@ class Rover:
     """
 
     def __init__(
-        self, arena: Arena, config: ExplorerConfig, seed: int, start: Pose | None = None, steering: Any = "4ws"
+        self, arena: Arena, config: ExplorerConfig, seed: int, start: Pose2 | None = None, steering: Any = "4ws"
     ) -> None:
         self.arena, self.config = arena, config
-        self.pose: Pose = arena.start(seed) if start is None else start
+        self.pose: Pose2 = arena.start(seed) if start is None else start
         self.home = self.pose
         self.rng = np.random.default_rng([11, seed])
         self.grid = OccupancyGrid(GridConfig())
@@ -99,13 +99,13 @@ class Rover:
         self.truth = np.column_stack((x, y))
         self.unseen = np.ones(len(x), np.bool_)
         self.attempts = self.unreached = Attempts(config.blacklist, config.attempts)
-        self.trail: list[Pose] = []
+        self.trail: list[Pose2] = []
         self.stuck, self.stuck_at = 0, self.pose
         self.blameless = self.attempts, self.unreached
         self.hits = np.empty((0, 2))
         """Of the newest scan, in the map; taken at this pose:"""
-        self.seen_from: Pose | None = None
-        self.scanned: Pose | None = None
+        self.seen_from: Pose2 | None = None
+        self.scanned: Pose2 | None = None
         self.sent: list[Grid | None] = [None, None]
 
     @property
@@ -169,7 +169,7 @@ class Rover:
         self.run.decisions.append(time.process_time() - begin)
         return answer.target
 
-    def route(self, goal: Pose, *, clear: bool = True) -> np.ndarray | None:
+    def route(self, goal: Pose2, *, clear: bool = True) -> np.ndarray | None:
         """Poses of a route."""
         if self.seen_from != self.pose:
             self.scan()

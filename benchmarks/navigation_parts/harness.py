@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import OCCUPIED, DistanceField, Footprint
 from monstertruck_planners.goals.config import PlannerConfig
-from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup
+from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Setup
 from monstertruck_planners.goals.goal_run import apart
 from monstertruck_planners.goals.plan_step import PlanningStep
 from monstertruck_planners.route.config import HybridConfig
@@ -76,7 +77,7 @@ BARE = Footprint(padding=0.0)
 CONFIG = LqrConfig(kind="lqr", goal_tolerance=0.01)
 
 
-def random_pose(where: Place, rng: np.random.Generator) -> Pose:
+def random_pose(where: Place, rng: np.random.Generator) -> Pose2:
     """A pose with some centimetres of room."""
     while True:
         x, y = rng.uniform(where.low, where.high)
@@ -85,7 +86,7 @@ def random_pose(where: Place, rng: np.random.Generator) -> Pose:
             return float(pose[0, 0]), float(pose[0, 1]), float(pose[0, 2])
 
 
-def drive(where: Place, answer: PlanAnswer, pose: Pose) -> tuple[Pose, bool, float]:
+def drive(where: Place, answer: PlanAnswer, pose: Pose2) -> tuple[Pose2, bool, float]:
     """Follow a route; returns the last pose, whether it collided, and the seconds it took."""
     assert answer.poses is not None
     assert answer.directions is not None

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from monstertruck_estimation.se2 import between, compose, transform
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.graph import optimise
 from monstertruck_estimation.slam.kiss_matcher import KissMatcher
 from monstertruck_estimation.slam.mapping import Mapper, MappingEvent
 from monstertruck_estimation.slam.scan_matcher import PlanarMatcher, ScanMatcher
 from monstertruck_estimation.slam.scans import prepare
+from monstertruck_kinematics.se2 import between, compose, transform
 from slam_parts.kiss_alone import KissOdometry
 from slam_parts.logs import Log, load, scored
 

@@ -13,8 +13,8 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter1d, label
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.scans import ScanGeometry
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, load_map
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_estimation.slam.worker import SlamWorker
 from monstertruck_estimation.slam.worker_io import ScanInput, Start, WorkerInput
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import OCCUPIED, load_map
 from monstertruck_sim.world.raycast import cast_rays, clearance

@@ -30,7 +30,6 @@ from kiss_icp.config import KISSConfig
 from kiss_icp.kiss_icp import KissICP
 
 from monstertruck_drivers.hokuyo_urg.recording import RecordedRanges
-from monstertruck_estimation.se2 import between, compose, interpolate, transform, wrap
 from monstertruck_estimation.slam.config import GridConfig, SlamConfig
 from monstertruck_estimation.slam.grid import OccupancyGrid
 from monstertruck_estimation.slam.mapping import MappingEstimator
@@ -38,6 +37,7 @@ from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.storage import load
 from monstertruck_estimation.slam.worker import matcher_of
 from monstertruck_estimation.slam.worker_io import ScanInput
+from monstertruck_kinematics.se2 import between, compose, interpolate, transform, wrap
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from monstertruck_estimation.se2 import between
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.grid import GridBuilder
 from monstertruck_estimation.slam.localisation import LocalisationEstimator, submap_of
@@ -23,6 +22,7 @@ from monstertruck_estimation.slam.registration import measure
 from monstertruck_estimation.slam.scans import prepare, prepare_input
 from monstertruck_estimation.slam.storage import SavedGraph, SavedMap, trinary
 from monstertruck_estimation.slam.worker_io import ScanInput, SlamEstimate
+from monstertruck_kinematics.se2 import between
 from monstertruck_schemas.health import LocalisationStatus
 from slam_parts.logs import Log, load
 

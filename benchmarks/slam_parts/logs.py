@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from monstertruck_estimation.se2 import between, interpolate
 from monstertruck_estimation.slam.scans import ScanGeometry
+from monstertruck_kinematics.se2 import between, interpolate
 from monstertruck_runtime.clock import SECOND
 from slam_parts import drawn
 

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from monstertruck_estimation.se2 import between
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.localisation import LocalisationEstimator, submap_of
 from monstertruck_estimation.slam.registration import measure
 from monstertruck_estimation.slam.scans import prepare, prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput
+from monstertruck_kinematics.se2 import between
 from slam_parts.localisation import PLACED, Mapped, error, mapped, truth
 from slam_parts.logs import load
 

@@ -19,7 +19,6 @@ from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig, OdometryEstimator
 from monstertruck_estimation.scan_tilt import AngleHistory, plane_slopes, plane_tilt
-from monstertruck_estimation.se2 import between, compose, interpolate, inverse
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.localisation import LocalisationEstimator
 from monstertruck_estimation.slam.mapping import Estimator, MappingEstimator
@@ -27,6 +26,7 @@ from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.storage import load, save
 from monstertruck_estimation.slam.worker_io import ScanIncrement, ScanInput, SlamEstimate
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, compose, interpolate, inverse
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.health import LocalisationStatus

@@ -14,7 +14,7 @@ from statistics import median
 from typing import Any, Final, NamedTuple
 
 from monstertruck_kinematics.chassis import STILL
-from monstertruck_kinematics.drive import Twist
+from monstertruck_kinematics.se2 import Twist2
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Measurement
@@ -83,7 +83,7 @@ class ContactCheck(Check):
     def __init__(self, view: GateView, config: ContactConfig) -> None:
         super().__init__(view)
         self._config = config
-        self._steady: Twist[float] = STILL
+        self._steady: Twist2 = STILL
         """Commanded motion."""
         self._reached: dict[int, int] = {}
         """Since when each shaft has had its commanded speed, ns."""

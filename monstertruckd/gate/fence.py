@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import UnitTwist, placed, swept_poses
+from monstertruck_kinematics.se2 import placed
+from monstertruck_planners.collision import UnitTwist, swept_poses
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Measurement

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 from monstertruck_kinematics.chassis import STILL, Speeds
-from monstertruck_kinematics.drive import Twist
+from monstertruck_kinematics.se2 import Twist2
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest
 from monstertruckd.gate.approach import stopping
@@ -22,7 +22,7 @@ class Aim(NamedTuple):
     """The motion that is asked for at a tick, as far as the steering allows it by now."""
 
     target: Target
-    wanted: Twist[float]
+    wanted: Twist2
     """Of the base."""
     shafts: Speeds | None
     """Open loop: the speeds of the driven shafts, m/s."""

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from monstertruck_kinematics.chassis import MAX_ANGLE, STILL, Angles, Chassis, Speeds
-from monstertruck_kinematics.drive import Twist
 from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.se2 import Twist2
 from monstertruck_planners.collision import UnitTwist
 from monstertruck_schemas.req import DriveRequest, RequestedTwist
 from monstertruckd.gate.config import InForce
@@ -34,7 +34,7 @@ SATURATED: Final = 1e-4
 class Target(NamedTuple):
     """The motion that a request means for this body."""
 
-    twist: Twist[float]
+    twist: Twist2
     """Of the base."""
     angles: Angles
     """Steering angles it needs."""
@@ -57,7 +57,7 @@ class Motion:
     def __init__(self, limits: InForce, chassis: Chassis) -> None:
         self._limits = limits
         self._chassis = chassis
-        self.twist: Twist[float] = STILL
+        self.twist: Twist2 = STILL
         self.angles: Angles = chassis.straight
         self._open: Speeds | None = None
         """Shaft speeds that are commanded open loop, m/s; None = they follow from the twist."""
@@ -141,11 +141,11 @@ class Motion:
         reached = self._chassis.reached(angles)
         return reached, max(abs(asked - got) for asked, got in zip(angles, reached, strict=True)) > SATURATED
 
-    def along(self, twist: Twist[float], angles: Angles | None = None) -> Twist[float]:
+    def along(self, twist: Twist2, angles: Angles | None = None) -> Twist2:
         """The part of a twist that the body can do at steering angles, by default the commanded ones."""
         return self._chassis.along(twist, *(self.angles if angles is None else angles))
 
-    def pace(self, twist: Twist[float], shafts: Speeds | None = None) -> float:
+    def pace(self, twist: Twist2, shafts: Speeds | None = None) -> float:
         """Greatest speed of the base and of the driven wheels for a twist at the commanded steering angles, m/s.
 
         Args:
@@ -160,7 +160,7 @@ class Motion:
         """Pace of the commanded motion, m/s."""
         return self.pace(self.twist, self._open)
 
-    def max_pace(self, twist: Twist[float], shafts: Speeds | None = None) -> float:
+    def max_pace(self, twist: Twist2, shafts: Speeds | None = None) -> float:
         """Greatest pace allowed in the direction of ``twist``, m/s; arguments as of ``pace``."""
         ahead = twist[0] >= AHEAD * self.pace(twist, shafts)
         return self._limits.config.speed if ahead else self._limits.config.reverse_speed
@@ -182,7 +182,7 @@ class Motion:
         """Whether the body may move while its wheels turn to ``target``."""
         return self._chassis.aligned(self.angles, target)
 
-    def reverses(self, target: Twist[float], shafts: Speeds | None = None) -> bool:
+    def reverses(self, target: Twist2, shafts: Speeds | None = None) -> bool:
         """Whether wheels that turn for the present motion turn the other way for ``target``, on the whole.
 
         A motion from open loop to the other forms, or back, counts as one: it passes through standstill.
@@ -213,11 +213,11 @@ class Motion:
         else:
             self.turn_shafts((0.0,) * len(self._open), dt)
 
-    def _forecast(self, shafts: Speeds) -> Twist[float]:
+    def _forecast(self, shafts: Speeds) -> Twist2:
         """Twist of the base at shaft speeds, even if they contradict each other while they change."""
         return self._chassis.twist(self._chassis.input_speeds(shafts, *self.angles), *self.angles)
 
-    def accelerate(self, target: Twist[float], dt: float) -> None:
+    def accelerate(self, target: Twist2, dt: float) -> None:
         """Change the twist towards ``target``: no wheel, nor the base, changes its speed faster than allowed."""
         self._open = None
         change = (target[0] - self.twist[0], target[1] - self.twist[1], target[2] - self.twist[2])
@@ -241,7 +241,7 @@ class Motion:
         self._open = None
 
 
-def scaled(twist: Twist[float], factor: float) -> Twist[float]:
+def scaled(twist: Twist2, factor: float) -> Twist2:
     """A twist times a factor."""
     return twist[0] * factor, twist[1] * factor, twist[2] * factor
 
@@ -250,7 +250,7 @@ def _dot(one: Speeds, other: Speeds) -> float:
     return math.fsum(a * b for a, b in zip(one, other, strict=True))
 
 
-def _same(one: Twist[float], other: Twist[float]) -> bool:
+def _same(one: Twist2, other: Twist2) -> bool:
     return all(math.isclose(a, b, rel_tol=ROUNDING, abs_tol=ROUNDING) for a, b in zip(one, other, strict=True))
 
 

@@ -8,8 +8,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.drive import Twist
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Twist2
 from monstertruck_planners.collision import (
     Footprint,
     ScanPoints,
@@ -158,7 +158,7 @@ class ObstacleGuard:
         """Which of the points (n, 2) in base, m, lie in the lidar's field."""
         return self._visibility.covers(points)
 
-    def move(self, now: int, twist: Twist[float] | None, dt: float) -> None:
+    def move(self, now: int, twist: Twist2 | None, dt: float) -> None:
         """The body moved with ``twist`` for the ``dt`` s until ``now``, ns; None = it is not known how."""
         self._follow_limits()
         if twist is None:

@@ -14,8 +14,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.elementary import Array, integrate
-from monstertruck_planners.collision import Footprint, UnitTwist, free_distance, on_body, placed, points_relative
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import integrate, placed, points_relative
+from monstertruck_planners.collision import Footprint, UnitTwist, free_distance, on_body
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Message, Pose2D, Twist2D
 from monstertruck_schemas.event import Measurement

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from monstertruck_kinematics.chassis import Chassis, Speeds
-from monstertruck_kinematics.drive import Twist
+from monstertruck_kinematics.se2 import Twist2
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import Value
 from monstertruck_schemas import topics
@@ -195,7 +195,7 @@ class Samples:
         """Measured wheel speed over ground of every driven shaft, m/s; empty without fresh feedback of all of them."""
         return tuple([self._chassis.drivetrain.speed(drive.velocity) for drive in self._fresh_drives(now)])
 
-    def twist(self, now: int) -> Twist[float] | None:
+    def twist(self, now: int) -> Twist2 | None:
         """Velocity of the base by the measured shaft speeds and the newest steering angles; None without the former."""
         rolling, angles = self.shaft_speeds(now), self.angles
         return self._chassis.twist(self._chassis.input_speeds(rolling, *angles), *angles) if rolling else None

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.chassis import STILL
-from monstertruck_kinematics.drive import Twist
-from monstertruck_kinematics.elementary import Array, integrate
-from monstertruck_planners.collision import Footprint, beyond, on_body, placed, points_relative, relative
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, Twist2, integrate, placed, points_relative
+from monstertruck_planners.collision import Footprint, beyond, on_body, relative
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import position_deviation
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
@@ -45,16 +45,14 @@ CHANGED: Final = 0.1
 ELSEWHERE: Final = 0.3
 """Share of the beams with a range that differ so once a robot was carried; people who pass change fewer."""
 
-Pose = tuple[float, float, float]
-
 
 class _Taken(NamedTuple):
     """A scan, and where it was taken."""
 
     scan: LaserScan
-    pose: Pose
+    pose: Pose2
     """Of base, in the frame of the memory."""
-    lidar: Pose
+    lidar: Pose2
     """Of the lidar, in the frame of the memory."""
     travelled: float
     """m."""
@@ -88,7 +86,7 @@ class ScanMemory:
     """
 
     def __init__(
-        self, footprint: Footprint, mount: Pose, distance: float, time: float, deviation: float = math.inf
+        self, footprint: Footprint, mount: Pose2, distance: float, time: float, deviation: float = math.inf
     ) -> None:
         self._footprint = footprint
         self._mount = mount
@@ -101,14 +99,14 @@ class ScanMemory:
 
     def forget(self) -> None:
         """Start again: it is not known how the body has moved."""
-        self._pose: Pose = (0.0, 0.0, 0.0)
+        self._pose: Pose2 = (0.0, 0.0, 0.0)
         self._travelled = 0.0
-        self._ticks: deque[tuple[int, Pose, float]] = deque(maxlen=POSES_KEPT)
+        self._ticks: deque[tuple[int, Pose2, float]] = deque(maxlen=POSES_KEPT)
         self._newest: _Taken | None = None
         self._taken: deque[_Taken] = deque(maxlen=MEMORY_SCANS)
         self._views: deque[_Taken] = deque(maxlen=VIEWS)
 
-    def move(self, now: int, twist: Twist[float], dt: float) -> None:
+    def move(self, now: int, twist: Twist2, dt: float) -> None:
         """The body moved with ``twist``, m/s and rad/s, for the ``dt`` s until ``now``, ns."""
         if twist != STILL:
             self._rested = None
@@ -232,7 +230,7 @@ def spaced(points: Array, spacing: float) -> Array:
     return points[np.diff(along // spacing, prepend=-1.0) > 0]
 
 
-def _apart(one: Pose, other: Pose) -> float:
+def _apart(one: Pose2, other: Pose2) -> float:
     """Distance (m) and turn (rad) together."""
     return math.dist(one[:2], other[:2]) + abs(one[2] - other[2])
 

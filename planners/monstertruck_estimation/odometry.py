@@ -19,8 +19,8 @@ from monstertruck_estimation.inertial import Inertial, InertialInput
 from monstertruck_estimation.transforms import Quaternion, wrap_angle
 from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion
 from monstertruck_kinematics.chassis import Chassis
-from monstertruck_kinematics.elementary import Array, integrate, integration_jacobians
-from monstertruck_kinematics.se2 import Pose2, Twist2
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, Twist2, integrate, integration_jacobians
 from monstertruck_runtime.clock import ESTIMATES, SECOND, Clock, Schedule
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, Subscription

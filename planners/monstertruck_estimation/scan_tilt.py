@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from monstertruck_estimation.body_tilt import BodyAcceleration
-from monstertruck_kinematics.elementary import to_body
+from monstertruck_kinematics.se2 import to_body
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import Publisher

@@ -31,9 +31,10 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import ClassVar, Final, Literal
 
-from monstertruck_kinematics.drive import Drive, Twist, refuse
-from monstertruck_kinematics.elementary import KinematicsError, clip, signed_hypot, twist_at
+from monstertruck_kinematics.drive import Drive, refuse
+from monstertruck_kinematics.elementary import KinematicsError, clip, signed_hypot
 from monstertruck_kinematics.polynomials import AxlePolynomials, PolynomialSet, SteeringPolynomials
+from monstertruck_kinematics.se2 import Twist2, twist_at
 from monstertruck_kinematics.steered import WHEEL_NAMES, Ackermann, Bicycle, IndependentSteer, Synchro, Tricycle
 from monstertruck_kinematics.truck import (
     FULL,
@@ -121,7 +122,7 @@ class Chassis(ABC):
         """Speeds of the drive family's own inputs, m/s, from the shaft speeds; they hold while the steering changes."""
 
     @abstractmethod
-    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, *angles: float) -> Twist2:
         """Velocity (vx, vy, wz) of the base at steering angles."""
 
     def fastest_wheel_speed(self, shaft_speeds: Speeds) -> float:
@@ -146,7 +147,7 @@ class Chassis(ABC):
         """Whether servos steer any of its wheels."""
         return self.linkage is not None
 
-    def possible(self, twist: Twist[float]) -> Twist[float]:
+    def possible(self, twist: Twist2) -> Twist2:
         """The twist, with the sideways speed that follows from turning where the body cannot choose it.
 
         A ``vy`` of 0 is understood as none requested: a car whose base is not on its rear axle has one as it turns.
@@ -168,7 +169,7 @@ class Chassis(ABC):
             _require_way(vx, vy, wz, self.bicycle)
         return vx, vy, wz
 
-    def steering_for(self, twist: Twist[float], near: Angles) -> Angles:
+    def steering_for(self, twist: Twist2, near: Angles) -> Angles:
         """Steering angles for a possible twist; those nearest to ``near`` where there is a choice."""
         if not self.steered or twist == STILL:
             return near
@@ -178,17 +179,17 @@ class Chassis(ABC):
         """Steering angles for those of the bicycle; where there is a choice, those nearest to ``near``."""
         return (front, rear) if self.steered else near
 
-    def along(self, twist: Twist[float], *angles: float) -> Twist[float]:
+    def along(self, twist: Twist2, *angles: float) -> Twist2:
         """What the body does of a twist while its wheels stand at steering angles."""
         if not self.steered:
             return twist
         return self.bicycle.body_twist(signed_hypot(twist[0], twist[1]), *angles)
 
-    def shafts_along(self, twist: Twist[float], *angles: float) -> Speeds:
+    def shafts_along(self, twist: Twist2, *angles: float) -> Speeds:
         """Speed of every shaft for a twist that the body can do at steering angles."""
         return self.shaft_speeds(signed_hypot(twist[0], twist[1]), *angles)
 
-    def predicted(self, shaft_speeds: Speeds, *angles: float) -> Twist[float]:
+    def predicted(self, shaft_speeds: Speeds, *angles: float) -> Twist2:
         """Twist of the base that shaft speeds make at steering angles.
 
         Raises:
@@ -212,7 +213,7 @@ class Chassis(ABC):
         """Whether the body may move while its wheels turn from ``angles`` to ``target``."""
         return True
 
-    def axle_angles(self, twist: Twist[float], angles: Angles) -> tuple[float, float]:
+    def axle_angles(self, twist: Twist2, angles: Angles) -> tuple[float, float]:
         """Axle angles of the bicycle that moves like this; 0 where none does."""
         if self.steered and len(angles) == len(AXLES):
             return angles[0], angles[1]
@@ -324,7 +325,7 @@ class TruckChassis(Chassis):
         """The base's speed along its direction of travel."""
         return (shaft_speeds[0] / self.bicycle.drive_speed(1.0, *angles),)
 
-    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, *angles: float) -> Twist2:
         """See ``FourWheelSteering.body_twist``."""
         return self.bicycle.body_twist(inputs[0], *angles)
 
@@ -351,7 +352,7 @@ class FamilyChassis(Chassis):
         """The family's inverse."""
         return self.shafts_along(self.bicycle.body_twist(speed, front, rear))
 
-    def shafts_along(self, twist: Twist[float], *angles: float) -> Speeds:
+    def shafts_along(self, twist: Twist2, *angles: float) -> Speeds:
         """The family's inverse."""
         command = self.family.inverse(twist_at(*twist, self.origin, 0.0))
         return tuple(value / self.per_speed for value in command[: len(self.shafts)])
@@ -360,7 +361,7 @@ class FamilyChassis(Chassis):
         """The shafts themselves."""
         return shaft_speeds
 
-    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, *angles: float) -> Twist2:
         """The family's forward."""
         driven = tuple(value * self.per_speed for value in inputs)
         twist = self.family.forward((*driven, angles[0]) if self._steered else driven)
@@ -377,12 +378,12 @@ class TricycleChassis(FamilyChassis):
 
     family: Tricycle
 
-    def twist_of_rear(self, left: float, right: float) -> Twist[float]:
+    def twist_of_rear(self, left: float, right: float) -> Twist2:
         """Twist of the base from the speeds of the rear wheels, m/s."""
         twist = self.family.odometry(left / self.family.radius, right / self.family.radius)
         return twist_at(*twist, -self.origin, 0.0)
 
-    def rear_of_twist(self, twist: Twist[float]) -> tuple[float, float]:
+    def rear_of_twist(self, twist: Twist2) -> tuple[float, float]:
         """Speeds of the left and of the right rear wheel, m/s."""
         half = twist[2] * self.family.track / 2.0
         return twist[0] - half, twist[0] + half
@@ -410,7 +411,7 @@ class SynchroChassis(Chassis):
         """The shaft itself."""
         return shaft_speeds
 
-    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, *angles: float) -> Twist2:
         """The platform translates along its wheels."""
         return self.family.platform_twist((inputs[0] / self.family.wheel_radius, 0.0), angles[0])
 
@@ -422,11 +423,11 @@ class SkidWheelsChassis(FamilyChassis):
     Wheels of one side that turn unlike each other drag it along at their mean.
     """
 
-    def shafts_along(self, twist: Twist[float], *angles: float) -> Speeds:
+    def shafts_along(self, twist: Twist2, *angles: float) -> Speeds:
         """Both wheels of a side alike."""
         return super().shafts_along(twist, *angles) * 2
 
-    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, *angles: float) -> Twist2:
         """Of the means of the sides."""
         front_left, front_right, rear_left, rear_right = inputs
         return super().twist(((front_left + rear_left) / 2, (front_right + rear_right) / 2), *angles)
@@ -453,7 +454,7 @@ class IndependentChassis(Chassis):
         """The shafts themselves."""
         return shaft_speeds
 
-    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, *angles: float) -> Twist2:
         """Least-squares twist of the wheels' velocities."""
         return self.family.forward((*self.bicycle.wheel_angles(*angles), *inputs))
 
@@ -488,7 +489,7 @@ class WheelSteerChassis(Chassis):
         """Each servo turns its wheel itself."""
         return tuple(clip(servo, -WHEEL_REACH, WHEEL_REACH) for servo in servos)
 
-    def steering_for(self, twist: Twist[float], near: Angles) -> Angles:
+    def steering_for(self, twist: Twist2, near: Angles) -> Angles:
         """Wheels along their own velocities; a wheel rolls backwards rather than turn further than it must."""
         if twist == STILL:
             return near
@@ -512,7 +513,7 @@ class WheelSteerChassis(Chassis):
         """Wheels have no axle angle."""
         return angles, False
 
-    def along(self, twist: Twist[float], *angles: float) -> Twist[float]:
+    def along(self, twist: Twist2, *angles: float) -> Twist2:
         """Least-squares twist of what each wheel can roll of its velocity."""
         return self.twist(self.shafts_along(twist, *angles), *angles)
 
@@ -524,7 +525,7 @@ class WheelSteerChassis(Chassis):
         """Wheel speeds about the bicycle's ICR."""
         return self._wheels(self.bicycle.body_twist(speed, front, rear))[1]
 
-    def shafts_along(self, twist: Twist[float], *angles: float) -> Speeds:
+    def shafts_along(self, twist: Twist2, *angles: float) -> Speeds:
         """The part of every wheel's velocity along the wheel."""
         return tuple(
             speed * math.cos(angle - at) for angle, speed, at in zip(*self._wheels(twist), angles, strict=True)
@@ -534,11 +535,11 @@ class WheelSteerChassis(Chassis):
         """The shafts themselves."""
         return shaft_speeds
 
-    def twist(self, inputs: Speeds, *angles: float) -> Twist[float]:
+    def twist(self, inputs: Speeds, *angles: float) -> Twist2:
         """Least-squares twist of the wheels' velocities."""
         return self.family.forward((*angles, *inputs))
 
-    def _wheels(self, twist: Twist[float]) -> tuple[Angles, Speeds]:
+    def _wheels(self, twist: Twist2) -> tuple[Angles, Speeds]:
         """Angle and speed of every wheel."""
         command = self.family.inverse(twist)
         return command[: len(self.shafts)], command[len(self.shafts) :]

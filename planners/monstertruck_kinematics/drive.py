@@ -11,9 +11,8 @@ from typing import Protocol
 import numpy as np
 
 from monstertruck_kinematics.elementary import KinematicsError, Real, require_finite
+from monstertruck_kinematics.se2 import TwistOf
 from monstertruck_kinematics.wheels import Wheel
-
-Twist = tuple[Real, Real, Real]
 
 
 class Drive(Protocol):
@@ -23,7 +22,7 @@ class Drive(Protocol):
     def inputs(self) -> tuple[str, ...]:
         """Names of the command's entries."""
 
-    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+    def forward(self, command: Sequence[Real]) -> TwistOf[Real]:
         """Twist that a command produces."""
 
     def inverse(self, twist: Sequence[Real]) -> tuple[Real, ...]:

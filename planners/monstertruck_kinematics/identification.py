@@ -7,8 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from monstertruck_kinematics.elementary import Array, KinematicsError, integrate, require_positive, to_body
+from monstertruck_kinematics.elementary import Array, KinematicsError, require_positive
 from monstertruck_kinematics.fitting import FitResult, least_squares, minimax
+from monstertruck_kinematics.se2 import integrate, to_body
 from monstertruck_kinematics.unsteered import SkidSteer
 
 MAX_SLIP_RATIO = 1.15

@@ -7,12 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from monstertruck_kinematics.drive import (
-    TWIST,
-    Twist,
-    refuse,
-    unpacked,
-)
+from monstertruck_kinematics.drive import TWIST, refuse, unpacked
 from monstertruck_kinematics.elementary import (
     Array,
     KinematicsError,
@@ -25,8 +20,8 @@ from monstertruck_kinematics.elementary import (
     sign,
     sin,
     tan,
-    to_world,
 )
+from monstertruck_kinematics.se2 import TwistOf, to_world
 from monstertruck_kinematics.truck import MAX_AXLE_ANGLE, FourWheelSteering
 from monstertruck_kinematics.wheels import FixedWheel, SteeredWheel, Wheel
 
@@ -58,7 +53,7 @@ class Bicycle:
         if self.driven not in ("front", "rear"):
             raise KinematicsError(f"driven is {self.driven!r}: expected front or rear")
 
-    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+    def forward(self, command: Sequence[Real]) -> TwistOf[Real]:
         """Twist of the rear axle's middle from (speed of the driven wheel, steering angle)."""
         speed, steer = unpacked(command, self.inputs)
         if self.driven == "front":
@@ -105,7 +100,7 @@ class Tricycle(Bicycle):
         super().__post_init__()
         require_positive("track", self.track)
 
-    def odometry(self, left: Real, right: Real) -> Twist[Real]:
+    def odometry(self, left: Real, right: Real) -> TwistOf[Real]:
         """Twist measured by the two rear odometers (rates in rad/s), without knowing the steering angle."""
         return (0.5 * self.radius) * (left + right), 0.0 * left, (self.radius / self.track) * (right - left)
 
@@ -148,7 +143,7 @@ class Ackermann:
         """The body with its reference point on the rear axle."""
         return FourWheelSteering(self.wheelbase, self.track, cg_split=1.0)
 
-    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+    def forward(self, command: Sequence[Real]) -> TwistOf[Real]:
         """Twist from (speed, equivalent bicycle angle): R = L / tan(steer) (2.13)."""
         speed, steer = unpacked(command, self.inputs)
         return self.geometry.body_twist(speed, steer, 0.0 * steer)
@@ -209,7 +204,7 @@ class FourWheelSteer:
     def __post_init__(self) -> None:
         require_positive("radius", self.radius)
 
-    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+    def forward(self, command: Sequence[Real]) -> TwistOf[Real]:
         """Twist from (speed, front, rear): see ``FourWheelSteering.body_twist``."""
         speed, front, rear = unpacked(command, self.inputs)
         return self.geometry.body_twist(speed, front, rear)
@@ -261,7 +256,7 @@ class IndependentSteer:
         count = range(1, len(self.positions) + 1)
         return (*(f"steer {i}" for i in count), *(f"speed {i}" for i in count))
 
-    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+    def forward(self, command: Sequence[Real]) -> TwistOf[Real]:
         """Least-squares twist of the wheels' velocities; exact if they agree."""
         values = unpacked(command, self.inputs)
         count = len(self.positions)
@@ -317,7 +312,7 @@ class Synchro:
         require_positive("wheel_radius", self.wheel_radius)
         require_positive("circle", self.circle)
 
-    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+    def forward(self, command: Sequence[Real]) -> TwistOf[Real]:
         """(v, 0, omega) in the wheels' frame from the rolling rate and the turning rate, rad/s."""
         roll, turn = unpacked(command, self.inputs)
         return roll * self.wheel_radius, 0.0 * roll, turn + 0.0 * roll
@@ -328,7 +323,7 @@ class Synchro:
         refuse("vy", vy, vx, "the wheels cannot move sideways")
         return vx / self.wheel_radius, wz
 
-    def platform_twist(self, command: Sequence[Real], direction: Real) -> Twist[Real]:
+    def platform_twist(self, command: Sequence[Real], direction: Real) -> TwistOf[Real]:
         """Twist of the platform when its wheels point along ``direction`` in its frame: it translates only."""
         speed, zero, _ = self.forward(command)
         vx, vy = to_world(direction, speed, zero)

@@ -30,7 +30,6 @@ from monstertruck_kinematics.elementary import (
     clip,
     cos,
     hypot,
-    integrate,
     interpolated,
     larger,
     nonzero,
@@ -46,6 +45,7 @@ from monstertruck_kinematics.elementary import (
     where_positive,
 )
 from monstertruck_kinematics.polynomials import SERVO_LIMIT, AxlePolynomials, SteeringPolynomials
+from monstertruck_kinematics.se2 import integrate
 
 SteeringModeName = Literal["front", "rear", "counter", "crab", "spot"]
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from monstertruck_kinematics.drive import TWIST, Twist, refuse, unpacked
+from monstertruck_kinematics.drive import TWIST, refuse, unpacked
 from monstertruck_kinematics.elementary import Array, KinematicsError, Real, require_finite, require_positive
+from monstertruck_kinematics.se2 import TwistOf
 from monstertruck_kinematics.wheels import CasterWheel, FixedWheel, SwedishWheel, Wheel, rolling_matrix
 
 
@@ -32,7 +33,7 @@ class Differential:
         require_positive("radius", self.radius)
         require_positive("track", self.track)
 
-    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+    def forward(self, command: Sequence[Real]) -> TwistOf[Real]:
         """Twist from the wheel rates (left, right)."""
         left, right = unpacked(command, self.inputs)
         return (
@@ -108,7 +109,7 @@ class SkidSteer:
         """No slip at all: a differential drive of half track c (eqs. 10, 11)."""
         return cls(radius, half_track, -half_track)
 
-    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+    def forward(self, command: Sequence[Real]) -> TwistOf[Real]:
         """Twist from the wheel rates (left, right)."""
         left, right = unpacked(command, self.inputs)
         left, right = left * (self.gain_left * self.radius), right * (self.gain_right * self.radius)
@@ -177,7 +178,7 @@ class SwedishDrive:
         """The wheels' names."""
         return tuple(w.name for w in self.swedish)
 
-    def forward(self, command: Sequence[Real]) -> Twist[Real]:
+    def forward(self, command: Sequence[Real]) -> TwistOf[Real]:
         """Twist from the wheel rates."""
         rates = unpacked(command, self.inputs)
         vx, vy, wz = (_combined(row, rates) for row in self.twist_of_rates.tolist())

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_kinematics.elementary import Array, integrate
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import integrate
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
@@ -295,28 +296,6 @@ def swept_poses(twist: UnitTwist, distances: Array) -> Array:
     still = np.zeros_like(distances)
     vx, vy, wz = (component * distances for component in twist)
     return np.column_stack(integrate((still, still, still), vx, vy, wz, 1.0))
-
-
-def placed(poses: Array, at: tuple[float, float, float]) -> Array:
-    """Poses (n, 3) given in the frame of ``at``, in the frame that ``at`` is given in."""
-    x, y, yaw = at
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.column_stack(
-        (x + c * poses[:, 0] - s * poses[:, 1], y + s * poses[:, 0] + c * poses[:, 1], yaw + poses[:, 2])
-    )
-
-
-def points_relative(points: Array, at: tuple[float, float, float]) -> Array:
-    """Points (n, 2) in the frame of ``at``, both given in one frame."""
-    x, y, yaw = at
-    c, s = math.cos(yaw), math.sin(yaw)
-    dx, dy = points[:, 0] - x, points[:, 1] - y
-    return np.column_stack((c * dx + s * dy, c * dy - s * dx))
-
-
-def poses_relative(poses: Array, at: tuple[float, float, float]) -> Array:
-    """Poses (n, 3) in the frame of ``at``, both given in one frame."""
-    return np.column_stack((points_relative(poses, at), poses[:, 2] - at[2]))
 
 
 def scan_points(scan: LaserScan, mount: tuple[float, float, float]) -> Array:

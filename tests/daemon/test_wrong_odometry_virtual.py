@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.odometry import DeadReckoning, OdometryEstimate
-from monstertruck_estimation.se2 import between, compose
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 from monstertruck_schemas.reasons import Reason

@@ -14,10 +14,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array, rotation
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.errors import NotInstalledError
 from monstertruck_sim.world.config import CameraConfig, TagConfig
 from monstertruck_sim.world.noise import CAMERA, generator
-from monstertruck_sim.world.plant import Caster, Plant, Pose
+from monstertruck_sim.world.plant import Caster, Plant
 from monstertruck_sim.world.scene import Surroundings
 
 Picture = NDArray[np.uint8]
@@ -84,7 +85,7 @@ class Holder(Protocol):
         """The board at an instant, before a camera at ``place``."""
 
 
-def mounted(pose: Pose, config: CameraConfig, attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> CameraPlace:
+def mounted(pose: Pose2, config: CameraConfig, attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> CameraPlace:
     """The camera of a robot at ``pose``.
 
     Args:

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, Twist2
 from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.config import SimTruckConfig, SinusoidTilt, SteadyTilt, TiltConfig, WorldConfig
 from monstertruck_sim.world.obstacles import Box, Obstacle
-from monstertruck_sim.world.plant import Caster, Plant, Pose, Twist
+from monstertruck_sim.world.plant import Caster, Plant
 from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.sensors import PlaneSweep, Sweep
 from monstertruck_sim.world.sonar import Solids
@@ -34,22 +35,22 @@ class PlanOutline:
     def __init__(self, scene: Surroundings, truck: SimTruckConfig, name: str) -> None:
         self.scene, self._truck, self.name = scene, truck, name
         self._half_diagonal = hypot(truck.length, truck.width) / 2
-        self._free: Pose | None = None
+        self._free: Pose2 | None = None
         """Pose with free room around."""
         self._known: tuple[Obstacle, ...] = ()
         """Obstacles at the time of ``_free``."""
 
-    def box(self, pose: Pose, room: float = 0.0) -> Box:
+    def box(self, pose: Pose2, room: float = 0.0) -> Box:
         """It at a pose, grown by ``room`` all around."""
         x, y, yaw = pose
         return Box(x, y, self._truck.length + 2 * room, self._truck.width + 2 * room, yaw)
 
-    def pace(self, twist: Twist) -> float:
+    def pace(self, twist: Twist2) -> float:
         """Speed of its fastest point, m/s."""
         vx, vy, wz = twist
         return hypot(vx, vy) + abs(wz) * self._half_diagonal
 
-    def blocked(self, pose: Pose, twist: Twist) -> None:
+    def blocked(self, pose: Pose2, twist: Twist2) -> None:
         """It cannot move on to a pose: a contact with who is there."""
         self.scene.report(self.box(pose), self.name, self.pace(twist))
 
@@ -64,7 +65,7 @@ class PlanOutline:
         """Ranges to walls, things, people and the other robots."""
         return self.scene.cast(xs, ys, angles, reach, times_ns, self.name)
 
-    def _fixed(self, pose: Pose) -> float:
+    def _fixed(self, pose: Pose2) -> float:
         if self._known is not self.scene.obstacles:
             self._free, self._known = None, self.scene.obstacles
         if self._free is not None and self._way(self._free, pose) < _ROOM:
@@ -72,11 +73,11 @@ class PlanOutline:
         self._free = pose if self._depth(pose, _ROOM) == 0.0 else None
         return 0.0 if self._free else self._depth(pose)
 
-    def _way(self, a: Pose, b: Pose) -> float:
+    def _way(self, a: Pose2, b: Pose2) -> float:
         """No point of the footprint is further from its place at the other pose than this, m."""
         return hypot(b[0] - a[0], b[1] - a[1]) + abs(b[2] - a[2]) * self._half_diagonal
 
-    def _depth(self, pose: Pose, room: float = 0.0) -> float:
+    def _depth(self, pose: Pose2, room: float = 0.0) -> float:
         """How deep the footprint, grown by ``room`` all around, reaches into things that do not move, m."""
         return self.scene.fixed_overlap(self.box(pose, room))
 
@@ -169,7 +170,7 @@ class PlaneSpace(Space):
         return self.terrain.tilt(x, y, yaw, self._truck.wheelbase, self._truck.track)
 
 
-def plane(config: WorldConfig, footprint: PlanOutline, start: Pose, seed: int | None) -> Engine:
+def plane(config: WorldConfig, footprint: PlanOutline, start: Pose2, seed: int | None) -> Engine:
     """One robot of the plane."""
     space = PlaneSpace(footprint, config)
     plant = TruckPlant(config.truck, config.battery, start, space.contact, space.attitude, seed)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import JointSource, PulseSource
-from monstertruck_kinematics.elementary import Array, integrate
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, Twist2, integrate
 from monstertruck_sim.world.actuators import RPM, Servo, Shaft
 from monstertruck_sim.world.battery import BatteryModel
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
@@ -20,9 +21,7 @@ GRAVITY = 9.81
 _KEPT_NS = 600_000_000
 """What the past of a robot's poses is kept for."""
 
-Pose = tuple[float, float, float]
-Twist = tuple[float, float, float]
-Vector = tuple[float, float, float]
+Xyz = tuple[float, float, float]
 
 
 class TruthState(NamedTuple):
@@ -80,7 +79,7 @@ class Plant(ABC):
     """Whether nothing is integrated between two points of the grid; else a step ends early at the requested instant."""
 
     def __init__(
-        self, config: SimTruckConfig, battery: BatteryModelConfig, start: Pose, attitude: tuple[float, float]
+        self, config: SimTruckConfig, battery: BatteryModelConfig, start: Pose2, attitude: tuple[float, float]
     ) -> None:
         self.config = config
         self.battery = BatteryModel(battery)
@@ -98,27 +97,27 @@ class Plant(ABC):
         self._start_ns: int | None = None
         self._elapsed = 0
         self._pose = start
-        self._twist: Twist = (0.0, 0.0, 0.0)
+        self._twist: Twist2 = (0.0, 0.0, 0.0)
         self._attitude = attitude
         self._height = 0.0
         """Height of the base, m."""
-        self._stuck_at: Pose | None = None
+        self._stuck_at: Pose2 | None = None
         self._slipping = [False] * count
         self._trail: deque[tuple[float, ...]] = deque(maxlen=_KEPT_NS // self.STEP_NS)
         self.joints: JointSource | None = None
         """Joints of the lidar's mount; None: it is fixed."""
         self.together: Callable[[int], None] = lambda _: None
         """Brings what else moves in the world to an instant (ns), before this robot is integrated to it."""
-        self.on_blocked: Callable[[Pose, Twist], None] = lambda _pose, _twist: None
+        self.on_blocked: Callable[[Pose2, Twist2], None] = lambda _pose, _twist: None
         """Gets a pose that something keeps the robot from, and the twist with which it went there."""
 
     @property
-    def pose(self) -> Pose:
+    def pose(self) -> Pose2:
         """Of the geometric centre in the map frame, at the newest instant; the heading counts turns."""
         return self._pose
 
     @property
-    def twist(self) -> Twist:
+    def twist(self) -> Twist2:
         """Velocity in the body frame: m/s, m/s, rad/s."""
         return self._twist
 
@@ -129,12 +128,12 @@ class Plant(ABC):
 
     @property
     @abstractmethod
-    def acceleration(self) -> Vector:
+    def acceleration(self) -> Xyz:
         """Of the body, forward, left and up in its level frame, as a sensor on it feels it, m/s^2; without gravity."""
 
     @property
     @abstractmethod
-    def rates(self) -> Vector:
+    def rates(self) -> Xyz:
         """Angular velocity about forward, left and up of the level frame, rad/s."""
 
     @property
@@ -167,7 +166,7 @@ class Plant(ABC):
         return 0.0
 
     @abstractmethod
-    def carry(self, pose: Pose) -> None:
+    def carry(self, pose: Pose2) -> None:
         """Put the robot down elsewhere, at rest; sensors see no way between the two places."""
 
     def slot(self, time_ns: int, period_ns: int) -> int:

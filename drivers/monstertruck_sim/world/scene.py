@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import FREE, OCCUPIED
 from monstertruck_sim.world.built_in import BuiltIn
 from monstertruck_sim.world.config import PersonConfig
 from monstertruck_sim.world.obstacles import Box, Disc, Obstacle, discs_and_segments, penetration
 from monstertruck_sim.world.people import STEP_S, Person
-from monstertruck_sim.world.plant import Plant, Pose
+from monstertruck_sim.world.plant import Plant
 from monstertruck_sim.world.raycast import cast_rays, clearance, grid_penetration
 from monstertruck_sim.world.truck_plant import STEP_NS
 
@@ -85,7 +86,7 @@ class Surroundings:
         InputError: a person's way is not free.
     """
 
-    def __init__(self, place: BuiltIn, people: Sequence[PersonConfig], seed: int, starts: Sequence[Pose]) -> None:
+    def __init__(self, place: BuiltIn, people: Sequence[PersonConfig], seed: int, starts: Sequence[Pose2]) -> None:
         self.place, self.map, self.starts = place, place.map, tuple(starts)
         self.solid = place.map.cells != FREE
         """Cells in which nobody may begin."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import CompassReading, ImuReading, JointSource, MotorReading, PulseSource
 from monstertruck_kinematics.elementary import Array, Real, cos, rotation, sin
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.clock import SECOND
 from monstertruck_sim.world.board import panel_ranges
 from monstertruck_sim.world.camera import FlatPanel
@@ -31,7 +32,7 @@ from monstertruck_sim.world.noise import (
     WhiteNoise,
     generator,
 )
-from monstertruck_sim.world.plant import GRAVITY, Caster, Plant, Pose, Vector
+from monstertruck_sim.world.plant import GRAVITY, Caster, Plant, Xyz
 from monstertruck_sim.world.terrain import Terrain
 
 STEPS = 769
@@ -331,7 +332,7 @@ class SimulatedCompass:
             acceleration=_to_body((0.0, 0.0, hypot(*force)), pitch, roll),
         )
 
-    def _distorted(self, field: Vector) -> Vector:
+    def _distorted(self, field: Xyz) -> Xyz:
         iron = self._config.iron
         return (
             iron.soft_x * field[0] + iron.soft_xy * field[1] + iron.hard_x,
@@ -390,7 +391,7 @@ class SimulatedRearWheels:
     def __init__(self, plant: Plant, config: SimTruckConfig) -> None:
         self._plant = plant
         self._half, self._radius = config.track / 2, config.wheel_radius
-        self._pose: Pose | None = None
+        self._pose: Pose2 | None = None
         self._at = 0
         self._rolled = [0.0, 0.0]
 
@@ -403,7 +404,7 @@ class SimulatedRearWheels:
         self._pose, self._at = (x, y, yaw), time_ns
         return self._rolled[0] / self._radius, self._rolled[1] / self._radius
 
-    def _roll(self, before: Pose, now: Pose, dt: int) -> None:
+    def _roll(self, before: Pose2, now: Pose2, dt: int) -> None:
         """Along an arc; nothing where the robot was carried."""
         way = hypot(now[0] - before[0], now[1] - before[1])
         if way > CARRIED * dt / SECOND:
@@ -431,7 +432,7 @@ def _mounted(config: LidarConfig) -> Beams | None:
     return c * x - s * y, s * x + c * y, z
 
 
-def _to_body(v: Vector, pitch: float, roll: float) -> Vector:
+def _to_body(v: Xyz, pitch: float, roll: float) -> Xyz:
     """A vector of the level frame in the body frame: Rx(-roll) Ry(-pitch) v."""
     x = cos(pitch) * v[0] - sin(pitch) * v[2]
     z = sin(pitch) * v[0] + cos(pitch) * v[2]

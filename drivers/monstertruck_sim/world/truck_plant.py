@@ -11,13 +11,13 @@ from typing import ClassVar
 
 from monstertruck_kinematics.chassis import Chassis, TruckChassis
 from monstertruck_kinematics.dynamics import SingleTrack
-from monstertruck_kinematics.elementary import integrate
 from monstertruck_kinematics.linkage import dragged_speeds
+from monstertruck_kinematics.se2 import Pose2, integrate
 from monstertruck_kinematics.truck import LinkedAxles
 from monstertruck_sim.world.actuators import RPM, Shaft
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
 from monstertruck_sim.world.noise import SLIP, SlowNoise
-from monstertruck_sim.world.plant import GRAVITY, Plant, Pose, Vector
+from monstertruck_sim.world.plant import GRAVITY, Plant, Xyz
 from monstertruck_sim.world.skid import SkidEffects
 
 STEP_NS = 5_000_000
@@ -53,7 +53,7 @@ class TruckPlant(Plant):
         self,
         config: SimTruckConfig,
         battery: BatteryModelConfig,
-        start: Pose,
+        start: Pose2,
         contact: Contact,
         tilt: Tilt,
         seed: int | None,
@@ -75,16 +75,16 @@ class TruckPlant(Plant):
         self._felt = (0.0, 0.0)
 
     @property
-    def acceleration(self) -> Vector:
+    def acceleration(self) -> Xyz:
         """Of the body, forward, left and up in its level frame, as a sensor on it feels it, m/s^2; without gravity."""
         return *self._felt, 0.0
 
     @property
-    def rates(self) -> Vector:
+    def rates(self) -> Xyz:
         """Angular velocity about forward, left and up of the level frame, rad/s; that the tilt turns is left out."""
         return 0.0, 0.0, self._twist[2]
 
-    def carry(self, pose: Pose) -> None:
+    def carry(self, pose: Pose2) -> None:
         """Put the robot down elsewhere, at rest; sensors see no way between the two places."""
         self._pose, self._twist, self._stuck_at = pose, (0.0, 0.0, 0.0), None
         self._wheel_speeds = [0.0] * len(self.shafts)

@@ -17,6 +17,7 @@ from monstertruck_drivers.emulation import (
     SonarSource,
     WheelSource,
 )
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.errors import InputError, NotInstalledError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_sim.world.board import BoardHolder
@@ -25,7 +26,7 @@ from monstertruck_sim.world.camera import SimulatedView
 from monstertruck_sim.world.config import TiltConfig, WorldConfig
 from monstertruck_sim.world.obstacles import Box, Obstacle
 from monstertruck_sim.world.plane import Engine, PlanOutline, plane
-from monstertruck_sim.world.plant import Caster, Plant, Pose, TruthState
+from monstertruck_sim.world.plant import Caster, Plant, TruthState
 from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.sensors import (
     SimulatedCompass,
@@ -150,7 +151,7 @@ class World:
         """With which the lidar pushes its pitch (0) or roll (1) joint, Nm, at the newest instant."""
         return self._plant.mount_torque(joint)
 
-    def carry(self, time_ns: int, pose: Pose) -> None:
+    def carry(self, time_ns: int, pose: Pose2) -> None:
         """Put the truck down at another ``pose``: x, y (m) and yaw (rad) in the map frame.
 
         Raises:
@@ -211,7 +212,7 @@ class World:
         self._space.set_tilt(tilt)
 
 
-def make_engine(config: WorldConfig, footprint: PlanOutline, start: Pose, seed: int | None, *, lidar: bool) -> Engine:
+def make_engine(config: WorldConfig, footprint: PlanOutline, start: Pose2, seed: int | None, *, lidar: bool) -> Engine:
     """What computes one robot: ``engine`` of the configuration.
 
     Raises:
@@ -267,7 +268,7 @@ def make_scene(config: WorldConfig, seed: int, others: Sequence[WorldConfig] = (
     return Surroundings(place, config.people, seed, [_start(each, place) for each in (config, *others)])
 
 
-def _start(config: WorldConfig, place: BuiltIn) -> Pose:
+def _start(config: WorldConfig, place: BuiltIn) -> Pose2:
     start = config.start
     return (start.x, start.y, start.yaw) if start else place.start
 

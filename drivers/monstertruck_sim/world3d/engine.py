@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.description import WHEELS, LidarHead, Mechanics, wheel_inertia
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.platform import frame_name, rolled
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_kinematics.truck import FourWheelSteering, LinkedAxles
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import OCCUPIED
@@ -22,7 +23,7 @@ from monstertruck_sim.world.config import LidarConfig, SimTruckConfig, TiltConfi
 from monstertruck_sim.world.mechanics import description, mechanics, platform_wheels
 from monstertruck_sim.world.obstacles import Box, Disc, Obstacle
 from monstertruck_sim.world.plane import Engine, PlanOutline, Space
-from monstertruck_sim.world.plant import Caster, Pose
+from monstertruck_sim.world.plant import Caster
 from monstertruck_sim.world.scene import Neighbour
 from monstertruck_sim.world.sensors import LEVEL_BEAMS, Beams, UnevenGround, over, turned
 from monstertruck_sim.world3d.ground import blocks, ground_heights, scenery
@@ -289,7 +290,7 @@ def wheel_steering(truck: SimTruckConfig) -> Steering:
     return lambda _: ()
 
 
-def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose, *, lidar: bool) -> Engine:
+def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose2, *, lidar: bool) -> Engine:
     """One robot of rigid bodies, with or without a lidar on its joints.
 
     Raises:

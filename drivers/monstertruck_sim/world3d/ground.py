@@ -9,6 +9,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.outside import MEGABYTE, contents, picture, reading
 from monstertruck_sim.world.config import (
@@ -22,7 +23,6 @@ from monstertruck_sim.world.config import (
     WorldConfig,
 )
 from monstertruck_sim.world.noise import GROUND, generator
-from monstertruck_sim.world.plant import Pose
 from monstertruck_sim.world.terrain import LEVEL, Profile, Terrain
 from monstertruck_sim.world3d.heights import HeightGrid
 from monstertruck_sim.world3d.model import Block
@@ -41,7 +41,7 @@ Bounds = tuple[float, float, float, float]
 
 
 def ground_heights(
-    config: WorldConfig, profile: Profile | None, bounds: Bounds, starts: Sequence[Pose]
+    config: WorldConfig, profile: Profile | None, bounds: Bounds, starts: Sequence[Pose2]
 ) -> HeightGrid | None:
     """Sum of the map's profile, rough patches, features and picture; None: level.
 
@@ -68,7 +68,7 @@ def ground_heights(
     return HeightGrid(np.ascontiguousarray(z), HEIGHT_STEP, (x0, y0))
 
 
-def _height(feature: GroundFeature, x: Array, y: Array, starts: Sequence[Pose]) -> Array:
+def _height(feature: GroundFeature, x: Array, y: Array, starts: Sequence[Pose2]) -> Array:
     if isinstance(feature, Hills):
         return _hills(feature, x, y, starts)
     if isinstance(feature, Slope):
@@ -83,7 +83,7 @@ def _height(feature: GroundFeature, x: Array, y: Array, starts: Sequence[Pose]) 
     return np.zeros_like(x)
 
 
-def _hills(feature: Hills, x: Array, y: Array, starts: Sequence[Pose]) -> Array:
+def _hills(feature: Hills, x: Array, y: Array, starts: Sequence[Pose2]) -> Array:
     """White noise without waves shorter than ``wavelength``, level around the starts."""
     noise = generator(feature.seed, GROUND).standard_normal(x.shape)
     spectrum = np.fft.rfft2(noise)

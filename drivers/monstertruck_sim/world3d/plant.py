@@ -12,10 +12,11 @@ import mujoco
 import numpy as np
 
 from monstertruck_kinematics.description import HEAD_JOINTS, Mechanics
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.errors import CommandFailedError, InputError
 from monstertruck_sim.world.actuators import RPM
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
-from monstertruck_sim.world.plant import Plant, Pose, Vector
+from monstertruck_sim.world.plant import Plant, Xyz
 from monstertruck_sim.world3d.model import (
     CARRIES,
     HEAD_LAG,
@@ -100,7 +101,7 @@ class RigidPlant(Plant):
         self,
         config: SimTruckConfig,
         battery: BatteryModelConfig,
-        start: Pose,
+        start: Pose2,
         model: mujoco.MjModel,
         drive: DriveLine,
         steering: Steering,
@@ -134,12 +135,12 @@ class RigidPlant(Plant):
         self._put(start)
 
     @property
-    def acceleration(self) -> Vector:
+    def acceleration(self) -> Xyz:
         """Of the body, forward, left and up in its level frame, as a sensor on it feels it, m/s^2; without gravity."""
         return self._felt
 
     @property
-    def rates(self) -> Vector:
+    def rates(self) -> Xyz:
         """Angular velocity about forward, left and up of the level frame, rad/s."""
         return self._turning
 
@@ -157,7 +158,7 @@ class RigidPlant(Plant):
         self.before_steps()
         super().integrate(time_ns)
 
-    def carry(self, pose: Pose) -> None:
+    def carry(self, pose: Pose2) -> None:
         """Put the robot down elsewhere, at rest; sensors see no way between the two places.
 
         Raises:
@@ -193,7 +194,7 @@ class RigidPlant(Plant):
             self.carry(self._pose)
             raise
 
-    def _support(self, pose: Pose) -> float:
+    def _support(self, pose: Pose2) -> float:
         """Turn the robot as it is to stand, and put blocks below its wheels; height of its base then, m."""
         model, data = self.model, self.data
         x, y, yaw = pose
@@ -222,7 +223,7 @@ class RigidPlant(Plant):
             data.mocap_quat[mocap] = cy, 0.0, 0.0, sy
         return ground + base
 
-    def _put(self, pose: Pose) -> None:
+    def _put(self, pose: Pose2) -> None:
         """Let it settle on its springs at a pose, held in its place.
 
         Raises:
@@ -356,7 +357,7 @@ class RigidPlant(Plant):
         self._twist = c * vx + s * vy, c * vy - s * vx, self._turning[2]
         self._velocity = vx, vy, vz
 
-    def _feel(self, before: Vector) -> None:
+    def _feel(self, before: Xyz) -> None:
         """The acceleration of a step, from the velocity before it, through the sensor's filter."""
         ax, ay, az = ((now - then) / TIMESTEP for now, then in zip(self._velocity, before, strict=True))
         c, s = cos(self._pose[2]), sin(self._pose[2])

@@ -13,9 +13,9 @@ import numpy as np
 
 from monstertruck_drivers.os4000.attitude import level_field
 from monstertruck_drivers.os4000.config import IronConfig
-from monstertruck_estimation.se2 import wrap
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
+from monstertruck_kinematics.se2 import wrap
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics
 from monstertruckd.config.calibration import Estimate, Result, WizardName

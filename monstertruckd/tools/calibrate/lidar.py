@@ -17,13 +17,13 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.motion import find_offset
 from monstertruck_estimation.slam.registration import Cloud, register
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import Array, sinc
 from monstertruck_kinematics.fitting import FitResult, least_squares
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics

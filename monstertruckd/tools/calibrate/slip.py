@@ -13,9 +13,10 @@ from typing import Any, ClassVar, Final, Literal
 import numpy as np
 
 from monstertruck_kinematics.chassis import Chassis
-from monstertruck_kinematics.elementary import Array, integrate, to_body
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import least_squares
 from monstertruck_kinematics.identification import skid_model
+from monstertruck_kinematics.se2 import integrate, to_body
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.srf08.config import Srf08Config
-from monstertruck_estimation.se2 import wrap
 from monstertruck_kinematics.chassis import Chassis, TruckChassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import FitResult, least_squares
+from monstertruck_kinematics.se2 import wrap
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason

@@ -12,10 +12,10 @@ from typing import Final
 
 import numpy as np
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.registration import Cloud, register
 from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, RequestRefusedError, TruckError
 from monstertruck_schemas import topics

@@ -23,8 +23,8 @@ from monstertruck_drivers.maestro.protocol import Code, Decoder, ServoCommand
 from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_drivers.steppers.protocol import Splitter
 from monstertruck_kinematics.chassis import STILL, WHEEL_REACH, Chassis
-from monstertruck_kinematics.drive import Twist
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Twist2
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_schemas.roles import SHAFTS, DeviceRole
@@ -330,7 +330,7 @@ class Observation:
     now: int
     """Ns."""
     truth: TruthState
-    twist: Twist[float]
+    twist: Twist2
     """True one, of the body: m/s, m/s, rad/s."""
     targets: tuple[tuple[int, int, float], ...]
     """Speeds that bytes since the one before ask motors for: (ns, shaft, m/s over ground); 0 = any stop."""
@@ -575,7 +575,7 @@ class _Turning:
     def __init__(self, steering: _PulsedSteering, world: World) -> None:
         self._steering = steering
         self._world = world
-        self._course: Twist[float] = STILL
+        self._course: Twist2 = STILL
         """The newest requested motion of several motors."""
         self._turn_errors: deque[tuple[int, float]] = deque()
 
@@ -605,7 +605,7 @@ class _Turning:
         asked = self._pace(self._course)
         return self._course[2] * min(self._pace(seen.twist) / asked, 1.0) if asked > 0 else 0.0
 
-    def _pace(self, twist: Twist[float]) -> float:
+    def _pace(self, twist: Twist2) -> float:
         """Size of a motion: speed of the base, or of the wheels that turn it, m/s."""
         return max(math.hypot(*twist[:2]), abs(twist[2]) * self._steering.chassis.bicycle.track / 2)
 

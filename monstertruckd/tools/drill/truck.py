@@ -9,8 +9,8 @@ from typing import Final, Self
 import numpy as np
 
 from monstertruck_kinematics.chassis import Chassis
-from monstertruck_kinematics.drive import Twist
 from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.se2 import Twist2
 from monstertruck_runtime.clock import SECOND, VirtualClock, on_computer
 from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import fifo, latest
@@ -125,7 +125,7 @@ PATIENCE: Final = 0.5
 """Seconds for which a wanderer that is refused unseen ground waits before it holds the second control."""
 
 
-def _can(chassis: Chassis, twist: Twist[float]) -> bool:
+def _can(chassis: Chassis, twist: Twist2) -> bool:
     with suppress(KinematicsError):
         chassis.possible(twist)
         return True

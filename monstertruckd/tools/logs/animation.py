@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import placed
+from monstertruck_kinematics.se2 import placed
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import CommandFailedError, InputError, TruckError
 from monstertruck_runtime.moving_picture import MovingPicture

@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 
 from monstertruck_drivers.hokuyo_urg.recording import RecordedRanges
-from monstertruck_estimation.se2 import Vector, between, interpolate
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, between, interpolate
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.outside import arrays as arrays_of
@@ -53,7 +53,7 @@ class LogGeometry:
     """Ranges from here on are no returns, m."""
     time_increment: float | None = None
     """Seconds between neighbouring beams."""
-    mount: Vector | None = None
+    mount: Pose2 | None = None
     """Planar pose of the sensor in base, m and rad."""
 
     @property
@@ -229,7 +229,7 @@ def _carmen(path: Path, given: dict[str, Any]) -> ScanLog:
     return ScanLog("carmen", scans, (begin or 0.0) - BEGIN / SECOND, _missing(given))
 
 
-def _sick(stamp: int, ranges: Array, odom: Vector | None, geometry: dict[str, Any]) -> ScanInput:
+def _sick(stamp: int, ranges: Array, odom: Pose2 | None, geometry: dict[str, Any]) -> ScanInput:
     """A scan of this ``geometry``; by default half a turn ahead: n beams, or n + 1 with both ends."""
     count = len(ranges)
     assumed = {
@@ -255,6 +255,6 @@ def _urg(path: Path) -> Iterator[ScanInput]:
         )
 
 
-def _vector(values: Any) -> Vector:
+def _vector(values: Any) -> Pose2:
     x, y, yaw = (float(value) for value in values)
     return x, y, yaw

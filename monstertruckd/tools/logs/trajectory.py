@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import between, compose, interpolate
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, compose, interpolate
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.small_files import replace_file
 from monstertruckd.tools.logs.scans import ScanLog

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from monstertruck_kinematics.elementary import to_body, to_world
+from monstertruck_kinematics.se2 import to_body, to_world
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.plant import TruthState

@@ -9,9 +9,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from monstertruck_estimation.se2 import interpolate, wrap
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import least_squares
+from monstertruck_kinematics.se2 import interpolate, wrap
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.topics import ODOMETRY, POSE, STAND_POSE, TRACKER

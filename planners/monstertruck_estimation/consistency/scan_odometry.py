@@ -17,10 +17,10 @@ import numpy as np
 from monstertruck_estimation.consistency.delay import scan_delay
 from monstertruck_estimation.consistency.exchange import Claim, ScanVerdict, StepInput, StepOutput
 from monstertruck_estimation.consistency.tracks import KEPT
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.registration import Cloud, Fit, fitting, measure, register
 from monstertruck_estimation.slam.scans import Scan, prepare_input
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 
 MIN_POINTS: Final = 30

@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 
+from monstertruck_estimation.correction import SmoothedCorrection
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.filter import (
     MOVED_BY,
@@ -30,10 +31,10 @@ from monstertruck_estimation.fusion.slip import SlipChange, SlipDetector
 from monstertruck_estimation.heading_turns import HeadingTurns
 from monstertruck_estimation.inertial import Inertial
 from monstertruck_estimation.odometry import SOURCE_TIMEOUT, OdometryEstimate
-from monstertruck_estimation.se2 import SmoothedCorrection, compose, inverse
 from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion, increment_covariance
 from monstertruck_kinematics.chassis import Chassis
-from monstertruck_kinematics.elementary import Array, integrate
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import compose, integrate, inverse
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import ScanMotion

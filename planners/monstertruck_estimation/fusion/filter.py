@@ -8,9 +8,9 @@ import numpy as np
 
 from monstertruck_estimation.fusion.compass_gate import CompassGate, HeadingInnovation, HeadingUse, gate_heading
 from monstertruck_estimation.fusion.config import DEVIATION_SCALE, FusionConfig
-from monstertruck_estimation.se2 import between, between_jacobians, rotation
 from monstertruck_estimation.transforms import wrap_angle
-from monstertruck_kinematics.elementary import Array, integrate, integration_jacobians
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, between_jacobians, integrate, integration_jacobians, rotation
 from monstertruck_runtime.clock import SECOND
 
 

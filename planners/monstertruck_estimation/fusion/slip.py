@@ -14,9 +14,9 @@ import numpy as np
 
 from monstertruck_estimation.fusion.config import DEVIATION_SCALE, SlipConfig
 from monstertruck_estimation.fusion.filter import ScanMeasurement, WheelMeasurement
-from monstertruck_estimation.se2 import between, compose, compose_jacobians, interpolate
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, compose, compose_jacobians, interpolate
 from monstertruck_runtime.clock import SECOND
 
 SOURCE_TIMEOUT: Final = 3 * SECOND

@@ -14,8 +14,8 @@ from monstertruck_estimation.points import files
 from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.points.exchange import ReadAnswer, ReadTask
 from monstertruck_estimation.points.tracking import Bases, PointMap, PoseAsker, nearest
-from monstertruck_estimation.se2 import Vector, between, compose
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, between, compose
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, WorkerError, disk_reason
@@ -92,7 +92,7 @@ class PointFolders:
 @dataclass(frozen=True, slots=True)
 class _Placed:
     stamp: int
-    pose: Vector
+    pose: Pose2
     covariance: Array
     rate: float
 
@@ -138,12 +138,12 @@ class PointService:
         self._map = PointMap(config, mount)
         self._sequences = Sequences(max_age)
         self._history: deque[_Placed] = deque(maxlen=HISTORY)
-        self._trail: deque[tuple[int, Vector]] = deque(maxlen=CRUMBS)
+        self._trail: deque[tuple[int, Pose2]] = deque(maxlen=CRUMBS)
         self._stamps: tuple[int, ...] = ()
         self._bases: Bases = {}
         self._dirty: dict[str, None] = {}
         self._published = self._unsaved = False
-        self._looked: tuple[Vector, int] | None = None
+        self._looked: tuple[Pose2, int] | None = None
         """Where pictures were read last, and how many."""
         self._unreadable = False
         self._writing = asyncio.Lock()
@@ -240,7 +240,7 @@ class PointService:
             attitude.pitch, attitude.roll
         ) <= self._config.tilt  # fmt: skip
 
-    def _worth(self, pose: Vector) -> bool:
+    def _worth(self, pose: Pose2) -> bool:
         """Whether the robot has moved since the last pictures, or has looked here once only."""
         if self._looked is not None:
             before, looks = self._looked
@@ -341,7 +341,7 @@ class PointService:
             text = f"done, but a power cut would undo it: {reason.text}; the robot goes on trying to save it"
             raise RequestRefusedError(reason, text)
 
-    def take(self, request: PointRequest) -> Vector | None:
+    def take(self, request: PointRequest) -> Pose2 | None:
         """Mark a place, or forget a point.
 
         Returns:
@@ -369,7 +369,7 @@ class PointService:
         self._events(Reason.POINT_CHANGED, Severity.INFO, self.name, text)
         return place
 
-    def _mark(self, request: PointRequest) -> Vector:
+    def _mark(self, request: PointRequest) -> Pose2:
         if (request.x is None) != (request.y is None):
             raise InputError("point: x and y: expected both, or neither")
         if request.name.startswith("tag-"):
@@ -425,5 +425,5 @@ class PointService:
         rpc.register("point_picture", point_picture, AccessRole.OBSERVER, recorded=False)
 
 
-def _apart(one: Vector, other: Vector) -> bool:
+def _apart(one: Pose2, other: Pose2) -> bool:
     return max(abs(one[0] - other[0]), abs(one[1] - other[1]), abs(math.remainder(one[2] - other[2], math.tau))) > MOVED

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.points.exchange import TagReading, Triple
-from monstertruck_estimation.se2 import Vector, between, compose
 from monstertruck_estimation.vision.mount import camera_axes
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, between, compose
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.points import PointKind, PointOfInterest
 
@@ -56,7 +56,7 @@ class PointSighting:
 
     stamp: int
     """Of the picture, ns."""
-    base: Vector
+    base: Pose2
     """The robot in map then, as known at that time."""
     place: Triple
     """In base, m."""
@@ -86,7 +86,7 @@ class Tracked:
     """Side of the tag in it, pixels."""
 
 
-Bases = Mapping[int, Vector]
+Bases = Mapping[int, Pose2]
 """Where the robot was at instants, by the map as it is now."""
 PoseAsker = Callable[[tuple[int, ...]], Bases]
 """Asks the mapper where the robot was at instants; answers with what it knows by now."""
@@ -107,7 +107,7 @@ class PointMap:
     shown: dict[str, PointOfInterest] = field(default_factory=dict)
     """As they were when ``refresh`` was last called for each."""
 
-    def see(self, reading: TagReading, stamp: int, base: Vector, covariance: Array, rate: float) -> bool:
+    def see(self, reading: TagReading, stamp: int, base: Pose2, covariance: Array, rate: float) -> bool:
         """Take a reading in; returns whether it made a tag a point of interest.
 
         Args:
@@ -142,7 +142,7 @@ class PointMap:
         needed = self.config.sightings
         return point.count >= needed and (len(point.sightings) == 1 or _consensus(point.sightings, {}, self.config) > 1)
 
-    def mark(self, name: str, stamp: int, base: Vector, place: Vector, covariance: Array) -> None:
+    def mark(self, name: str, stamp: int, base: Pose2, place: Pose2, covariance: Array) -> None:
         """Mark a place by name, as an operator does.
 
         Args:
@@ -158,7 +158,7 @@ class PointMap:
         one = PointSighting(stamp, base, (x, y, 0.0), yaw, spread)
         self.points[name] = Tracked(name, PointKind.MARK, None, None, (one,), 0, stamp, stamp)
 
-    def anchor(self, name: str, base: Vector) -> None:
+    def anchor(self, name: str, base: Pose2) -> None:
         """Leave a mark where it is in the map, for the robot was at ``base`` at its instant by the map of today."""
         point = self.points[name]
         (old,) = point.sightings
@@ -218,7 +218,7 @@ class PointMap:
 
 
 def sighting(
-    reading: TagReading, mount: Mount, stamp: int, base: Vector, covariance: Array, rate: float
+    reading: TagReading, mount: Mount, stamp: int, base: Pose2, covariance: Array, rate: float
 ) -> PointSighting:
     """A reading in the robot's base, with what may be wrong with it.
 
@@ -313,12 +313,12 @@ def _added(sightings: tuple[PointSighting, ...], new: PointSighting) -> tuple[Po
     return kept if len(kept) <= KEPT else (kept[0], *kept[2:])
 
 
-def _into_base(base: Vector) -> Array:
+def _into_base(base: Pose2) -> Array:
     """Turns (x, y, yaw) of map into base's axes, (3, 3)."""
     c, s = math.cos(base[2]), math.sin(base[2])
     return np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
 
 
-def nearest(trail: Sequence[tuple[int, Vector]], place: Vector) -> tuple[int, Vector]:
+def nearest(trail: Sequence[tuple[int, Pose2]], place: Pose2) -> tuple[int, Pose2]:
     """The instant at which the robot was nearest to a place, and where it was."""
     return min(trail, key=lambda row: math.dist(row[1][:2], place[:2]))

@@ -19,7 +19,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import between, compose, inverse, rotation, transform
 from monstertruck_estimation.slam.budget import (
     CROSSED,
     EDGE,
@@ -38,6 +37,7 @@ from monstertruck_estimation.slam.registration import measure, register
 from monstertruck_estimation.slam.scan_matcher import degeneracy, deviations
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, compose, inverse, rotation, transform
 
 VIEW: Final = 2.5
 """Distance within which two keyframes see enough of the same surroundings, m."""

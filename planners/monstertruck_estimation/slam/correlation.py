@@ -14,11 +14,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import rotation
 from monstertruck_estimation.slam.budget import CELL, DRAWN
 from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import rotation
 
 Pyramid = NDArray[np.uint8]
 Blocks = NDArray[np.int32]

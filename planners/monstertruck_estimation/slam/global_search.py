@@ -15,7 +15,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import Vector, between, compose
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import Submap, correlate, merged
 from monstertruck_estimation.slam.map_evidence import Evidence, EvidenceGrid
@@ -23,6 +22,7 @@ from monstertruck_estimation.slam.mapping import Mapper, MappingEvent
 from monstertruck_estimation.slam.registration import measure, register
 from monstertruck_estimation.slam.scans import Scan, downsample_indices
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, between, compose
 from monstertruck_runtime.clock import SECOND
 
 LEVELS: Final = 7
@@ -94,7 +94,7 @@ class GlobalLocaliser:
         self._middle = np.array((*((low + high) / 2), 0.0))
         self._half = float((high - low).max() / 2) + 1.0
 
-    def step(self, scan: Scan, stamp: int, odom: Array | None, mount: Vector = (0.0, 0.0, 0.0)) -> Array | None:
+    def step(self, scan: Scan, stamp: int, odom: Array | None, mount: Pose2 = (0.0, 0.0, 0.0)) -> Array | None:
         """Add a scan; returns the pose of base in the map, shape (3,), when it is certain.
 
         Args:

@@ -15,8 +15,8 @@ from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import splu
 
-from monstertruck_estimation.se2 import between, wrap
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, wrap
 
 Index = NDArray[np.int64]
 

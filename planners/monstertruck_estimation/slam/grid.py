@@ -14,11 +14,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import Vector, between, interpolate, transform
 from monstertruck_estimation.slam.config import GridConfig
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.worker_io import UNKNOWN, GridPatch, ScanInput
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, between, interpolate, transform
 from monstertruck_runtime.clock import SECOND
 
 Cells = NDArray[np.int8]
@@ -315,12 +315,12 @@ class GridBuilder:
         self._points = PointPages()
         self._returns: list[int] = []
         """How many of each scan's points are returns; the others end beams that met nothing."""
-        self._mounts: list[Vector] = []
+        self._mounts: list[Pose2] = []
 
     def __len__(self) -> int:
         return len(self._stamps)
 
-    def add(self, scan: Scan, stamp: int, pose: Array, mount: Vector, passed: Array = NONE) -> bool:
+    def add(self, scan: Scan, stamp: int, pose: Array, mount: Pose2, passed: Array = NONE) -> bool:
         """Integrate a scan if the robot moved far enough since the last one; returns whether it did.
 
         Args:

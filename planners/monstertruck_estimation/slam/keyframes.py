@@ -8,7 +8,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import between, compose, compose_jacobians, inverse, wrap
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import Submap, merged
 from monstertruck_estimation.slam.graph import Edges, drift, optimise, parts
@@ -16,6 +15,7 @@ from monstertruck_estimation.slam.registration import CELL, Cloud, normal_equati
 from monstertruck_estimation.slam.scan_matcher import deviations
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, compose, compose_jacobians, inverse, wrap
 from monstertruck_runtime.clock import SECOND
 
 INITIAL_ROWS: Final = 64

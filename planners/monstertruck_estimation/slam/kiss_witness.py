@@ -10,11 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.kiss_map import KissMap
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.worker_io import SlamEstimate
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import LocalisationStatus
 

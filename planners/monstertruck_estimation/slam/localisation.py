@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import Vector, between, compose, compose_jacobians, inverse
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import Submap, merged
 from monstertruck_estimation.slam.global_search import GlobalLocaliser
@@ -31,6 +30,7 @@ from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.storage import SavedGraph, SavedMap, surface_elements
 from monstertruck_estimation.slam.worker_io import GridPatch, ScanInput, SlamEstimate
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, between, compose, compose_jacobians, inverse
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
@@ -86,7 +86,7 @@ class LocalisationEstimator:
         start: base in map, if known approximately; None = anywhere.
     """
 
-    def __init__(self, saved: SavedMap, config: MapperConfig, start: Vector | None = None) -> None:
+    def __init__(self, saved: SavedMap, config: MapperConfig, start: Pose2 | None = None) -> None:
         self._saved = saved
         self._config = config
         self._submap = submap_of(saved)
@@ -112,7 +112,7 @@ class LocalisationEstimator:
         self.counts = {"scans": 0, "keys": 0, "closures": 0, "rejected": 0, "searches": int(start is None)}
 
     @property
-    def twist(self) -> Vector:
+    def twist(self) -> Pose2:
         """See ``Estimator``."""
         return self._motion.twist
 
@@ -190,7 +190,7 @@ class LocalisationEstimator:
         return False
 
     def _track(
-        self, scan: Scan, delta: Array, predicted: Predicted, mount: Vector
+        self, scan: Scan, delta: Array, predicted: Predicted, mount: Pose2
     ) -> tuple[ScanMatch, LocalisationStatus]:
         guess, covariance, _ = predicted
         alone = self.odometry is not OdometryUse.USED
@@ -216,13 +216,13 @@ class LocalisationEstimator:
         lost = self._misfits >= LOST_AFTER and not match.accepted
         return match, LocalisationStatus.LOST if lost else status_of(match, LocalisationStatus.LOCALISED)
 
-    def _matched_alone(self, scan: Scan, delta: Array, predicted: Predicted, mount: Vector) -> tuple[ScanMatch, bool]:
+    def _matched_alone(self, scan: Scan, delta: Array, predicted: Predicted, mount: Pose2) -> tuple[ScanMatch, bool]:
         """Match all beams, for the motion is known too badly to say which end on mapped ground."""
         match = self._front.match(scan, delta, *predicted[:2], self._submap)
         contradiction = self._evidence.judge(match.pose, scan.points, np.array(mount[:2])).contradiction
         return match, fits(match) and contradiction <= MAX_CONTRADICTION
 
-    def _matched(self, scan: Scan, delta: Array, predicted: Predicted, mount: Vector) -> tuple[ScanMatch, bool]:
+    def _matched(self, scan: Scan, delta: Array, predicted: Predicted, mount: Pose2) -> tuple[ScanMatch, bool]:
         """Match the beams that end on mapped ground; whether the match counts."""
         guess, covariance, published = predicted
         sensor = np.array(mount[:2])
@@ -251,7 +251,7 @@ class LocalisationEstimator:
         status = LocalisationStatus.OUTSIDE if outside else LocalisationStatus.SEARCHING
         return rejected(guess, covariance, MatchStatus.EMPTY), status
 
-    def _found(self, scan: Scan, pose: Array, mount: Vector) -> tuple[ScanMatch, LocalisationStatus]:
+    def _found(self, scan: Scan, pose: Array, mount: Pose2) -> tuple[ScanMatch, LocalisationStatus]:
         """Track from ``pose``; the search goes on, as a check."""
         self._tracking, self._checked, self._misfits = True, 0.0, 0
         return self._track(scan, np.zeros(3), (pose, FOUND_COVARIANCE, FOUND_COVARIANCE), mount)

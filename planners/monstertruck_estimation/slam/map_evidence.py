@@ -14,8 +14,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from monstertruck_estimation.se2 import transform
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import transform
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap
 
 TOLERANCE: Final = 0.15

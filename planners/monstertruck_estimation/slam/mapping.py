@@ -10,7 +10,6 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import Vector, between, compose, compose_jacobians, inverse
 from monstertruck_estimation.slam.budget import ScanBudget
 from monstertruck_estimation.slam.closure import CONTRADICTION, PART_CONTRADICTION, LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
@@ -42,6 +41,7 @@ from monstertruck_estimation.slam.scans import Scan, prepare_input
 from monstertruck_estimation.slam.storage import SavedGraph, saved_graph
 from monstertruck_estimation.slam.worker_io import GridPatch, ScanIncrement, ScanInput, SlamEstimate
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, between, compose, compose_jacobians, inverse
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
@@ -95,7 +95,7 @@ class Mapper:
     """
 
     def __init__(
-        self, config: MapperConfig | None = None, front: ScanMatcher | None = None, start: Vector = (0.0, 0.0, 0.0)
+        self, config: MapperConfig | None = None, front: ScanMatcher | None = None, start: Pose2 = (0.0, 0.0, 0.0)
     ) -> None:
         self.config = config or MapperConfig()
         self.map = KeyframeMap(self.config)
@@ -118,7 +118,7 @@ class Mapper:
         return self._loss.lost or not self.map.joined()[-1:].all()
 
     @property
-    def twist(self) -> Vector:
+    def twist(self) -> Pose2:
         """Velocity of base over the last two scans (vx, vy, wz; m/s, rad/s), to deskew the next one."""
         return self._motion.twist
 
@@ -127,7 +127,7 @@ class Mapper:
         scan: Scan,
         stamp: int,
         odom: Array | None = None,
-        again: Callable[[Vector], Scan] | None = None,
+        again: Callable[[Pose2], Scan] | None = None,
         period: float = 0.0,
     ) -> Step | None:
         """Take one scan.
@@ -354,7 +354,7 @@ class Estimator(Protocol):
     """Scans, keyframes, closures, rejected matches."""
 
     @property
-    def twist(self) -> Vector:
+    def twist(self) -> Pose2:
         """Velocity of base by the last scans, m/s and rad/s."""
 
     @property
@@ -396,7 +396,7 @@ class MappingEstimator:
 
     def __init__(
         self, mapper: MapperConfig, grid: GridConfig, front: ScanMatcher | None = None,
-        start: Vector = (0.0, 0.0, 0.0), body: tuple[float, float] | None = None,
+        start: Pose2 = (0.0, 0.0, 0.0), body: tuple[float, float] | None = None,
     ) -> None:  # fmt: skip
         self.mapper = Mapper(mapper, front, start)
         self.builder = GridBuilder(grid, body)
@@ -405,15 +405,15 @@ class MappingEstimator:
         self._moved = False
         self._redrawn = False
         self._misfits = 0
-        self._apart: list[tuple[Scan, int, Vector]] = []
+        self._apart: list[tuple[Scan, int, Pose2]] = []
         """Keyframes that are not on the map: scan, stamp, mount."""
-        self._doubtful: list[tuple[Scan, int, Vector]] = []
+        self._doubtful: list[tuple[Scan, int, Pose2]] = []
         """Those on it by a join that is in doubt."""
         self._offset = ClockOffsetEstimator()
         self._scan_odometry = ScanOdometry()
 
     @property
-    def twist(self) -> Vector:
+    def twist(self) -> Pose2:
         """See ``Estimator``."""
         return self.mapper.twist
 
@@ -564,7 +564,7 @@ def estimate(
     )
 
 
-def plain(pose: Any) -> Vector:
+def plain(pose: Any) -> Pose2:
     """A pose as three floats."""
     x, y, yaw = (float(value) for value in pose)
     return x, y, yaw

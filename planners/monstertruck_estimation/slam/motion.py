@@ -7,11 +7,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import between, compose, rotation
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.scan_matcher import LOW_OVERLAP, ScanMatch, deviations
 from monstertruck_estimation.slam.worker_io import ScanIncrement
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, compose, rotation
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import OdometryUse
 

@@ -17,7 +17,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.budget import ELEMENT, Pieces, PiecewiseSearch, ScanBudget, finished
 from monstertruck_estimation.slam.closure import CONTRADICTION, VIEW, LoopCloser, contradiction, opposed, surroundings
 from monstertruck_estimation.slam.correlation import Peak, Submap, correlate, look_ups
@@ -26,6 +25,7 @@ from monstertruck_estimation.slam.motion import OVERLAP_DROP, OVERLAP_GAIN
 from monstertruck_estimation.slam.scan_matcher import GATE_LOW_OVERLAP, LOW_OVERLAP, ScanMatch, deviations
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 
 LOST_AFTER: Final = 1.5

@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from monstertruck_estimation.correction import SmoothedCorrection
 from monstertruck_estimation.scan_tilt import ScanAngles, plane_slopes
-from monstertruck_estimation.se2 import SmoothedCorrection, Vector, between, interpolate, rotation
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_estimation.slam.worker_io import (
     GridPatch,
@@ -23,6 +23,7 @@ from monstertruck_estimation.slam.worker_io import (
 )
 from monstertruck_estimation.transforms import planar
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, between, interpolate, rotation
 from monstertruck_runtime.actors.actor import WorkerActor
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DamagedFileError, WorkerError
@@ -103,7 +104,7 @@ class SlamService:
         self._scan, self._odometry, self._angles = scan, odometry, angles
         self._motions = motion
         self._pose, self._whole, self._tiles, self._health, self._events = pose, whole, tiles, health, events
-        self._history: deque[tuple[int, Vector]] = deque(maxlen=HISTORY)
+        self._history: deque[tuple[int, Pose2]] = deque(maxlen=HISTORY)
         self._correction = SmoothedCorrection(config.slew, config.jump)
         self._newest: SlamEstimate | None = None
         self._latest: Odometry | None = None
@@ -125,7 +126,7 @@ class SlamService:
         """The worker has a map."""
         self._instants: tuple[int, ...] = ()
         self._sent_instants: tuple[int, ...] = ()
-        self._bases: dict[int, Vector] = {}
+        self._bases: dict[int, Pose2] = {}
 
     def frames(self) -> Iterable[Transform]:
         """Odom in map as published; without odometry, base in map."""
@@ -137,7 +138,7 @@ class SlamService:
         stamp = self._newest.stamp
         return planar("map", "odom", stamp, self._newest.pose), planar("odom", "base", stamp, (0.0, 0.0, 0.0))
 
-    def bases_at(self, instants: tuple[int, ...]) -> Mapping[int, Vector]:
+    def bases_at(self, instants: tuple[int, ...]) -> Mapping[int, Pose2]:
         """Poses of base at instants, ns, by the present graph; updated every ``tiles_period``.
 
         Those requested now are answered later, those the map does not know never.
@@ -290,7 +291,7 @@ class SlamService:
             ceiling=self._config.ceiling,
         )
 
-    def _motion(self, begin: int, end: int) -> tuple[Vector | None, Vector]:
+    def _motion(self, begin: int, end: int) -> tuple[Pose2 | None, Pose2]:
         """Base in odom at ``begin``, and the velocity until ``end``; both ns."""
         history = self._history
         if not history or begin - history[-1][0] > STALE or begin < history[0][0]:
@@ -310,7 +311,7 @@ class SlamService:
         angles = None if self._angles is None else self._angles.at(scan)
         return None if angles is None else plane_slopes(*angles, yaw=self._mount.yaw)
 
-    def _start(self, odom: Vector | None) -> Vector:
+    def _start(self, odom: Pose2 | None) -> Pose2:
         """Start pose of a new map: the present pose in map."""
         if odom is not None:
             return self._correction.pose(odom, 0.0)

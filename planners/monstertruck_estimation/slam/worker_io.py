@@ -7,9 +7,9 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.se2 import Vector
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 
@@ -43,11 +43,11 @@ class ScanInput:
     range_max: float
     time_increment: float = 0.0
     """Seconds between neighbouring beams."""
-    mount: Vector = (0.0, 0.0, 0.0)
+    mount: Pose2 = (0.0, 0.0, 0.0)
     """Planar pose of the sensor in base, m and rad."""
-    odom: Vector | None = None
+    odom: Pose2 | None = None
     """Base in odom at ``stamp``; None without odometry."""
-    twist: Vector = (0.0, 0.0, 0.0)
+    twist: Pose2 = (0.0, 0.0, 0.0)
     """The base's velocity during the scan, m/s and rad/s."""
     slopes: tuple[float, float] | None = None
     """Rise per metre along the sensor's x and y axis; None = not known, assumed level."""
@@ -57,7 +57,7 @@ class ScanInput:
     """Height of the ceiling over the ground, m."""
 
     @classmethod
-    def of(cls, scan: LaserScan, mount: Vector) -> Self:
+    def of(cls, scan: LaserScan, mount: Pose2) -> Self:
         """From the message alone."""
         return cls(
             stamp=scan.stamp,
@@ -76,7 +76,7 @@ class Start:
     """Start of a worker."""
 
     config: SlamConfig
-    pose: Vector = (0.0, 0.0, 0.0)
+    pose: Pose2 = (0.0, 0.0, 0.0)
     """Base in map at the first scan."""
     body: tuple[float, float] | None = None
     """Length and width of the robot, m: where it stands the ground is free; None = not known."""
@@ -110,7 +110,7 @@ class ScanIncrement:
 
     since: int
     """Stamp of the earlier scan, ns."""
-    motion: Vector
+    motion: Pose2
     """Base at the later one in base at the earlier one."""
     covariance: tuple[float, ...]
     """Row-major (3, 3), of the later scan's pose in the map, in base's axes; the earlier one's came with its own."""
@@ -121,11 +121,11 @@ class SlamEstimate:
     """Pose and quality of match of one scan."""
 
     stamp: int
-    pose: Vector
+    pose: Pose2
     """Base in map at ``stamp``."""
     covariance: tuple[float, ...]
     """Row-major (3, 3)."""
-    map_from_odom: Vector | None
+    map_from_odom: Pose2 | None
     """Odom in map; None without odometry."""
     status: LocalisationStatus
     overlap: float

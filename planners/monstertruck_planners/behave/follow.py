@@ -12,7 +12,8 @@ from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self
 
 from pydantic import Field
 
-from monstertruck_kinematics.elementary import KinematicsError, to_body, to_world
+from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.se2 import to_body, to_world
 from monstertruck_planners.behave.api import BehaviourBody, BehaviourConfig, BehaviourStep, Inputs, RequestedMotion
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import points_relative
+from monstertruck_kinematics.se2 import points_relative
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import Publisher, Ready

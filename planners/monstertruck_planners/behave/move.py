@@ -17,9 +17,9 @@ from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from monstertruck_kinematics.drive import Twist
 from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.profiles import BasicMove, CubicProfile, CubicRamp, MotionProfile, TrapezoidalProfile
+from monstertruck_kinematics.se2 import Twist2
 from monstertruck_planners.behave.api import BehaviourBody, BehaviourConfig, BehaviourStep, Inputs, RequestedMotion
 from monstertruck_schemas.base import Twist2D
 from monstertruck_schemas.reasons import Reason
@@ -333,7 +333,7 @@ def _profile(config: MoveConfig, distance: float) -> MotionProfile | None:
     return CubicProfile(distance, amounts.speed, 1.5 * amounts.speed / amounts.acceleration)
 
 
-def require_possible(move: BasicMove, body: BehaviourBody) -> Twist[float]:
+def require_possible(move: BasicMove, body: BehaviourBody) -> Twist2:
     """Twist of base at unit pace, of a move that a body can do.
 
     Raises:

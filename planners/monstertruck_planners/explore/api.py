@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_planners.explore.catalog import EXPLORERS
 from monstertruck_planners.explore.config import ExplorerConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, Point, Viewpoint
 from monstertruck_planners.explore.frontier import FrontierMap
 from monstertruck_planners.explore.kernels import far_from_obstacles, joined_cells, new_areas, shares_seen
-from monstertruck_planners.goals.exchange import Pose
 from monstertruck_planners.goals.plan_step import ASSUMED_FREE, standing_free
 from monstertruck_planners.route.api import RouteCosts, RouteMap, Vehicle
 from monstertruck_planners.route.config import DriveCosts
@@ -102,7 +102,7 @@ class Option:
     """A frontier and its viewpoint."""
 
     frontier: Frontier
-    pose: Pose
+    pose: Pose2
     path_length: float
     """Metres, dearer in narrow places."""
     gain: float
@@ -156,7 +156,7 @@ class ExplorationView:
 
     known: FrontierMap
     setup: ExploreSetup
-    pose: Pose
+    pose: Pose2
     banned: tuple[Point, ...]
     avoided: tuple[Point, ...]
     memory: Remembered

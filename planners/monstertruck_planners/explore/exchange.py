@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.explore.catalog import AnyExplorer
-from monstertruck_planners.goals.exchange import Pose
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Grid
 
@@ -16,7 +16,7 @@ Point = tuple[float, float]
 class CameraView:
     """What the camera is good for where tags are looked for."""
 
-    mount: Pose = (0.18, 0.0, 0.0)
+    mount: Pose2 = (0.18, 0.0, 0.0)
     """In base."""
     view: float = 0.95
     """Angle of view that is counted on, rad."""
@@ -38,7 +38,7 @@ class ExploreSetup:
     """Least turning radius, m."""
     margin: float = 0.04
     """Kept to obstacles by the routes, m."""
-    lidar: Pose = (0.0, 0.0, 0.0)
+    lidar: Pose2 = (0.0, 0.0, 0.0)
     """In base."""
     camera: CameraView = CameraView()
 
@@ -47,7 +47,7 @@ class ExploreSetup:
 class ExploreTask:
     """What is newer than at the task before, and whether a decision is requested."""
 
-    pose: Pose
+    pose: Pose2
     """Of the base, in map."""
     whole: Grid | None = None
     """A whole map, which replaces the last one."""
@@ -64,7 +64,7 @@ class ExploreTask:
     """Frontiers here are skipped."""
     avoided: tuple[Point, ...] = ()
     """No viewpoints here: these places could not be reached."""
-    home: Pose | None = None
+    home: Pose2 | None = None
     """The path there is wanted."""
     find: bool = False
     """Walls are looked at, too, once no frontier is left."""
@@ -74,7 +74,7 @@ class ExploreTask:
 class Viewpoint:
     """A place to look from, and what for."""
 
-    pose: Pose
+    pose: Pose2
     """Of the base, in map."""
     frontier: Point
     """Centre of the frontier or wall that is viewed."""

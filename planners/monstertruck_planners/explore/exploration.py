@@ -10,10 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from monstertruck_planners.collision import placed
+from monstertruck_kinematics.se2 import Pose2, placed
 from monstertruck_planners.explore.config import ExplorerConfig
 from monstertruck_planners.explore.exchange import ExploreAnswer, Point, Viewpoint
-from monstertruck_planners.goals.exchange import Pose
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import ExplorationPhase
 from monstertruck_schemas.reasons import Reason
@@ -116,7 +115,7 @@ class Choose:
 class Go:
     """Send a goal."""
 
-    pose: Pose
+    pose: Pose2
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,9 +146,9 @@ class Observed:
 
     now: float
     """Seconds."""
-    pose: Pose | None
+    pose: Pose2 | None
     """Of the base, in map; None = not known, or not to be trusted."""
-    believed: Pose | None = None
+    believed: Pose2 | None = None
     """The pose even if it is not to be trusted."""
     ended: Reason | None = None
     """How the newest goal ended; None = it is pursued, or there was none."""
@@ -186,7 +185,7 @@ class Exploration:
 
     number: int
     source: str
-    home: Pose
+    home: Pose2
     returns: bool
     """Whether the robot drives home at the end."""
     budget: float
@@ -223,16 +222,16 @@ class Exploration:
     newest: ExploreAnswer = field(default_factory=ExploreAnswer)
     travelled: float = 0.0
     """Metres, by poses apart by ``COUNTED``."""
-    counted: Pose | None = None
+    counted: Pose2 | None = None
     """The last of these."""
-    before: Pose | None = None
-    trail: tuple[Pose, ...] = ()
+    before: Pose2 | None = None
+    trail: tuple[Pose2, ...] = ()
     """Where it came from, the newest last."""
-    near_home: tuple[Pose, ...] = ()
+    near_home: tuple[Pose2, ...] = ()
     """Where it passed first within ``NEAR_START`` of its start, ``SPACING`` apart."""
     stuck: int = 0
     """Goals in a row that failed where the robot stands."""
-    stuck_at: Pose | None = None
+    stuck_at: Pose2 | None = None
     """Where the robot stands then."""
     blameless: tuple[Attempts, Attempts] | None = None
     """At frontiers and at places to look from, before these goals."""
@@ -247,7 +246,7 @@ class Exploration:
     """Of them: at which the robot cannot stand."""
     looks: int = 0
     """Short drives since the robot was lost."""
-    came_from: Pose | None = None
+    came_from: Pose2 | None = None
     """Where the newest of these began, and whether the robot has to drive back there."""
     goes_back: bool = False
 
@@ -261,7 +260,7 @@ Step = tuple[Exploration, tuple[Action, ...]]
 
 
 def begin(
-    number: int, source: str, pose: Pose, now: float, config: ExplorerConfig, *, home: bool, budget: float,
+    number: int, source: str, pose: Pose2, now: float, config: ExplorerConfig, *, home: bool, budget: float,
     find: int | None = None,
 ) -> Step:  # fmt: skip
     """Take on an exploration."""
@@ -329,7 +328,7 @@ def _moved(run: Exploration, seen: Observed) -> Exploration:
     )  # fmt: skip
 
 
-def _near_home(run: Exploration, pose: Pose | None) -> tuple[Pose, ...]:
+def _near_home(run: Exploration, pose: Pose2 | None) -> tuple[Pose2, ...]:
     """Where a robot that set out has been: what it could not see behind itself at its start, it passed over there."""
     places = run.near_home
     if pose is None or len(places) == PLACES or math.dist(pose[:2], run.home[:2]) > NEAR_START:
@@ -534,7 +533,7 @@ def _returning(run: Exploration, seen: Observed) -> Step:
     return replace(run, target=Viewpoint(pose, pose[:2]), home_goals=run.home_goals + 1), (Go(pose),)
 
 
-def _back_home(run: Exploration, pose: Pose) -> Step:
+def _back_home(run: Exploration, pose: Pose2) -> Step:
     away = math.dist(pose[:2], run.home[:2])
     beside = f"{away:.1f} m from the start, which the map does not show as free"
     where = "back at the start" if pose == run.home else beside

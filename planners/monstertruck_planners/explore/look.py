@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_planners.collision import OCCUPIED
 from monstertruck_planners.explore.api import ExplorationView
 from monstertruck_planners.explore.exchange import CameraView, Viewpoint
 from monstertruck_planners.explore.frontier import FrontierMap
 from monstertruck_planners.explore.kernels import shares_seen
-from monstertruck_planners.goals.exchange import Pose
 
 FACE: Final = 0.2
 """Faces of walls are counted by squares of this side, m, and eight directions."""
@@ -56,7 +56,7 @@ class WallLooks:
         self._camera = camera
         self._looked: set[int] = set()
 
-    def take(self, known: FrontierMap, pose: Pose) -> None:
+    def take(self, known: FrontierMap, pose: Pose2) -> None:
         """The robot is here: what is before its camera was viewed."""
         faces = faces_of(known)
         if len(faces.keys):
@@ -85,7 +85,7 @@ class WallLooks:
                 best, least = Viewpoint(pose, (x, y), length, gain * FACE), (length + WORTH) / gain
         return best
 
-    def _place(self, view: ExplorationView, point: Array, normal: Array) -> Pose | None:
+    def _place(self, view: ExplorationView, point: Array, normal: Array) -> Pose2 | None:
         """Where the robot can stand with the face before its camera."""
         mx, my, turn = self._camera.mount
         for aside in ASIDE:
@@ -102,7 +102,7 @@ class WallLooks:
                     return pose
         return None
 
-    def _sees(self, known: FrontierMap, faces: Faces, pose: Pose) -> NDArray[np.bool_]:
+    def _sees(self, known: FrontierMap, faces: Faces, pose: Pose2) -> NDArray[np.bool_]:
         """Which faces are before the camera of a robot at a pose."""
         camera, (mx, my, turn) = self._camera, self._camera.mount
         c, s = math.cos(pose[2]), math.sin(pose[2])

@@ -8,10 +8,11 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_planners.explore import exploration
 from monstertruck_planners.explore.exchange import ExploreAnswer, ExploreSetup, ExploreTask
 from monstertruck_planners.explore.exploration import Action, Cancel, Choose, Exploration, Go, Notice, Observed, Save
-from monstertruck_planners.goals.exchange import Pose, pose_of
+from monstertruck_planners.goals.exchange import pose_of
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.tasks import TaskServer
 from monstertruck_runtime.actors.actor import Actor
@@ -98,7 +99,7 @@ class ExplorerService:
         self._setup, self._config, self._clock, self._place = setup, setup.config, clock, actor
         self._goals, self._save = goals, save
         self._in, self._events = inputs, events
-        self.tasks = TaskServer[ExploreRequest, Pose, ExplorationState](
+        self.tasks = TaskServer[ExploreRequest, Pose2, ExplorationState](
             self, clock, inputs.gate, max_age, state, changes=CHANGES, period=REPORT, others=(inputs.goal,)
         )
         self._run: Exploration | None = None
@@ -141,7 +142,7 @@ class ExplorerService:
         """Whether an exploration runs."""
         return self._run is not None and self._run.running
 
-    def accept(self, request: ExploreRequest) -> Pose:
+    def accept(self, request: ExploreRequest) -> Pose2:
         """Where an exploration would begin.
 
         Raises:
@@ -155,7 +156,7 @@ class ExplorerService:
             )
         return pose
 
-    def begin(self, accepted: Pose, request: ExploreRequest, number: int) -> None:
+    def begin(self, accepted: Pose2, request: ExploreRequest, number: int) -> None:
         """Explore from a pose on."""
         self._fresh, self._goal, self._refused, self._saves = True, None, None, None
         self._deciding = None  # of the exploration before: its answer is not one to this
@@ -278,12 +279,12 @@ class ExplorerService:
             return None, "", ""
         return goal.outcome, goal.text, ""
 
-    def _believed(self, now: int) -> Pose | None:
+    def _believed(self, now: int) -> Pose2 | None:
         """Of the base in map, whatever it is worth."""
         pose = self._in.pose.latest
         return None if pose is None or now - pose.received > POSE.fresh_for() * SECOND else pose_of(pose)
 
-    def _pose(self, now: int) -> Pose | None:
+    def _pose(self, now: int) -> Pose2 | None:
         """Of the base in map, while it is known."""
         pose, slam = self._believed(now), self._in.slam.latest
         if pose is None:
@@ -353,7 +354,7 @@ class ExplorerService:
         self._seq += 1
         return inner_request(self._seq, self._in.gate.latest, self._clock.now(), SOURCE)
 
-    def _go(self, pose: Pose) -> None:
+    def _go(self, pose: Pose2) -> None:
         x, y, yaw = pose
         self._refused = None
         try:

@@ -16,16 +16,9 @@ from scipy.ndimage import binary_dilation
 
 from monstertruck_estimation.slam.grid import trace
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import (
-    OCCUPIED,
-    DistanceField,
-    first_contact,
-    placed,
-    points_relative,
-    poses_relative,
-    scan_points_at,
-)
-from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Pose, Setup, explained_within
+from monstertruck_kinematics.se2 import Pose2, placed, points_relative, poses_relative
+from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, scan_points_at
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Setup, explained_within
 from monstertruck_planners.goals.plan_step import answer_of
 from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, nearest_pose, pose_distance
 from monstertruck_planners.local.catalog import make_local_planner
@@ -268,7 +261,7 @@ class DeformStep:
         directions[:1] = directions[1:2] if len(directions) > 1 else directions
         self._place = first + nearest_pose(PosePath(guide.poses[first : last + 1], directions), here)
 
-    def _free(self, setup: Setup, here: Array, pose: Pose, points: Array, mapped: NDArray[np.bool_]) -> bool:
+    def _free(self, setup: Setup, here: Array, pose: Pose2, points: Array, mapped: NDArray[np.bool_]) -> bool:
         """Whether the truck can drive the route as it is: always looked at; to go back to it more is asked.
 
         The route keeps its distance to the map's obstacles; where these seem nearer the pose is off, and only what the

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
@@ -14,7 +15,6 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Ground, Odometry
 
-Pose = tuple[float, float, float]
 Place = tuple[float, float, float | None]
 """x, y (m), and yaw (rad) if it matters."""
 
@@ -26,7 +26,7 @@ class Setup:
     config: PlannerConfig
     geometry: FourWheelSteering
     footprint: Footprint
-    lidar: Pose = (0.0, 0.0, 0.0)
+    lidar: Pose2 = (0.0, 0.0, 0.0)
     """Pose of the lidar in base."""
     cusp_clearance: float = 0.0
     """Clearance that the gate demands at a cusp, m."""
@@ -52,7 +52,7 @@ class SeenGround:
 
     grid: Grid
     """See ``topics.SEEN``."""
-    pose: Pose
+    pose: Pose2
     """Of the grid's frame in the map's frame."""
     field: tuple[float, float]
     """Least and greatest bearing that the lidar measures, rad."""
@@ -65,9 +65,9 @@ class PlanTask:
     """One thing to plan."""
 
     what: Literal["route", "escape"]
-    pose: Pose
+    pose: Pose2
     """Of the base, in the map's frame."""
-    goal: Pose
+    goal: Pose2
     """Of the base."""
     points: Array
     """Shape (n, 2): returns of the newest scan in the map's frame, m."""
@@ -135,7 +135,7 @@ class DeformTask:
     """One scan, with what is newer than at the scan before."""
 
     scan: LaserScan
-    pose: Pose
+    pose: Pose2
     """Of the base, in the map's frame."""
     setup: Setup | None = None
     grid: Grid | None = None
@@ -198,7 +198,7 @@ def explained_within(config: PlannerConfig, deviation: float) -> float:
     return config.scan_tolerance + min(2.0 * deviation, config.scan_tolerance)
 
 
-def pose_of(odometry: Odometry) -> Pose:
+def pose_of(odometry: Odometry) -> Pose2:
     """x, y (m), yaw (rad)."""
     return odometry.pose.x, odometry.pose.y, odometry.pose.yaw
 

@@ -8,8 +8,9 @@ import math
 from dataclasses import dataclass, replace
 from typing import Final, Literal, assert_never
 
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_planners.goals.config import PlannerConfig
-from monstertruck_planners.goals.exchange import Place, PlanAnswer, Pose
+from monstertruck_planners.goals.exchange import Place, PlanAnswer
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.reasons import Reason
@@ -89,7 +90,7 @@ class Observations:
     armed: bool
     """The gate lets the truck move."""
     at_rest: bool
-    pose: Pose | None
+    pose: Pose2 | None
     """Of the base, in the goal's frame."""
     answer: PlanAnswer | None = None
     """The newest plan, once."""
@@ -116,7 +117,7 @@ class GoalRun:
     """One goal and how far it has come."""
 
     number: int
-    goal: Pose
+    goal: Pose2
     source: str
     now: float
     via: tuple[Place, ...] = ()
@@ -161,7 +162,7 @@ class GoalRun:
 Step = tuple[GoalRun, tuple[Action, ...]]
 
 
-def begin(number: int, goal: Pose, source: str, now: float, via: tuple[Place, ...] = ()) -> Step:
+def begin(number: int, goal: Pose2, source: str, now: float, via: tuple[Place, ...] = ()) -> Step:
     """Take on a goal."""
     run = GoalRun(number, goal, source, now, via, since=now, moved=now)
     x, y, yaw = goal
@@ -290,7 +291,7 @@ def _progressed(run: GoalRun, left: float, config: PlannerConfig) -> GoalRun:
     return replace(run, next_recovery=0) if run.nearest < run.recovery_distance - config.recovered else run
 
 
-def _at_waypoint(run: GoalRun, pose: Pose | None, config: PlannerConfig) -> bool:
+def _at_waypoint(run: GoalRun, pose: Pose2 | None, config: PlannerConfig) -> bool:
     return bool(run.via) and pose is not None and math.dist(pose[:2], run.via[0][:2]) < config.waypoint_radius
 
 
@@ -358,12 +359,12 @@ def _end(run: GoalRun, reason: Reason, text: str, severity: Severity = Severity.
     return ended, (Halt(), Report(reason, severity, f"goal {run.number}: {text}"))
 
 
-def _error(pose: Pose, goal: Pose, config: PlannerConfig) -> float:
+def _error(pose: Pose2, goal: Pose2, config: PlannerConfig) -> float:
     """How far a pose is off a goal, as the greater share of its tolerances."""
     away, turned = apart(pose, goal)
     return max(away / config.position_tolerance, turned / config.yaw_tolerance)
 
 
-def apart(a: Pose, b: Pose) -> tuple[float, float]:
+def apart(a: Pose2, b: Pose2) -> tuple[float, float]:
     """Distance, m, and angle, rad, between two poses."""
     return math.dist(a[:2], b[:2]), abs(math.remainder(a[2] - b[2], math.tau))

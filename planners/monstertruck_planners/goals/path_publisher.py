@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import Footprint, first_contact, placed, poses_relative
-from monstertruck_planners.goals.exchange import PlanAnswer, Pose, pose_of
+from monstertruck_kinematics.se2 import Pose2, placed, poses_relative
+from monstertruck_planners.collision import Footprint, first_contact
+from monstertruck_planners.goals.exchange import PlanAnswer, pose_of
 from monstertruck_planners.track.segments import stops
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Mailbox
@@ -204,7 +205,7 @@ def _followed(path: Path, before: float = 0.0) -> FollowedPath:
     return FollowedPath(path, poses, np.concatenate(([0.0], np.cumsum(steps))), before)
 
 
-def poses_ahead(poses: Array, travelled: Array, along: float, reach: float, pose: Pose) -> Array:
+def poses_ahead(poses: Array, travelled: Array, along: float, reach: float, pose: Pose2) -> Array:
     """The truck's pose, then the path's poses from ``along`` to ``along + reach``, one every few centimetres.
 
     Args:
@@ -223,7 +224,7 @@ def poses_ahead(poses: Array, travelled: Array, along: float, reach: float, pose
     return np.vstack((np.array(pose), chosen))
 
 
-def path_blocked(footprint: Footprint, poses: Array, points: Array, at: Pose) -> bool:
+def path_blocked(footprint: Footprint, poses: Array, points: Array, at: Pose2) -> bool:
     """Whether the footprint driven along ``poses`` (m, 3) comes upon a point of a scan.
 
     Args:

@@ -18,16 +18,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import (
-    OCCUPIED,
-    DistanceField,
-    Footprint,
-    placed,
-    points_relative,
-    rectangle_distance,
-)
+from monstertruck_kinematics.se2 import Pose2, placed, points_relative
+from monstertruck_planners.collision import OCCUPIED, DistanceField, Footprint, rectangle_distance
 from monstertruck_planners.goals.escape import escape
-from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, Setup, explained_within
+from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Setup, explained_within
 from monstertruck_planners.goals.unseen import Unseen, unseen_around
 from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle, make_planner, warm_up
 from monstertruck_planners.route.config import GoalConfig, GridAstarConfig, HybridConfig, LatticeConfig
@@ -164,7 +158,7 @@ class StaticMap:
         previous: the last map: only differences are computed again.
     """
 
-    def __init__(self, cells: Cells, resolution: float, origin: Pose, previous: "StaticMap | None" = None) -> None:
+    def __init__(self, cells: Cells, resolution: float, origin: Pose2, previous: "StaticMap | None" = None) -> None:
         self.cells = cells
         self.resolution = resolution
         self.origin = origin
@@ -188,7 +182,7 @@ class StaticMap:
             marked(np.zeros(self.cells.shape, np.bool_), points, self.resolution, self.origin), 100, self.cells
         )
 
-    def obstacles(self, cells: Cells, pose: Pose, reach: float) -> Array:
+    def obstacles(self, cells: Cells, pose: Pose2, reach: float) -> Array:
         """Centres of the occupied cells round a pose, shape (n, 2), in the frame of the pose."""
         rows, columns = np.nonzero(cells >= OCCUPIED)
         centres = (np.column_stack((columns, rows)) + 0.5) * self.resolution
@@ -197,7 +191,7 @@ class StaticMap:
         return np.asarray(there[np.hypot(there[:, 0], there[:, 1]) < reach])
 
 
-def marked(cells: NDArray[np.bool_], points: Array, resolution: float, origin: Pose) -> NDArray[np.bool_]:
+def marked(cells: NDArray[np.bool_], points: Array, resolution: float, origin: Pose2) -> NDArray[np.bool_]:
     """Cells of a grid (rows, columns) with those set that hold a point; points (n, 2) in the frame of ``origin``."""
     column, row = (np.floor(v / resolution).astype(np.int64) for v in points_relative(points, origin).T)
     rows, columns = cells.shape
@@ -207,7 +201,7 @@ def marked(cells: NDArray[np.bool_], points: Array, resolution: float, origin: P
 
 
 def standing_free(
-    cells: Cells, resolution: float, origin: Pose, footprint: Footprint, pose: Pose, beside: float = 0.0
+    cells: Cells, resolution: float, origin: Pose2, footprint: Footprint, pose: Pose2, beside: float = 0.0
 ) -> Cells:
     """Cells with those under the truck set free: unknown ones, and obstacles that it overlaps by its edge only.
 
@@ -264,7 +258,7 @@ def ground_layers(ground: Ground, grid: StaticMap, reach: float) -> tuple[Array,
     return layers[0], layers[1]
 
 
-def _cells_within(grid: StaticMap, corner: Pose, size: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _cells_within(grid: StaticMap, corner: Pose2, size: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns of a map's cells round a rectangle: the pose of its corner, and its height and width, m."""
     flat = np.array([(x, y, 0.0) for x in (0.0, size[1]) for y in (0.0, size[0])])
     box = points_relative(placed(flat, corner)[:, :2], grid.origin) / grid.resolution
@@ -491,13 +485,13 @@ class PlanningStep:
             unseen=self._closed_cells(cells.shape, static_map.resolution, static_map.origin),
         )
 
-    def _closed_cells(self, shape: tuple[int, ...], resolution: float, origin: Pose) -> NDArray[np.bool_] | None:
+    def _closed_cells(self, shape: tuple[int, ...], resolution: float, origin: Pose2) -> NDArray[np.bool_] | None:
         """Cells of a grid with the closed unseen places; None without any."""
         if not len(self._closed):
             return None
         return marked(np.zeros(shape, np.bool_), self._closed, resolution, origin)
 
-    def _standing(self, static_map: StaticMap, cells: Cells, pose: Pose) -> RouteMap:
+    def _standing(self, static_map: StaticMap, cells: Cells, pose: Pose2) -> RouteMap:
         """The map with the ground under the truck free, and with a margin if the truck is at its edge."""
         assert self._setup is not None
         footprint = self._setup.footprint

@@ -8,7 +8,8 @@ from typing import Any, Final
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import placed, scan_points_at
+from monstertruck_kinematics.se2 import Pose2, placed
+from monstertruck_planners.collision import scan_points_at
 from monstertruck_planners.goals import goal_run
 from monstertruck_planners.goals.deformation import RouteDeformation, event_of
 from monstertruck_planners.goals.exchange import (
@@ -17,7 +18,6 @@ from monstertruck_planners.goals.exchange import (
     Place,
     PlanAnswer,
     PlanTask,
-    Pose,
     SeenGround,
     SeenScan,
     Setup,
@@ -70,7 +70,7 @@ TRAIL: Final = 4 * SECOND
 JUMP: Final = 0.5
 """Distance between the poses of two ticks that counts as a jump, m: the kept scans are dropped."""
 
-Route = tuple[Pose, tuple[Place, ...]]
+Route = tuple[Pose2, tuple[Place, ...]]
 """A goal, and what is passed before it."""
 
 
@@ -135,11 +135,11 @@ class GoalService:
         self._sent_ground: Ground | None = None
         self._scanned: tuple[LaserScan, Odometry] | None = None
         self._points: Array = np.empty((0, 2))
-        self._seen: deque[tuple[Pose, Array]] = deque(maxlen=SEEN)
+        self._seen: deque[tuple[Pose2, Array]] = deque(maxlen=SEEN)
         """Poses and returns in base of scans since the last plan."""
-        self._trail: deque[tuple[int, Pose]] = deque()
+        self._trail: deque[tuple[int, Pose2]] = deque()
         """Times (ns) and poses of the last ticks."""
-        self._before: Pose | None = None
+        self._before: Pose2 | None = None
 
     async def run(self, ready: Ready) -> None:
         """Serve goals until cancelled.
@@ -489,12 +489,12 @@ def _estopped(gate: GateState | None) -> bool:
     return gate is not None and gate.mode is GateMode.ESTOPPED
 
 
-def _in_map(points: Array, pose: Pose) -> Array:
+def _in_map(points: Array, pose: Pose2) -> Array:
     """Points in base, shape (n, 2), in the frame of the pose."""
     return placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
 
 
-def _moved_on(before: Pose, pose: Pose) -> bool:
+def _moved_on(before: Pose2, pose: Pose2) -> bool:
     turned = abs(math.remainder(pose[2] - before[2], math.tau))
     return math.dist(before[:2], pose[:2]) > SEEN_STEP or turned > SEEN_TURN
 

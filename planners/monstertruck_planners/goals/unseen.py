@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import DistanceField, Footprint, placed, points_relative, rectangle_distance
-from monstertruck_planners.goals.exchange import PlanAnswer, Pose, SeenGround
+from monstertruck_kinematics.se2 import Pose2, placed, points_relative
+from monstertruck_planners.collision import DistanceField, Footprint, rectangle_distance
+from monstertruck_planners.goals.exchange import PlanAnswer, SeenGround
 
 NEAR: Final = 0.6
 """Unseen ground within this distance of what a route would cover in reverse is closed to the next one, m: a truck's
@@ -50,12 +51,12 @@ class Unseen:
 
     places: Array
     left: Array
-    lidar: Pose
+    lidar: Pose2
     field: tuple[float, float]
     reach: float
     footprint: Footprint
 
-    def near(self, pose: Pose) -> Array:
+    def near(self, pose: Pose2) -> Array:
         """Places that count as unseen now, in base at ``pose``, shape (n, 2), m."""
         return points_relative(self.places[self.left < SOON], pose)
 
@@ -118,7 +119,7 @@ class Unseen:
         return np.asarray(visible)
 
 
-def unseen_around(seen: SeenGround, keep: float, lidar: Pose, footprint: Footprint) -> Unseen:
+def unseen_around(seen: SeenGround, keep: float, lidar: Pose2, footprint: Footprint) -> Unseen:
     """Ground of a survey that counts as unseen now or soon.
 
     Args:

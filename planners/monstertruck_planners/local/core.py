@@ -11,7 +11,8 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import DistanceField, points_relative
+from monstertruck_kinematics.se2 import points_relative
+from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.collision_kernels import FieldData, FootprintData, safe_distance
 from monstertruck_planners.local.api import (
     CUSP_REACHED,

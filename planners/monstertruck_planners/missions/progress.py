@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from monstertruck_planners.goals.exchange import Pose
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_schemas.base import Pose2D, Schema
 from monstertruck_schemas.mission import (
     AnyStep,
@@ -54,7 +54,7 @@ class MissionProgress:
     """One mission and how far it has come."""
 
     mission: Mission
-    start: Pose
+    start: Pose2
     """Where it began, in map."""
     index: int = 0
     """Index of the present step."""
@@ -177,7 +177,7 @@ class SavedProgress(Schema):
         return self
 
     @classmethod
-    def of(cls, progress: MissionProgress, source: str, at: Pose | None = None) -> "SavedProgress":
+    def of(cls, progress: MissionProgress, source: str, at: Pose2 | None = None) -> "SavedProgress":
         """What is kept of a mission."""
         x, y, yaw = progress.start
         return cls(
@@ -199,6 +199,6 @@ class SavedProgress(Schema):
             self.mission, start, self.index, failures=self.failures, why=why, returning=self.returning
         )
 
-    def away(self, pose: Pose) -> float:
+    def away(self, pose: Pose2) -> float:
         """Metres of a pose from where the robot was."""
         return 0.0 if self.at is None else math.dist(pose[:2], (self.at.x, self.at.y))

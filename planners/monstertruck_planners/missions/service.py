@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar, assert_never
 
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_planners.behave.service import BehaviourService
 from monstertruck_planners.explore.service import ExplorerService
-from monstertruck_planners.goals.exchange import Pose, pose_of, require_place
+from monstertruck_planners.goals.exchange import pose_of, require_place
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.missions.progress import (
     GOOD,
@@ -178,7 +179,7 @@ class MissionService:
         """Writes what the newest request changed."""
         self._limit: asyncio.Timeout | None = None
         """Of the present step."""
-        self._noted: Pose | None = None
+        self._noted: Pose2 | None = None
         """Where the robot was when that was last kept."""
         self._task: asyncio.Task[None] | None = None
         self._group: asyncio.TaskGroup | None = None
@@ -405,7 +406,7 @@ class MissionService:
             await self._clock.sleep(min(left / SECOND, 1.0 / RATE))
         return StepEnd(Reason.OK)
 
-    def _before(self, step: PointStep) -> Pose:
+    def _before(self, step: PointStep) -> Pose2:
         """Pose before a point of interest.
 
         Raises:
@@ -421,7 +422,7 @@ class MissionService:
                 return pose.x, pose.y, pose.yaw
         raise NotFoundError(f"no point of interest {step.point!r} is known")
 
-    def _towards(self, x: float, y: float) -> Pose:
+    def _towards(self, x: float, y: float) -> Pose2:
         """Pose of the robot as it is, turned towards a place.
 
         Raises:
@@ -431,7 +432,7 @@ class MissionService:
             raise RequestRefusedError(Reason.NO_MAP, "no fresh pose")
         return pose[0], pose[1], math.atan2(y - pose[1], x - pose[0])
 
-    async def _go(self, where: Callable[[], Pose], via: tuple[tuple[float, float], ...] = ()) -> StepEnd:
+    async def _go(self, where: Callable[[], Pose2], via: tuple[tuple[float, float], ...] = ()) -> StepEnd:
         waypoints = tuple(Waypoint(x=a, y=b) for a, b in via)
 
         def start() -> GoalRequest | GoalControl:
@@ -549,7 +550,7 @@ class MissionService:
         self._seq += 1
         return inner_request(self._seq, self._in.gate.latest, self._clock.now(), SOURCE)
 
-    def _pose(self) -> Pose | None:
+    def _pose(self) -> Pose2 | None:
         pose = self._in.pose.latest
         if pose is None or self._clock.now() - pose.received > ODOMETRY.fresh_for() * SECOND:
             return None

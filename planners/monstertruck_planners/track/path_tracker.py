@@ -18,6 +18,7 @@ import numpy as np
 
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.response import Response, ResponseEstimator, choose, rounded
@@ -33,7 +34,6 @@ from monstertruck_schemas.plan import MAX_RUNS, Steering
 from monstertruck_schemas.reasons import Reason
 
 Angles = tuple[float, float]
-Pose = tuple[float, float, float]
 
 LONGEST: Final = 0.05
 """Greatest time step of the prediction, s."""
@@ -105,7 +105,7 @@ class AxleModel:
             self._target = self._due.popleft()[1]
         self._t = t
 
-    def ahead(self, pose: Pose, speed: float, geometry: FourWheelSteering, seconds: float) -> tuple[Pose, Angles]:
+    def ahead(self, pose: Pose2, speed: float, geometry: FourWheelSteering, seconds: float) -> tuple[Pose2, Angles]:
         """Pose and angles in ``seconds``, at a constant speed and if nothing else is requested."""
         angles = self.angles
         begin = self._t or 0.0
@@ -252,7 +252,7 @@ TURNED: Final = 0.03
 class TrackingState(NamedTuple):
     """The predicted state at which a request made at this step begins to act, and the reference there."""
 
-    pose: Pose
+    pose: Pose2
     """x, y (m), yaw (rad)."""
     angles: Angles
     """Of the axles, rad."""

@@ -10,10 +10,11 @@ from typing import Any, Final, NamedTuple
 from monstertruck_estimation.body_tilt import BodyAcceleration
 from monstertruck_estimation.ground.terrain import TerrainEstimator
 from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.se2 import Pose2, poses_relative
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint, ScanPoints, clearance_to_points, points_near, poses_relative
+from monstertruck_planners.collision import Footprint, ScanPoints, clearance_to_points, points_near
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
-from monstertruck_planners.track.path_tracker import Command, Pose, TruckState
+from monstertruck_planners.track.path_tracker import Command, TruckState
 from monstertruck_planners.track.segments import PathProgress, SegmentedPath
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
@@ -63,7 +64,7 @@ class TrackSetup:
     config: AnyTracker
     steering: FourWheelSteering
     footprint: Footprint
-    lidar: Pose
+    lidar: Pose2
     """Pose of the lidar in base."""
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from monstertruck_estimation.odometry import DeadReckoning, OdometryConfig
 from monstertruck_kinematics.chassis import Dimensions
-from monstertruck_kinematics.elementary import integrate
+from monstertruck_kinematics.se2 import integrate
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.bodies import BODIES
 from monstertruck_runtime.clock import SECOND

@@ -6,7 +6,7 @@ import pytest
 
 from monstertruck_estimation.rear_wheels import EncoderConfig, EncoderInput, RearWheelConfig, RearWheelReckoning, judged
 from monstertruck_kinematics.chassis import Dimensions, tricycle_chassis
-from monstertruck_kinematics.elementary import integrate
+from monstertruck_kinematics.se2 import integrate
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import SteeringFeedback, WheelEncoders

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from monstertruck_kinematics.chassis import STILL
-from monstertruck_planners.collision import Footprint, ScanPoints, placed
+from monstertruck_kinematics.se2 import placed
+from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason

@@ -5,14 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.elementary import (
-    KinematicsError,
-    integrate,
-    integration_jacobians,
-    to_body,
-    to_world,
-    twist_at,
-)
+from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.se2 import integrate, integration_jacobians, to_body, to_world, twist_at
 from monstertruck_kinematics.steered import Ackermann, Bicycle, FourWheelSteer, IndependentSteer, Synchro, Tricycle
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_kinematics.unsteered import Differential, SkidSteer, SwedishDrive, mecanum, omni

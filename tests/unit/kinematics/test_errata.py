@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.elementary import twist_at
 from monstertruck_kinematics.identification import PUBLISHED_CIRCLES, PUBLISHED_HALF_TRACK, PUBLISHED_RADIUS
 from monstertruck_kinematics.linkage import SteeringLinkage
 from monstertruck_kinematics.polynomials import (
@@ -16,6 +15,7 @@ from monstertruck_kinematics.polynomials import (
     SteeringPolynomials,
     polynomial,
 )
+from monstertruck_kinematics.se2 import twist_at
 from monstertruck_kinematics.steered import Ackermann, Synchro
 from monstertruck_kinematics.truck import DriveTrain, FourWheelSteering, LinkedAxles
 from monstertruck_kinematics.unsteered import SkidSteer

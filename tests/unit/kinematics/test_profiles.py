@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.elementary import KinematicsError, integrate
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.profiles import (
     BasicMove,
     CubicProfile,
@@ -14,6 +14,7 @@ from monstertruck_kinematics.profiles import (
     TrapezoidalProfile,
     shortest_ramp,
 )
+from monstertruck_kinematics.se2 import integrate
 from monstertruck_kinematics.steered import Ackermann, Bicycle, FourWheelSteer, IndependentSteer, Synchro, Tricycle
 from monstertruck_kinematics.unsteered import Differential, SkidSteer, mecanum, omni
 

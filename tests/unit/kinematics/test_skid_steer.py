@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monstertruck_kinematics.elementary import KinematicsError, integrate, twist_at
+from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.fitting import least_squares, minimax
 from monstertruck_kinematics.identification import (
     MODEL_NAMES,
@@ -20,6 +20,7 @@ from monstertruck_kinematics.identification import (
     skid_model,
     unexplained_spread,
 )
+from monstertruck_kinematics.se2 import integrate, twist_at
 from monstertruck_kinematics.unsteered import SkidSteer
 
 IDEAL = SkidSteer.ideal(PUBLISHED_RADIUS, PUBLISHED_HALF_TRACK)

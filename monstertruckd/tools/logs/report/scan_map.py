@@ -11,7 +11,8 @@ from PIL import Image
 
 from monstertruck_estimation.transforms import FrameTree, planar_pose
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.collision import placed, scan_points
+from monstertruck_kinematics.se2 import placed
+from monstertruck_planners.collision import scan_points
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import NotFoundError
 from monstertruck_schemas.sensor import LaserScan, SonarRanges

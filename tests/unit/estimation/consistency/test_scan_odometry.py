@@ -9,9 +9,9 @@ from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.exchange import ScanVerdict, StepInput, StepOutput
 from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
 from monstertruck_estimation.consistency.scan_odometry import ScanMotionStep, scatter_of
-from monstertruck_estimation.se2 import between
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_estimation.wheel_motion import WheelIncrement
+from monstertruck_kinematics.se2 import between
 from monstertruck_runtime.clock import SECOND
 from tests.unit.estimation.consistency.kit import PERIOD, SENSORS, straight
 from tests.unit.estimation.slam.kit import CORRIDOR, HALL, LIDAR, ROOM, box, ranges

@@ -7,8 +7,8 @@ import numpy as np
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion
 from monstertruck_estimation.inertial import Inertial
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.transforms import IDENTITY
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.sensor import Attitude, Imu, Vector3

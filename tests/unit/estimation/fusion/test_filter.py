@@ -16,7 +16,7 @@ from monstertruck_estimation.fusion.filter import (
     initial_state,
     predict,
 )
-from monstertruck_estimation.se2 import between, between_jacobians
+from monstertruck_kinematics.se2 import between, between_jacobians
 from monstertruck_runtime.clock import SECOND
 from tests.unit.estimation.fusion.kit import config
 

@@ -5,11 +5,11 @@ import math
 
 import numpy as np
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.mapping import Mapper, Step
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 
 BEAMS = 240

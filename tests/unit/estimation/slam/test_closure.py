@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.closure import LoopCloser, LoopMatch, consistent_group, in_view
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.keyframes import KeyframeMap
+from monstertruck_kinematics.se2 import between, compose
 from tests.unit.estimation.slam.kit import box, drifting, errors, scan
 
 POSTS = ((-1.6, 1.3), (-0.7, -0.2), (0.4, 1.0), (0.9, -2.0), (1.7, 0.3), (2.6, -1.0), (3.4, 1.5), (3.0, 0.5))

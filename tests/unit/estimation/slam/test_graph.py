@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.graph import Edges, drift, optimise, residuals, robust_weights
 from monstertruck_estimation.slam.keyframes import pruned
+from monstertruck_kinematics.se2 import between, compose
 from tests.unit.estimation.slam.kit import errors, rounds
 
 SMALL_WINDOW = np.diag((1e4, 1e4, 4e4))

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.se2 import between, compose, transform
 from monstertruck_estimation.slam.budget import ScanBudget
 from monstertruck_estimation.slam.closure import LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
@@ -15,6 +14,7 @@ from monstertruck_estimation.slam.mapping import Mapper, MappingEstimator, Mappi
 from monstertruck_estimation.slam.relocation import CONFIRMING_WAY, JoinChange, Relocation
 from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput
+from monstertruck_kinematics.se2 import between, compose, transform
 from monstertruck_schemas.health import LocalisationStatus
 from tests.unit.estimation.slam.kit import HALL, LIDAR, WAY, box, consume, extend, ranges, rounds, scan
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from monstertruck_estimation.se2 import between
 from monstertruck_estimation.slam import keyframes
 from monstertruck_estimation.slam.graph import drift
 from monstertruck_estimation.slam.keyframes import LOOSENED, Trajectory
 from monstertruck_estimation.slam.mapping import Mapper
+from monstertruck_kinematics.se2 import between
 from tests.unit.estimation.slam.kit import rounds, scan
 from tests.unit.estimation.slam.test_relocation import HALL
 

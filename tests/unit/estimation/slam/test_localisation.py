@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam import localisation
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.localisation import LocalisationEstimator
@@ -14,6 +13,7 @@ from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch
 from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.storage import SavedMap
 from monstertruck_estimation.slam.worker_io import ScanInput, SlamEstimate
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import LocalisationStatus
 from tests.unit.estimation.slam.kit import LIDAR, ROOM, box, ranges, rounds

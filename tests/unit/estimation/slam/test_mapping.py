@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.kiss_matcher import KissMatcher
 from monstertruck_estimation.slam.mapping import Mapper, MappingEvent
 from monstertruck_estimation.slam.scans import ScanGeometry, prepare
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_schemas.health import OdometryUse
 from tests.unit.estimation.slam.kit import (
     BEAMS,

@@ -4,10 +4,10 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.motion import MotionPredictor, OdometryCheck, ScanOdometry
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch, rejected
+from monstertruck_kinematics.se2 import between, compose
 from monstertruck_schemas.health import OdometryUse
 
 INFORMATION = np.diag((1e4, 1e5, 1e6))

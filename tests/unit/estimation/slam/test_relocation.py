@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from monstertruck_estimation.se2 import between, compose
 from monstertruck_estimation.slam.budget import ScanBudget, finished
 from monstertruck_estimation.slam.closure import LoopCloser, opposed
 from monstertruck_estimation.slam.config import MapperConfig
@@ -14,6 +13,7 @@ from monstertruck_estimation.slam.mapping import UNKNOWN, Mapper, MappingEvent
 from monstertruck_estimation.slam.relocation import LOST_PATH, LossDetector, Relocation, contradicts, led_there
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch, rejected
 from monstertruck_estimation.slam.storage import saved_graph
+from monstertruck_kinematics.se2 import between, compose
 from tests.unit.estimation.slam.kit import HALL, WAY, box, drifting, errors, extend, rounds, scan, submaps
 
 SECOND = 10**9

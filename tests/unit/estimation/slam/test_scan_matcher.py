@@ -3,7 +3,6 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.se2 import between, compose, inverse, transform
 from monstertruck_estimation.slam.correlation import LikelihoodGrid, Submap, correlate, merged
 from monstertruck_estimation.slam.kiss_matcher import KissMatcher
 from monstertruck_estimation.slam.registration import Cloud, Fit, register
@@ -18,6 +17,7 @@ from monstertruck_estimation.slam.scan_matcher import (
     gated,
 )
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
+from monstertruck_kinematics.se2 import between, compose, inverse, transform
 from tests.unit.estimation.slam.kit import CORRIDOR, ROOM, box, scan
 
 PLACE = np.array((1.8, 0.2, 1.2))

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from monstertruck_estimation.correction import SmoothedCorrection
 from monstertruck_estimation.scan_tilt import plane_slopes, plane_tilt
-from monstertruck_estimation.se2 import SmoothedCorrection
 from monstertruck_estimation.slam import storage
 from monstertruck_estimation.slam import worker as estimation
 from monstertruck_estimation.slam.config import MapperConfig, SlamConfig

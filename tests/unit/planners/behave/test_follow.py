@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from monstertruck_kinematics.chassis import Dimensions, differential_chassis, synchro_chassis
-from monstertruck_kinematics.elementary import KinematicsError, integrate
+from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.se2 import integrate
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.api import BehaviourBody, Inputs
 from monstertruck_planners.behave.follow import FollowConfig, LeaderFollower

@@ -13,7 +13,8 @@ from monstertruck_kinematics.chassis import (
     synchro_chassis,
     truck_chassis,
 )
-from monstertruck_kinematics.elementary import KinematicsError, integrate
+from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_kinematics.se2 import integrate
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.api import BehaviourBody, Inputs
 from monstertruck_planners.behave.move import Move, MoveConfig

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from monstertruck_kinematics.se2 import placed, points_relative
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import Footprint, clearance_to_points, placed, points_relative
+from monstertruck_planners.collision import Footprint, clearance_to_points
 from monstertruck_planners.goals import goal_run
 from monstertruck_planners.goals.config import EscapeConfig, PlannerConfig
 from monstertruck_planners.goals.escape import blocked_sides, escape

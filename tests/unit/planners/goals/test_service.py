@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from monstertruck_planners.collision import placed
+from monstertruck_kinematics.se2 import placed
 from monstertruck_planners.goals import deformation
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.deform_step import DeformStep, Window

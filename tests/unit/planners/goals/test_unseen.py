@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from monstertruck_kinematics.se2 import Pose2, points_relative
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.collision import DistanceField, Footprint, points_relative, rectangle_distance
+from monstertruck_planners.collision import DistanceField, Footprint, rectangle_distance
 from monstertruck_planners.goals.config import EscapeConfig, PlannerConfig
 from monstertruck_planners.goals.escape import escape
-from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Pose, SeenGround, Setup
+from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, SeenGround, Setup
 from monstertruck_planners.goals.plan_step import PlanningStep
 from monstertruck_planners.goals.unseen import BESIDE, PACE, SOON, Unseen, unseen_around
 from monstertruck_planners.route.api import RouteMap, Vehicle
@@ -36,7 +37,7 @@ def grid(cells: np.ndarray, origin: tuple[float, float], frame: str) -> Grid:
     )  # fmt: skip
 
 
-def survey(*, age: int = 0, pose: Pose = HERE) -> SeenGround:
+def survey(*, age: int = 0, pose: Pose2 = HERE) -> SeenGround:
     """What a lidar of 240 degrees has seen of open ground since it was switched on there: all but what is behind."""
     middle = (np.arange(64) + 0.5 - 32) * 0.05
     x, y = np.meshgrid(middle, middle)
@@ -46,7 +47,7 @@ def survey(*, age: int = 0, pose: Pose = HERE) -> SeenGround:
 
 
 def planned(
-    goal: Pose, seen: SeenGround | None, *, room: np.ndarray | None = None, pose: Pose = HERE, route: Any = None
+    goal: Pose2, seen: SeenGround | None, *, room: np.ndarray | None = None, pose: Pose2 = HERE, route: Any = None
 ) -> tuple[PlanAnswer, PlanningStep]:
     cells = np.zeros((60, 100)) if room is None else room
     config = PlannerConfig(route=route or HybridConfig(margin=0.04, effort=3000, reverse_cost=2.0))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from monstertruck_kinematics.elementary import integrate
+from monstertruck_kinematics.se2 import integrate
 from monstertruck_kinematics.unsteered import SkidSteer
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.calibrate.slip import SkidArc, result_of

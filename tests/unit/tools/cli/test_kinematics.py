@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from monstertruck_kinematics.elementary import integrate
+from monstertruck_kinematics.se2 import integrate
 from monstertruck_kinematics.unsteered import SkidSteer
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.kinematics import app
