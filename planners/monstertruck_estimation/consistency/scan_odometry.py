@@ -42,6 +42,10 @@ STEPS: Final = 10
 """Steps by which a motion over a window is refined: scan odometry drifts."""
 SCATTERED: Final = 20
 """Newest changes of the motion whose scatter is measured."""
+AVERAGED: Final = 2
+"""Number of motions whose mean velocity deskews the next scan. With one, the registration error feeds back into the
+next scan and grows where only the last beams constrain the motion. With two it decays if a sweep takes no longer than
+the interval between scans."""
 REMEMBERED: Final = 128
 """Scans kept for claims."""
 
@@ -81,8 +85,8 @@ class ScanMotionStep:
     def __init__(self) -> None:
         self._front: tuple[str, KissFront | None] | None = None
         self._pose = np.zeros(3)
-        self._motion, self._seconds = np.zeros(3), 0.0
-        """Newest motion and the time it took."""
+        self._motions: deque[tuple[Array, float]] = deque(maxlen=AVERAGED)
+        """Latest motions with their durations (s)."""
         self._changes: deque[tuple[float, float]] = deque(maxlen=SCATTERED)
         """From one motion to the next, m^2 and rad^2."""
         self._last: tuple[int, Cloud] | None = None
@@ -102,9 +106,12 @@ class ScanMotionStep:
         name, front = self._front
         stamp, last = inputs.scan.stamp, None if inputs.anew else self._last
         dt = math.inf if last is None else (stamp - last[0]) / SECOND
-        share = dt / self._seconds if 0.0 < dt < GAP and self._seconds > 0 else 0.0
-        lasting = self._motion * share
-        twist = lasting / dt if share else np.zeros(3)
+        follows = bool(self._motions) and 0.0 < dt < GAP
+        lasting, twist = np.zeros(3), np.zeros(3)
+        if follows:
+            motion, seconds = self._motions[-1]
+            lasting = motion * (dt / seconds)
+            twist = np.sum([moved for moved, _ in self._motions], axis=0) / sum(seconds for _, seconds in self._motions)
         vx, vy, wz = twist.tolist()
         whole = prepare_input(inputs.scan, LONGEST_RANGE, (vx, vy, wz))
         scan = whole.downsampled(THINNED, MOST_POINTS)
@@ -118,7 +125,7 @@ class ScanMotionStep:
         self._last = stamp, cloud
         if found is None or last is None:
             self._begin(front, scan, self._pose)
-            self._motion, self._seconds = np.zeros(3), 0.0
+            self._motions.clear()
             self._changes.clear()
             self._kept.clear()
             self._kept.append((stamp, whole, self._pose))
@@ -126,10 +133,10 @@ class ScanMotionStep:
         motion, overlap, deviations = found
         self._pose = compose(self._pose, motion)
         self._keep(front, scan)
-        if share:
+        if follows:
             changed = motion - lasting
             self._changes.append((float(changed[:2] @ changed[:2]), float(changed[2] ** 2)))
-        self._motion, self._seconds = motion, dt
+        self._motions.append((motion, dt))
         self._kept.append((stamp, whole, self._pose))
         while stamp - self._kept[0][0] > KEPT:
             self._kept.popleft()

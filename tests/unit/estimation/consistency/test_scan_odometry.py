@@ -14,10 +14,10 @@ from monstertruck_estimation.wheel_motion import WheelIncrement
 from monstertruck_kinematics.se2 import between
 from monstertruck_runtime.clock import SECOND
 from tests.unit.estimation.consistency.kit import PERIOD, SENSORS, straight
-from tests.unit.estimation.slam.kit import CORRIDOR, HALL, LIDAR, ROOM, box, ranges
+from tests.unit.estimation.slam.kit import BEAMS, CORRIDOR, HALL, LIDAR, ROOM, box, ranges
 
 
-def outputs(walls, poses, front):
+def outputs(walls, poses, front, turn=0.0):
     rng, odometry = np.random.default_rng(3), ScanMotionStep()
     for k, pose in enumerate(poses):
         scan = ScanInput(
@@ -27,6 +27,7 @@ def outputs(walls, poses, front):
             angle_increment=LIDAR.angle_increment,
             range_min=0.02,
             range_max=30.0,
+            time_increment=turn / BEAMS,
         )
         yield odometry.step(StepInput(scan, front))
 
@@ -39,6 +40,14 @@ def test_it_follows_a_slow_start_along_walls(walls, start, front):
     truth = [between(a, b)[0] for a, b in pairwise(poses)]
     seen = [output.motion[0] for output in outputs(walls, poses, front)][1:]
     assert np.abs(np.cumsum(np.subtract(seen, truth))).max() < 0.02
+
+
+@pytest.mark.parametrize("front", ["own", "kiss"])
+def test_a_robot_at_rest_is_seen_at_rest_where_only_the_last_beams_meet_walls(front):
+    """A distortion undone by the newest motion alone swings up from scan to scan."""
+    corner = [((-1.6, 2.4), (1.2, 2.4)), ((1.2, 0.8), (1.2, 2.4))]
+    seen = [output.motion for output in outputs(corner, [(0.0, 0.0, 0.0)] * 100, front, turn=0.067)][1:]
+    assert np.abs(seen).max() < 0.03
 
 
 def test_it_states_what_nothing_constrains():
