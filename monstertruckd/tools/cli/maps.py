@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -14,7 +14,7 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.connection import not_ready, with_robot
 from monstertruckd.tools.cli.logs import finish_log
 from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption, with_parameters
-from monstertruckd.tools.cli.output import JsonOption, command_group, needs_extra, print_json, progress, remark
+from monstertruckd.tools.cli.output import JsonOption, command_group, finish, needs_extra, print_json, progress, remark
 
 if TYPE_CHECKING:
     from monstertruck_estimation.slam.storage import SavedMap
@@ -24,12 +24,19 @@ if TYPE_CHECKING:
     from monstertruckd.tools.logs.scans import LogGeometry, ScanLog
 
 
+MOST_LOST: Final = 0.1
+"""Share of the path that may be lost in a map built with success."""
 LABELS = {
     "log": "kind of log",
     "keys": "key scans",
     "closures": "loops closed",
     "rejected": "matches rejected",
+    "rejected_by": "rejected because",
     "left_out": "scans left out",
+    "left_out_by": "left out because",
+    "odometry": "path by odometry",
+    "lost_share": "path lost",
+    "path_m": "path, m",
     "standing": "status of scans",
     "odometry_ahead_s": "odometry ahead, s",
     "poses": "poses by",
@@ -57,7 +64,7 @@ LidarMount = Annotated[
 ]
 Trajectory = Annotated[
     Path | None,
-    typer.Option(help="Write the pose of every scan, at the middle of its sweep (TUM format)."),
+    typer.Option(help="Write poses at the middle of each sweep (TUM); `build` lists lost ones again in NAME.lost.txt."),
 ]
 Png = Annotated[Path | None, typer.Option("--png", help="Draw it.")]
 
@@ -101,38 +108,52 @@ def build(
     *,
     geometry: "LogGeometry",
 ) -> None:
-    """Build a map from a log's scans, and its odometry if it has any."""
+    """Build a map from a log's scans, and its odometry if it has any.
+
+    Exit code 90 (`pose_lost`) if more than a tenth of the path is lost; the map is written even so.
+    """
     from monstertruck_estimation.slam.config import SlamConfig
     from monstertruck_estimation.slam.worker import SlamWorker
     from monstertruck_estimation.slam.worker_io import WorkerInput
     from monstertruck_runtime.errors import InputError
+    from monstertruck_schemas.reasons import Reason
+    from monstertruckd.tools.logs.map_quality import PathQuality
     from monstertruckd.tools.logs.trajectory import write_tum
 
     scans = _read(log, geometry)
     output.mkdir(parents=True, exist_ok=True)  # minutes before it is needed
     worker = SlamWorker()
     try:
-        facts, _ = _run(worker, scans, SlamConfig.model_validate({"front": front.value}))
+        facts, estimates = _run(worker, scans, SlamConfig.model_validate({"front": front.value}))
     except BaseException:
         with suppress(OSError):  # not empty
             output.rmdir()
         raise
-    done: WorkerOutput = worker.step(
-        WorkerInput(finish=True, whole=True, save=output, trajectory=trajectory is not None)
-    )
+    done: WorkerOutput = worker.step(WorkerInput(finish=True, whole=True, save=output, trajectory=True))
     if done.error is not None:
         raise InputError(done.error)
     assert done.whole is not None
+    assert done.trajectory is not None
+    assert done.on_map is not None
+    quality = PathQuality.of(done.trajectory, done.on_map, estimates, scans.scans)
+    facts |= {
+        "path_m": quality.length,
+        "odometry": quality.odometry,
+        "lost_share": quality.lost_share,
+        "lost_poses": int(quality.lost.sum()),
+    }
     rows, columns = done.whole.cells.shape
     facts["poses"] = "joint registration" if done.joint else "graph"
     facts |= {"map": output, "width_m": columns * done.whole.resolution, "height_m": rows * done.whole.resolution}
     if trajectory is not None:
-        assert done.trajectory is not None
-        facts["trajectory"] = write_tum(trajectory, *done.trajectory, scans)
+        facts["trajectory"] = write_tum(trajectory, *done.trajectory, scans, quality.lost)
     if png is not None:
         _draw(png, _load(output))
     _print(facts, json_output)
     finish_log(log, scans.fault)
+    if quality.lost_share > MOST_LOST:
+        text = f"{quality.lost_share:.0%} of the path of {quality.length:.1f} m is lost (limit: {MOST_LOST:.0%})"
+        finish(Reason.POSE_LOST, f"{log}: {text}: check lidar geometry, stamps and odometry")
 
 
 @app.command("show")
@@ -313,30 +334,35 @@ def _run(worker: Any, log: "ScanLog", config: Any) -> tuple[dict[str, Any], list
     """
     from monstertruck_estimation.slam.worker_io import Start, WorkerInput
     from monstertruck_runtime.errors import InputError
+    from monstertruckd.tools.logs.map_quality import verdicts
 
     first = log.scans[0].odom or (0.0, 0.0, 0.0)
     worker.step(WorkerInput(start=Start(config, first)))
     estimates: list[SlamEstimate] = []
-    refused: list[str] = []
+    refused: str | None = None
+    left_out: Counter[str] = Counter()
     counts: dict[str, int] = {}
     with progress("scans", len(log.scans)) as advance:
         for number, scan in enumerate(log.scans, start=1):
             outputs: WorkerOutput = worker.step(WorkerInput(scan=scan))
-            if outputs.refused is not None:
-                refused.append(outputs.refused)
+            if outputs.left_out is not None:
+                refused = outputs.refused
+                left_out[outputs.left_out.value] += 1
             counts = outputs.counts
             if outputs.estimate is not None:
                 estimates.append(outputs.estimate)
             advance(number)
-    if len(refused) == len(log.scans):
-        raise InputError(f"{log.make} log: none of its {len(refused)} scans can be used; the last one: {refused[-1]}")
+    if not estimates:
+        raise InputError(f"{log.make} log: none of its {len(log.scans)} scans can be used; the last one: {refused}")
     statuses = Counter(estimate.status.value for estimate in estimates)
     offsets = [estimate.offset for estimate in estimates if estimate.offset is not None]
     facts: dict[str, Any] = {
         "log": log.make,
         "seconds": (log.scans[-1].stamp - log.scans[0].stamp) / 1e9,
         **counts,
-        "left_out": len(refused),
+        "rejected_by": verdicts(estimates),
+        "left_out": left_out.total(),
+        "left_out_by": dict(left_out),
         "standing": dict(statuses),
         "odometry_ahead_s": offsets[-1] if offsets else None,
     }
@@ -356,7 +382,7 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.2f}"
     if isinstance(value, dict):
-        return ", ".join(f"{count} {name}" for name, count in value.items()) or "-"
+        return ", ".join(f"{_text(part)} {name}" for name, part in value.items()) or "-"
     if isinstance(value, tuple | list):
         return " ".join(_text(part) for part in value)
     return "-" if value is None else str(value)

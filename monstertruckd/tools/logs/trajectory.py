@@ -5,6 +5,7 @@ compares poses with another system, needs that of the middle: so each line has t
 the clock of the log, and the pose at that time (between the poses of neighbouring scans).
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,15 +36,20 @@ def mid_sweep(stamps: Array, poses: Array, delay: float) -> Array:
 
 
 def write_tum(
-    path: Path, stamps: Sequence[int] | NDArray[np.int64], poses: Array | Sequence[object], log: ScanLog
+    path: Path,
+    stamps: Sequence[int] | NDArray[np.int64],
+    poses: Array | Sequence[object],
+    log: ScanLog,
+    lost: NDArray[np.bool_] | None = None,
 ) -> str:
-    """Write poses of a log's scans.
+    """Write poses of a log's scans, and lost ones again to a second file (``poses.lost.txt``; empty if none is).
 
     Args:
         path: of the file.
         stamps: shape (n,), ns, of the scans' first beams.
         poses: shape (n, 3), base in map at ``stamps``.
         log: where the scans are from.
+        lost: shape (n,), mask of lost poses; None writes no second file.
 
     Returns:
         What was written, for people.
@@ -60,4 +66,9 @@ def write_tum(
         for second, (x, y, yaw) in zip(seconds.tolist(), middle.tolist(), strict=True)
     ]
     replace_file(path, "".join(lines))
-    return f"{path}, {len(lines)} poses, each {delay:g} s after its scan's stamp"
+    said = f"{path}, {len(lines)} poses, each {delay:g} s after its scan's stamp"
+    if lost is None:
+        return said
+    second = path.with_name(f"{path.stem}.lost{path.suffix}")
+    replace_file(second, "".join(itertools.compress(lines, lost.tolist())))
+    return f"{said}; {np.count_nonzero(lost)} lost ones, listed in {second}"

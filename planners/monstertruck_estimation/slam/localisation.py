@@ -182,6 +182,9 @@ class LocalisationEstimator:
     def trajectory(self) -> None:
         """See ``Estimator``: the poses were estimated one by one."""
 
+    def on_map(self) -> None:
+        """See ``Estimator``."""
+
     def poses_at(self, _stamps: NDArray[np.int64]) -> None:
         """See ``Estimator``."""
 

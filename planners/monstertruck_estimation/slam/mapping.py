@@ -376,6 +376,9 @@ class Estimator(Protocol):
     def trajectory(self) -> tuple[NDArray[np.int64], Array] | None:
         """Stamps (n,), ns, and poses (n, 3) of base in map at all scans; None in a saved map."""
 
+    def on_map(self) -> NDArray[np.bool_] | None:
+        """Which of these scans, (n,), belong to the map, not to a submap apart; None in a saved map."""
+
     def poses_at(self, stamps: NDArray[np.int64]) -> Array | None:
         """Base in map at instants (n,), ns: (n, 3), NaN where it is not known; None in a saved map."""
 
@@ -493,6 +496,10 @@ class MappingEstimator:
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
         """See ``Estimator``."""
         return self.mapper.trajectory()
+
+    def on_map(self) -> NDArray[np.bool_]:
+        """See ``Estimator``."""
+        return self.mapper.on_map()
 
     def poses_at(self, stamps: NDArray[np.int64]) -> Array:
         """See ``Estimator``."""

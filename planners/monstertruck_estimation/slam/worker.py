@@ -18,7 +18,7 @@ from monstertruck_estimation.slam.mapping import Estimator, MappingEstimator, Ma
 from monstertruck_estimation.slam.registration import Cloud, fitting
 from monstertruck_estimation.slam.scan_matcher import ScanMatcher
 from monstertruck_estimation.slam.scans import prepare_input
-from monstertruck_estimation.slam.worker_io import ScanInput, Start, WorkerInput, WorkerOutput
+from monstertruck_estimation.slam.worker_io import LeftOut, ScanInput, Start, WorkerInput, WorkerOutput
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.memory import give_back
 from monstertruck_schemas.health import OdometryUse
@@ -55,15 +55,18 @@ class SlamWorker:
         estimator = self._estimator
         if estimator is None:
             raise InputError("estimation: expected a start before anything else")
-        made, refused = None, None
+        made, left_out, refused = None, None, None
         if inputs.scan is not None:
-            refused = self._refusal(inputs.scan)
-            if refused is None:
+            left_out, refused = self._refusal(inputs.scan)
+            if left_out is None:
                 wrong = estimator.odometry is OdometryUse.CONTRADICTED
                 swept = replace(inputs.scan, twist=estimator.twist) if wrong else inputs.scan
                 scan = prepare_input(swept, self._longest, estimator.twist)
                 if len(scan) < MIN_POINTS:
-                    refused = f"only {len(scan)} of {len(inputs.scan.ranges)} beams have a return"
+                    left_out, refused = (
+                        LeftOut.EMPTY,
+                        f"only {len(scan)} of {len(inputs.scan.ranges)} beams have a return",
+                    )
                 else:
                     made = estimator.step(scan, inputs.scan)
                     if made is not None and self._witness is not None:
@@ -74,10 +77,24 @@ class SlamWorker:
         tiles, redrawn = estimator.changes() if inputs.tiles else ([], False)
         whole = estimator.patch() if inputs.whole or redrawn else None
         saved, error = self._save(inputs, estimator)
-        trajectory = estimator.trajectory() if inputs.trajectory else None
+        trajectory, on_map = (estimator.trajectory(), estimator.on_map()) if inputs.trajectory else (None, None)
         counts = dict(estimator.counts)
         bases = estimator.poses_at(np.array(inputs.instants, np.int64)) if inputs.instants else None
-        return WorkerOutput(made, refused, tuple(tiles), whole, counts, saved, error, trajectory, bases, joint, remarks)
+        return WorkerOutput(
+            made,
+            refused,
+            left_out,
+            tuple(tiles),
+            whole,
+            counts,
+            saved,
+            error,
+            trajectory,
+            on_map,
+            bases,
+            joint,
+            remarks,
+        )
 
     def _begin(self, start: Start) -> tuple[str, ...]:
         """Make the estimator; returns remarks on the saved map it reads."""
@@ -94,18 +111,19 @@ class SlamWorker:
         self._estimator = MappingEstimator(settings, config.grid, matcher_of(config.front), start.pose, start.body)
         return ()
 
-    def _refusal(self, scan: ScanInput) -> str | None:
-        """Why a scan cannot be used; None if it can."""
+    def _refusal(self, scan: ScanInput) -> tuple[LeftOut, str] | tuple[None, None]:
+        """Why a scan cannot be used, without and with figures; None if it can."""
         geometry = (len(scan.ranges), scan.start_angle, scan.angle_increment, *scan.mount)
         if self._geometry is None:
             self._geometry = geometry
         elif geometry != self._geometry:
             now, before = f"{geometry[0]:g} beams from {geometry[1]:.3f} rad", f"{self._geometry[0]:g}"
-            return f"another geometry: {now}, expected {before} beams from {self._geometry[1]:.3f} rad"
+            text = f"{now}, expected {before} beams from {self._geometry[1]:.3f} rad"
+            return LeftOut.GEOMETRY, f"{LeftOut.GEOMETRY}: {text}"
         if self._newest is not None and scan.stamp <= self._newest:
-            return f"not later than the scan before ({(scan.stamp - self._newest) / 1e9:+.3f} s)"
+            return LeftOut.ORDER, f"{LeftOut.ORDER} ({(scan.stamp - self._newest) / 1e9:+.3f} s)"
         self._newest = scan.stamp
-        return None
+        return None, None
 
     def _save(self, inputs: WorkerInput, estimator: Estimator) -> tuple[str | None, str | None]:
         if inputs.save is None:

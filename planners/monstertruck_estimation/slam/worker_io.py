@@ -1,6 +1,7 @@
 """Inputs and outputs of the SLAM worker; without numba, so that the daemon can import them."""
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Final, Self
 
@@ -143,13 +144,23 @@ class SlamEstimate:
     odometry: OdometryUse = OdometryUse.NONE
 
 
+class LeftOut(StrEnum):
+    """Why a scan was not used."""
+
+    GEOMETRY = "another geometry"
+    ORDER = "not later than the scan before"
+    EMPTY = "too few returns"
+
+
 @dataclass(frozen=True, slots=True)
 class WorkerOutput:
     """Result of one step."""
 
     estimate: SlamEstimate | None = None
     refused: str | None = None
-    """Why the scan was left out."""
+    """Why the scan was left out, with its figures."""
+    left_out: LeftOut | None = None
+    """The same without figures."""
     tiles: tuple[GridPatch, ...] = ()
     whole: GridPatch | None = None
     counts: dict[str, int] = field(default_factory=dict)
@@ -159,6 +170,8 @@ class WorkerOutput:
     """Why the map could not be saved."""
     trajectory: tuple[NDArray[np.int64], Array] | None = None
     """Stamps (n,), ns, and poses (n, 3) of base in map at the first beam of every scan; None in a saved map."""
+    on_map: NDArray[np.bool_] | None = None
+    """Shape (n,): which scans of ``trajectory`` belong to the map, not to a submap that is not joined to it."""
     bases: Array | None = None
     """Shape (n, 3): base in map at the instants requested; NaN where it is not known; None in a saved map."""
     joint: bool | None = None

@@ -8,9 +8,10 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from monstertruck_runtime.map_files import WorldMap, save_map
+from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.load import load_truck
 from monstertruckd.tools.cli.main import app
-from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, ranges, rounds
+from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, box, ranges, rounds
 
 TRUTH = rounds(60, laps=0.5)
 
@@ -41,6 +42,65 @@ def test_a_trajectory_with_the_geometry_that_was_given(log: Path, tmp_path: Path
     found = CliRunner().invoke(app, ["map", "localise", str(log), str(tmp_path / "map"), "--json", *map(str, geometry)])
     assert found.exit_code == 0, found.output
     assert json.loads(found.stdout)["localised"] > 10
+
+
+def test_the_summary_says_what_odometry_was_worth_and_why_scans_were_left_out(log: Path, tmp_path: Path):
+    whole = np.load(log)
+    rows, times, odom = (np.repeat(whole[name], 2, axis=0) for name in ("ranges", "t", "odom"))
+    times[1::2] += 0.05
+    times[21] = times[20]
+    rows[31] = np.inf
+    odom[60:] = np.nan
+    np.savez(tmp_path / "log.npz", t=times, ranges=rows, odom=odom, start_angle=LIDAR.start_angle,
+             angle_increment=LIDAR.angle_increment, range_max=5.6)  # fmt: skip
+    done = CliRunner().invoke(app, ["map", "build", str(tmp_path / "log.npz"), "-o", str(tmp_path / "map"), "--json"])
+    assert done.exit_code == 0, done.output
+    facts = json.loads(done.stdout)
+    assert facts["left_out"] == 2
+    assert facts["left_out_by"] == {"not later than the scan before": 1, "too few returns": 1}
+    assert facts["odometry"]["used"] + facts["odometry"]["missing"] == pytest.approx(1.0)
+    assert 0.3 < facts["odometry"]["missing"] < 0.5
+    assert facts["lost_share"] == 0.0
+    way = np.hypot(*np.diff(TRUTH[:, :2], axis=0).T).sum()
+    assert facts["path_m"] == pytest.approx(way, rel=0.15)
+
+
+def test_lost_poses_are_marked_and_the_exit_code_says_so(log: Path, tmp_path: Path):
+    """The robot is carried to another room after a third of the path: nothing joins both rooms."""
+    elsewhere = [*box(-2.0, -1.5, 2.4, 1.9), *box(0.6, 0.2, 1.1, 0.5), *box(-1.6, 0.9, -1.1, 1.9)]
+    away, rng = rounds(90, 0.8, 0.9, 0.6), np.random.default_rng(2)
+    rows = np.array([ranges(elsewhere, pose, noise=0.01, rng=rng) for pose in away])
+    whole = np.load(log)
+    np.savez(
+        tmp_path / "log.npz", t=500.0 + 0.1 * np.arange(150), ranges=np.concatenate((whole["ranges"], rows)),
+        odom=np.concatenate((TRUTH, away)), start_angle=LIDAR.start_angle,
+        angle_increment=LIDAR.angle_increment, range_max=5.6,
+    )  # fmt: skip
+    poses = tmp_path / "poses.txt"
+    done = CliRunner().invoke(
+        app,
+        ["map", "build", str(tmp_path / "log.npz"), "-o", str(tmp_path / "map"), "--trajectory", str(poses), "--json"],
+    )
+    assert done.exit_code == Reason.POSE_LOST.exit_code
+    assert "of the path of" in done.stderr.splitlines()[-1]
+    facts, lost = json.loads(done.stdout), np.loadtxt(tmp_path / "poses.lost.txt")
+    assert facts["lost_share"] > 0.2
+    assert facts["lost_poses"] == len(lost) > 60
+    assert facts["rejected"] == sum(facts["rejected_by"].values()) > 0
+    every = np.loadtxt(poses)
+    assert len(every) == 150
+    assert lost[:, 0] == pytest.approx(every[-len(lost) :, 0]), "from when it was carried on"
+    assert CliRunner().invoke(app, ["map", "show", str(tmp_path / "map")]).exit_code == 0
+
+
+def test_a_log_whose_scans_all_have_one_stamp_is_lost_by_its_odometry(log: Path, tmp_path: Path):
+    whole = np.load(log)
+    np.savez(tmp_path / "log.npz", t=np.full(60, 500.0), ranges=whole["ranges"], odom=TRUTH)
+    done = CliRunner().invoke(app, ["map", "build", str(tmp_path / "log.npz"), "-o", str(tmp_path / "map"), "--json"])
+    assert done.exit_code == Reason.POSE_LOST.exit_code
+    facts = json.loads(done.stdout)
+    assert facts["lost_share"] == 1.0
+    assert facts["left_out_by"] == {"not later than the scan before": 59}
 
 
 @pytest.mark.parametrize(
