@@ -44,8 +44,13 @@ def test_a_trajectory_with_the_geometry_that_was_given(log: Path, tmp_path: Path
     assert json.loads(found.stdout)["localised"] > 10
 
 
+def arrays_of(log: Path) -> dict[str, np.ndarray]:
+    with np.load(log) as arrays:
+        return dict(arrays)
+
+
 def test_the_summary_says_what_odometry_was_worth_and_why_scans_were_left_out(log: Path, tmp_path: Path):
-    whole = np.load(log)
+    whole = arrays_of(log)
     rows, times, odom = (np.repeat(whole[name], 2, axis=0) for name in ("ranges", "t", "odom"))
     times[1::2] += 0.05
     times[21] = times[20]
@@ -70,7 +75,7 @@ def test_lost_poses_are_marked_and_the_exit_code_says_so(log: Path, tmp_path: Pa
     elsewhere = [*box(-2.0, -1.5, 2.4, 1.9), *box(0.6, 0.2, 1.1, 0.5), *box(-1.6, 0.9, -1.1, 1.9)]
     away, rng = rounds(90, 0.8, 0.9, 0.6), np.random.default_rng(2)
     rows = np.array([ranges(elsewhere, pose, noise=0.01, rng=rng) for pose in away])
-    whole = np.load(log)
+    whole = arrays_of(log)
     np.savez(
         tmp_path / "log.npz", t=500.0 + 0.1 * np.arange(150), ranges=np.concatenate((whole["ranges"], rows)),
         odom=np.concatenate((TRUTH, away)), start_angle=LIDAR.start_angle,
@@ -94,7 +99,7 @@ def test_lost_poses_are_marked_and_the_exit_code_says_so(log: Path, tmp_path: Pa
 
 
 def test_a_log_whose_scans_all_have_one_stamp_is_lost_by_its_odometry(log: Path, tmp_path: Path):
-    whole = np.load(log)
+    whole = arrays_of(log)
     np.savez(tmp_path / "log.npz", t=np.full(60, 500.0), ranges=whole["ranges"], odom=TRUTH)
     done = CliRunner().invoke(app, ["map", "build", str(tmp_path / "log.npz"), "-o", str(tmp_path / "map"), "--json"])
     assert done.exit_code == Reason.POSE_LOST.exit_code
