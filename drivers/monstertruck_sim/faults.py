@@ -17,6 +17,7 @@ import numpy as np
 
 from monstertruck_drivers.config import Devices
 from monstertruck_drivers.emulation import signals_of
+from monstertruck_drivers.epos.exchange import BRIEF_SILENCES
 from monstertruck_drivers.signals import Signals
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.clock import Clock, VirtualClock
@@ -37,6 +38,8 @@ VITAL: Final = ("drive", "steering", "lidar", "compass", *MORE_DRIVES, "wheels",
 HOT: Final = 92.0
 """Temperature of a computer whose fan stands, degrees Celsius."""
 COOL: Final = 48.0
+SHORT_WRITES: Final = 19
+"""Maximum number of consecutive writes cut in half."""
 POST_RADIUS: Final = 0.1
 """Radius of an obstacle, m."""
 ALL_ROUND: Final = "-135 135"
@@ -350,7 +353,7 @@ class FaultCatalog:
         yield FaultKind.GARBAGE, lambda rng: _garbage(rng, _pick(rng, serial))
         yield FaultKind.BIT_ERRORS, lambda rng: _bit_errors(rng, _pick(rng, serial))
         yield FaultKind.SLOW, lambda rng: _slow(rng, _pick(rng, serial))
-        yield FaultKind.SHORT_WRITE, lambda rng: _short_write(rng, _pick(rng, serial))
+        yield FaultKind.SHORT_WRITE, lambda rng: _short_write(rng, _pick(rng, serial), guarded)
         yield FaultKind.RESET, lambda rng: _once(rng, FaultKind.RESET, _pick(rng, serial), "power-cycle")
         if len(guarded) > 1:
             yield FaultKind.WRONG_DEVICE, lambda rng: _wrong(rng, guarded, vital)
@@ -514,8 +517,10 @@ def _slow(rng: np.random.Generator, role: str) -> CatalogFault:
     return _cable(rng, FaultKind.SLOW, role, (start,), ("line chunk off", "line delay 0"))
 
 
-def _short_write(rng: np.random.Generator, role: str) -> CatalogFault:
-    start, end = (f"line short_writes {rng.integers(1, 20)}",), ("line short_writes 0",)
+def _short_write(rng: np.random.Generator, role: str, guarded: Collection[str]) -> CatalogFault:
+    """Many in a row cut a controller off: one that nothing stops meanwhile has few."""
+    most = SHORT_WRITES if role in guarded else BRIEF_SILENCES
+    start, end = (f"line short_writes {rng.integers(1, most + 1)}",), ("line short_writes 0",)
     return _cable(rng, FaultKind.SHORT_WRITE, role, start, end)
 
 

@@ -266,6 +266,27 @@ def test_a_wanderer_asks_a_body_for_nothing_impossible_and_for_all_that_it_can_d
     assert run_virtual(main) == turns | sideways
 
 
+@pytest.mark.parametrize("place", [(1.34, 0.0, 0.0), (-1.34, -1.34, math.pi / 4), (0.0, 1.34, 1.0)])
+def test_the_operator_of_a_robot_without_range_sensors_looks_where_it_drives(place: tuple[float, float, float]) -> None:
+    config = load_config(CONFIGS / "robots" / "skid_stand.yaml", SimulatedTruckConfig)[0]
+
+    async def main(clock: VirtualClock) -> None:
+        async with DrillTruck.running(
+            wired(config.model_copy(update={"recorder": None})), clock, wander=np.random.default_rng(3), judged=True
+        ) as truck:
+            judge, moved = truck.judge, 0
+            assert judge is not None
+            truck.rig.world.carry(clock.now(), place)
+            assert await truck.until(lambda: abs(truck.speed) > 0.03, 15.0, Order.ARM)
+            for _ in range(600):
+                await clock.sleep(0.05)
+                moved += abs(truck.speed) > 0.01
+            assert judge.violations == ()
+            assert moved > 150, "it goes on driving"
+
+    run_virtual(main)
+
+
 def test_a_wanderer_that_is_refused_unseen_ground_holds_the_second_control_after_a_while() -> None:
     async def main(clock: VirtualClock) -> None:
         config = with_overlay(wired(demo()), {"tracker": None, "path": None})

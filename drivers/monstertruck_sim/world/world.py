@@ -151,14 +151,18 @@ class World:
         """With which the lidar pushes its pitch (0) or roll (1) joint, Nm, at the newest instant."""
         return self._plant.mount_torque(joint)
 
+    def is_free(self, pose: Pose2) -> bool:
+        """Whether the robot at ``pose``, x, y (m) and yaw (rad) in the map frame, would touch nothing."""
+        solid = self.scene.overlap(self.scene.solid, self._footprint.box(pose))
+        return bool(solid + self._space.contact(*pose) <= 0)
+
     def carry(self, time_ns: int, pose: Pose2) -> None:
         """Put the truck down at another ``pose``: x, y (m) and yaw (rad) in the map frame.
 
         Raises:
             InputError: it would touch what is not free there.
         """
-        solid = self.scene.overlap(self.scene.solid, self._footprint.box(pose))
-        if solid + self._space.contact(*pose) > 0:
+        if not self.is_free(pose):
             raise InputError(f"carry: the robot at {pose} touches what is not free")
         self._plant.advance(time_ns)
         self._plant.carry(pose)

@@ -4,13 +4,14 @@ import asyncio
 import math
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager, suppress
+from functools import partial
 from typing import Final, Self
 
 import numpy as np
 
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import KinematicsError
-from monstertruck_kinematics.se2 import Twist2
+from monstertruck_kinematics.se2 import Twist2, integrate
 from monstertruck_runtime.clock import SECOND, VirtualClock, on_computer
 from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import fifo, latest
@@ -20,12 +21,14 @@ from monstertruck_schemas.event import Event
 from monstertruck_schemas.health import HealthTable, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Order, RequestedTwist, Role
+from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import GOAL
 from monstertruck_sim.world.built_in import BUILT_IN
+from monstertruck_sim.world.world import World
 from monstertruckd.bus.local import Bus
 from monstertruckd.daemon import Daemon
-from monstertruckd.tools.drill.judge import WorldJudge
+from monstertruckd.tools.drill.judge import MAY_MOVE, WorldJudge
 from monstertruckd.tools.drill.observer import Observer
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -43,6 +46,9 @@ GIVES: Final = 0.5
 """Seconds from one look of a giver of goals to the next."""
 OPTIONAL: Final = frozenset({"recorder"})
 """Services that a fault may end for the rest of a run: driving goes on without."""
+
+RANGE_SENSORS: Final = frozenset({DeviceRole.LIDAR, DeviceRole.SONAR})
+"""Roles of range sensors."""
 
 DaemonReport = Event | GateState | HealthTable
 
@@ -123,6 +129,12 @@ LEG_TIME: Final = (0.4, 2.0)
 """Seconds for which a wanderer keeps a speed and its angles."""
 PATIENCE: Final = 0.5
 """Seconds for which a wanderer that is refused unseen ground waits before it holds the second control."""
+LOOKS_AHEAD: Final = 2 * MAY_MOVE
+"""Look-ahead of the operator of a robot without range sensors (s): twice ``MAY_MOVE``."""
+LOOKS: Final = 8
+"""Number of poses checked over ``LOOKS_AHEAD``."""
+CHOICES: Final = 10
+"""Motions that it considers for a request; if none of them stays clear, the robot shall stand."""
 
 
 def _can(chassis: Chassis, twist: Twist2) -> bool:
@@ -132,10 +144,18 @@ def _can(chassis: Chassis, twist: Twist2) -> bool:
     return False
 
 
+def stays_clear(world: World, twist: Twist2) -> bool:
+    """Whether a robot touches nothing for ``LOOKS_AHEAD``, moving as it does or with ``twist``."""
+    pose, motions = world.plant.pose, (twist, world.plant.twist)
+    times = [LOOKS_AHEAD * (look + 1) / LOOKS for look in range(LOOKS)]
+    return all(world.is_free(integrate(pose, *motion, time)) for motion in motions for time in times)
+
+
 class Wanderer(DrivingStation):
     """A station that drives at random, in both directions and with all ways to steer.
 
     Where the gate stops before unseen ground it holds the second control after a while, until it drives elsewhere.
+    Nothing on a robot without range sensors stops it before an obstacle: its operator looks, and keeps it clear.
 
     Args:
         bus: of the daemon.
@@ -143,6 +163,7 @@ class Wanderer(DrivingStation):
         config: limits of the robot.
         rng: randomness.
         confirm: called with each request into unseen ground that it confirms.
+        clear: whether the robot touches nothing soon if it moves at a twist; of an operator who looks.
     """
 
     def __init__(
@@ -152,14 +173,17 @@ class Wanderer(DrivingStation):
         config: SimulatedTruckConfig,
         rng: np.random.Generator,
         confirm: Callable[[], None],
+        clear: Callable[[Twist2], bool] = lambda _: True,
     ) -> None:
         super().__init__(bus, clock)
         self._rng = rng
         self._confirm = confirm
+        self._clear = clear
         self._refused_since: int | None = None
         self._limits = config.gate.reverse_speed, config.gate.speed
         self._angle = config.gate.angle
         chassis = config.sim.world.truck.chassis()
+        self._bicycle = chassis.bicycle
         self._steering = STEERING[chassis.freedom]
         self._twists = tuple(twist for twist in (TURN, SIDEWAYS) if _can(chassis, twist))
         self._until = 0
@@ -195,6 +219,7 @@ class Wanderer(DrivingStation):
         now = self._clock.now()
         if now >= self._until:
             self.choose(backwards=self.backwards)
+        self._keep_clear()
         gate = self._gate.latest
         if gate is None or Reason.UNSEEN_STOP not in gate.reasons:
             self._refused_since = None
@@ -205,6 +230,19 @@ class Wanderer(DrivingStation):
         if self.unseen and not self.silent:
             self._confirm()
         super().send()
+
+    def _keep_clear(self) -> None:
+        """Choose motions until one stays clear; if none does, stand."""
+        for _ in range(CHOICES):
+            if self._clear(self._requested()):
+                return
+            self.choose(backwards=self.backwards)
+        self.speed, self.twist = 0.0, None
+
+    def _requested(self) -> Twist2:
+        if self.twist is not None:
+            return self.twist.vx, self.twist.vy, self.twist.wz
+        return self._bicycle.body_twist(self.speed, self.front, self.rear)
 
 
 class GoalGiver:
@@ -267,10 +305,16 @@ class DrillTruck:
         self.listen()
         if wander is not None:
             assert self.judge is not None
-            self.station = Wanderer(rig.bus, rig.clock, rig.config, wander, self.judge.confirm)
+            self.station = Wanderer(rig.bus, rig.clock, rig.config, wander, self.judge.confirm, self._looks())
         elif by_station:
             angle = min(math.atan(rig.config.geometry.wheelbase / CIRCLE), rig.config.gate.angle)
             self.station = DrivingStation(rig.bus, rig.clock, STATION_SPEED * rig.config.gate.speed, angle)
+
+    def _looks(self) -> Callable[[Twist2], bool]:
+        """Whether a motion stays clear, as the operator sees it; a robot with range sensors has to see for itself."""
+        if RANGE_SENSORS & self.rig.config.devices.present().keys():
+            return lambda _: True
+        return partial(stays_clear, self.rig.world)
 
     @property
     def observer(self) -> Observer:

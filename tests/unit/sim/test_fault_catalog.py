@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from monstertruck_drivers.epos.exchange import BRIEF_SILENCES
 from monstertruck_runtime.clock import SECOND, run_virtual
-from monstertruck_sim.faults import FaultCatalog, FaultKind, apply
+from monstertruck_sim.faults import SHORT_WRITES, FaultCatalog, FaultKind, apply
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
@@ -76,3 +77,24 @@ def test_cross_talk_is_an_echo_from_where_nothing_is():
     ghost, after, name = run_virtual(hear, start=SECOND)
     assert set(after) == {None}
     assert ghost * 343.0 / 2e6 == pytest.approx(float(name.split(", ")[1].removesuffix(" m")), abs=0.01)
+
+
+def test_short_writes_do_not_cut_off_a_controller_that_nothing_stops():
+    config = loaded("sonar")
+    catalog = FaultCatalog(config.devices, records=False, unguarded=("drive", "drive_2"))
+
+    async def drawn(clock):
+        rig, most = VirtualRig(config, clock), dict.fromkeys(("drive", "drive_2", "sonar", "imu"), 0)
+        try:
+            for seed in range(300):
+                fault = only(catalog, FaultKind.SHORT_WRITE, seed)
+                role = fault.name.rpartition(" ")[2]
+                await apply(fault.start, rig.context)
+                most[role] = max(most[role], rig.ports[role].device.faults.short_writes)
+                await apply(fault.end, rig.context)
+            return most
+        finally:
+            rig._folder.cleanup()
+
+    most = run_virtual(drawn, start=SECOND)
+    assert most == {"drive": BRIEF_SILENCES, "drive_2": BRIEF_SILENCES, "sonar": SHORT_WRITES, "imu": SHORT_WRITES}
