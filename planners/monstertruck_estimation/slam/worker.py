@@ -18,7 +18,7 @@ from monstertruck_estimation.slam.mapping import Estimator, MappingEstimator, Ma
 from monstertruck_estimation.slam.registration import Cloud, fitting
 from monstertruck_estimation.slam.scan_matcher import ScanMatcher
 from monstertruck_estimation.slam.scans import prepare_input
-from monstertruck_estimation.slam.worker_io import LeftOut, ScanInput, Start, WorkerInput, WorkerOutput
+from monstertruck_estimation.slam.worker_io import ScanInput, ScanLeftOut, Start, WorkerInput, WorkerOutput
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.memory import give_back
 from monstertruck_schemas.health import OdometryUse
@@ -64,7 +64,7 @@ class SlamWorker:
                 scan = prepare_input(swept, self._longest, estimator.twist)
                 if len(scan) < MIN_POINTS:
                     left_out, refused = (
-                        LeftOut.EMPTY,
+                        ScanLeftOut.EMPTY,
                         f"only {len(scan)} of {len(inputs.scan.ranges)} beams have a return",
                     )
                 else:
@@ -111,7 +111,7 @@ class SlamWorker:
         self._estimator = MappingEstimator(settings, config.grid, matcher_of(config.front), start.pose, start.body)
         return ()
 
-    def _refusal(self, scan: ScanInput) -> tuple[LeftOut, str] | tuple[None, None]:
+    def _refusal(self, scan: ScanInput) -> tuple[ScanLeftOut, str] | tuple[None, None]:
         """Why a scan cannot be used, without and with figures; None if it can."""
         geometry = (len(scan.ranges), scan.start_angle, scan.angle_increment, *scan.mount)
         if self._geometry is None:
@@ -119,9 +119,9 @@ class SlamWorker:
         elif geometry != self._geometry:
             now, before = f"{geometry[0]:g} beams from {geometry[1]:.3f} rad", f"{self._geometry[0]:g}"
             text = f"{now}, expected {before} beams from {self._geometry[1]:.3f} rad"
-            return LeftOut.GEOMETRY, f"{LeftOut.GEOMETRY}: {text}"
+            return ScanLeftOut.GEOMETRY, f"{ScanLeftOut.GEOMETRY}: {text}"
         if self._newest is not None and scan.stamp <= self._newest:
-            return LeftOut.ORDER, f"{LeftOut.ORDER} ({(scan.stamp - self._newest) / 1e9:+.3f} s)"
+            return ScanLeftOut.ORDER, f"{ScanLeftOut.ORDER} ({(scan.stamp - self._newest) / 1e9:+.3f} s)"
         self._newest = scan.stamp
         return None, None
 

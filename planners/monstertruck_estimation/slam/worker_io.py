@@ -144,7 +144,7 @@ class SlamEstimate:
     odometry: OdometryUse = OdometryUse.NONE
 
 
-class LeftOut(StrEnum):
+class ScanLeftOut(StrEnum):
     """Why a scan was not used."""
 
     GEOMETRY = "another geometry"
@@ -159,7 +159,7 @@ class WorkerOutput:
     estimate: SlamEstimate | None = None
     refused: str | None = None
     """Why the scan was left out, with its figures."""
-    left_out: LeftOut | None = None
+    left_out: ScanLeftOut | None = None
     """The same without figures."""
     tiles: tuple[GridPatch, ...] = ()
     whole: GridPatch | None = None
