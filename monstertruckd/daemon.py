@@ -51,7 +51,7 @@ from monstertruckd.config.calibration import CalibrationStore
 from monstertruckd.config.expiry import CalibrationWatch, DistanceCounter
 from monstertruckd.config.live import LiveConfig
 from monstertruckd.config.load import Tree, resolved
-from monstertruckd.config.start import LeftOut
+from monstertruckd.config.start import LeftOut, set_aside
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate.core import Gate
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch, marks_folder
@@ -227,6 +227,7 @@ class Daemon:
                 stand=self.config.stand != "none",
             )
             await bridge.open()
+            self._left_out = await set_aside(self._left_out, self.gate.store_latch, self._offload)
             self._start(bus_scope, bridge, OnBug.EXIT)
         self._start(bus_scope, ClockService(self.clock, self.bus.publisher(topics.CLOCK, Writer.DAEMON), self._events))
         self._start(bus_scope, self._board)
@@ -255,7 +256,7 @@ class Daemon:
             yield
 
     def _say_what_is_left_out(self) -> None:
-        for source, text in self._left_out:
+        for _, source, text in self._left_out:
             self._events(Reason.FILE_DAMAGED, Severity.WARNING, source, f"{text}; {STOPPED}")
 
     def _tap(self, record: Callable[[Topic[Any], int, bytes, int], None]) -> Tap:

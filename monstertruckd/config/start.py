@@ -1,10 +1,13 @@
 """What a daemon starts with: its configuration and whatever is sound of the files that it wrote itself."""
 
+from collections.abc import Awaitable, Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from monstertruck_runtime.errors import UnusableFileError
 from monstertruck_runtime.small_files import put_aside
+from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.roles import ServiceName
 from monstertruckd.config.load import SavedSettings, Tree, calibrated
 from monstertruckd.config.truck import TruckConfig
@@ -15,17 +18,18 @@ T = TypeVar("T", bound=TruckConfig)
 class LeftOut(NamedTuple):
     """A file that a start goes on without."""
 
+    file: Path
     source: str
     """Service whose values they are."""
     text: str
-    """What is wrong with the file, what counts instead, and where it is kept."""
+    """What is wrong with the file, and what counts instead; after ``set_aside`` also where it is kept."""
 
 
 def started(config: T, tree: Tree) -> tuple[T, Tree, tuple[LeftOut, ...]]:
     """Return the configuration as ``calibrated`` does, without saved settings and calibrations that cannot be used.
 
-    Such a file is renamed (see ``put_aside``), so that it is kept and later saves do not fail by it. Instead of saved
-    settings those of the configuration count, instead of a calibration the one before it.
+    Instead of saved settings those of the configuration count, instead of a calibration the one before it. The files
+    keep their names until ``set_aside``.
 
     Raises:
         ConfigError: the calibration is of another truck, or its folder cannot be read.
@@ -43,4 +47,24 @@ def _left_out(error: UnusableFileError, settings: Path) -> LeftOut:
         source, instead = ServiceName.GATE.value, "the settings of the configuration count"
     else:
         source, instead = ServiceName.CALIBRATION.value, "the calibration before it counts, if there is one"
-    return LeftOut(source, f"{error}; {instead}; {put_aside(error.file)}")
+    return LeftOut(error.file, source, f"{error}; {instead}")
+
+
+async def set_aside(
+    left_out: Iterable[LeftOut], store_stop: Callable[[], Awaitable[bool]], offload: Offload
+) -> tuple[LeftOut, ...]:
+    """Rename files that are left out, so that they are kept and later saves do not fail by them; see ``put_aside``.
+
+    The latched emergency stop is stored first: after a renaming alone, the next start would miss no file, and not stop.
+
+    Args:
+        left_out: the files.
+        store_stop: stores the latched stop; False if it could not.
+        offload: where files are renamed.
+    """
+    files = tuple(left_out)
+    if not files:
+        return ()
+    if not await store_stop():
+        return tuple(one._replace(text=f"{one.text}; the file stays until the stop can be stored") for one in files)
+    return tuple([one._replace(text=f"{one.text}; {await offload(partial(put_aside, one.file))}") for one in files])

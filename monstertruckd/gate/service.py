@@ -247,7 +247,7 @@ class GateService:
                 finally:
                     self.shut_down()  # before waiting for the disk
         finally:
-            await self._store_latch()
+            await self.store_latch()
 
     async def _cut(self) -> None:
         """Cut the ports each time that nothing else stops the robot."""
@@ -259,7 +259,7 @@ class GateService:
 
     async def close(self) -> None:
         """Store the latch once more and remove its mark, when no more orders can arrive; does not raise ``OSError``."""
-        if await self._store_latch():
+        if await self.store_latch():
             self._latch.close()
 
     async def _tick_forever(self, ready: Ready) -> None:
@@ -387,11 +387,11 @@ class GateService:
         while True:
             await self._latch_differs.wait()
             self._latch_differs.clear()
-            if not await self._store_latch():
+            if not await self.store_latch():
                 await self._clock.sleep(LATCH_RETRY)
                 self._latch_differs.set()
 
-    async def _store_latch(self) -> bool:
+    async def store_latch(self) -> bool:
         """Write the latch file if it differs from the gate's mode, even if cancelled; False if writing failed."""
         wanted = self._gate.mode is GateMode.ESTOPPED
         if wanted == self._latched:
