@@ -137,7 +137,7 @@ def write_save(
                     _take_over(before / name, fresh / name)
             _write(fresh / MANIFEST, manifest.model_dump_json(indent=1).encode() + b"\n")
             sync_folder(fresh)
-            number = max((int(path.name) for path in _numbered(saves)), default=0) + 1
+            number = max((int(path.name) for path in numbered_saves(saves)), default=0) + 1
             place = saves / f"{number:06d}"
             fresh.rename(place)
         except BaseException:
@@ -172,8 +172,8 @@ def _locked(saves: Path, how: int) -> Iterator[None]:
         os.close(handle)
 
 
-def _numbered(saves: Path) -> list[Path]:
-    """Saves, newest first."""
+def numbered_saves(saves: Path) -> list[Path]:
+    """Saves of a map in its folder of them, newest first; other entries of the folder are left out."""
     found = (path for path in saves.iterdir() if _NUMBER.fullmatch(path.name))
     return sorted(found, key=lambda path: int(path.name), reverse=True)
 
@@ -185,7 +185,7 @@ def _newest(folder: Path) -> MapSave:
         InputError: all are damaged.
     """
     remarks, others = list[str](), list[MapSave]()
-    for path in _numbered(folder / SAVES):
+    for path in numbered_saves(folder / SAVES):
         try:
             manifest = _check(path)
         except InputError as error:
@@ -215,7 +215,7 @@ def _run(folder: Path, run: str | None) -> str:
 
 def _base(saves: Path, run: str) -> tuple[Path | None, Mapping[str, _SavedFile]]:
     """Newest whole save of a run, and what it holds."""
-    for path in _numbered(saves):
+    for path in numbered_saves(saves):
         try:
             manifest = _check(path)
         except InputError:
@@ -277,7 +277,7 @@ def _take_over(old: Path, new: Path) -> None:
 def _prune(saves: Path) -> None:
     """Remove old saves: not the newest two, and not the newest of two grids that share no file."""
     grids = set[int]()
-    for age, path in enumerate(_numbered(saves)):
+    for age, path in enumerate(numbered_saves(saves)):
         grid = {(path / YAML).stat().st_ino} if (path / YAML).exists() else set[int]()
         another = len(grids) < 2 and not grid <= grids
         grids |= grid

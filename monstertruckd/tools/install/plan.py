@@ -11,7 +11,7 @@ from typing import Final
 from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
 from monstertruck_runtime.map_files import files_of
-from monstertruck_runtime.map_folders import MANIFEST, SAVES
+from monstertruck_runtime.map_folders import MANIFEST, SAVES, numbered_saves
 from monstertruck_runtime.small_files import text_of
 from monstertruckd.config.load import load_truck
 from monstertruckd.config.truck import TruckConfig
@@ -168,13 +168,13 @@ def _placed(files: Sequence[Path], maps: Sequence[Path], folder: Path) -> tuple[
 
 def _save_name(saved: Path, saves: Path) -> str:
     """Number under which a save is installed: above those that are installed, as the newest of them is read."""
-    others = sorted((path for path in saves.glob("[0-9]*") if path.is_dir()), key=lambda path: int(path.name))
-    if not others:
+    newest = next(iter(numbered_saves(saves)), None) if saves.is_dir() else None
+    if newest is None:
         return saved.name
-    newest = others[-1] / MANIFEST
-    if newest.is_file() and newest.read_bytes() == (saved / MANIFEST).read_bytes():
-        return others[-1].name
-    return f"{max(int(others[-1].name) + 1, int(saved.name)):06d}"
+    manifest = newest / MANIFEST
+    if manifest.is_file() and manifest.read_bytes() == (saved / MANIFEST).read_bytes():
+        return newest.name
+    return f"{max(int(newest.name) + 1, int(saved.name)):06d}"
 
 
 def _notes(config: TruckConfig) -> list[str]:

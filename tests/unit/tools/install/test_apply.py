@@ -257,6 +257,18 @@ def test_another_map_of_the_folder_replaces_the_installed_one(tmp_path: Path):
     assert np.count_nonzero(load_map(root / "etc" / "monstertruckd" / "maps" / "lab").cells) == 6 * 20
 
 
+def test_a_copy_that_somebody_keeps_among_the_installed_saves_is_no_save(tmp_path: Path):
+    (tmp_path / "maps").mkdir()
+    root, lab = tmp_path / "root", tmp_path / "maps" / "lab"
+    saved_map(lab, 3)
+    install(truck_plan(root, mapped(tmp_path, "maps/lab")), root)
+    saves = root / "etc" / "monstertruckd" / "maps" / "lab" / "saves"
+    shutil.copytree(saves / "000001", saves / "000001.bak")
+    saved_map(lab, 4)
+    install(truck_plan(root, mapped(tmp_path, "maps/lab")), root)
+    assert np.count_nonzero(load_map(saves.parent).cells) == 4 * 20
+
+
 @pytest.mark.skipif(shutil.which("systemd-sysusers") is None or os.geteuid() != 0, reason="needs systemd and root")
 def test_systemd_makes_the_user_and_the_folders(tmp_path: Path):
     install(truck_plan(tmp_path), tmp_path)
