@@ -148,6 +148,7 @@ def calibrated(config: T, tree: Tree, without: Collection[Path] = ()) -> tuple[T
         saved.put(settings, config, data)
         origins |= {tuple(key.split(".")): Origin(saved.path, line) for key, (_, line) in settings.items()}
         sources.append(str(saved.path))
+    results: Mapping[WizardName, Result] = {}
     if path is not None:
         results = store.load(path).results
         try:
@@ -161,7 +162,7 @@ def calibrated(config: T, tree: Tree, without: Collection[Path] = ()) -> tuple[T
         changed = type(config).model_validate(data)
     except ValidationError as error:
         refused = saved.path
-        if path is not None and (not settings or not _is_valid(config, store.load(path).results.values(), path)):
+        if path is not None and (not settings or not _is_valid(config, results.values(), path)):
             refused = path
         raise UnusableFileError(refused, f"{' with '.join(sources)}: {first_mistake(error)}") from error
     return changed, replace(tree, origins=origins, calibration=path, unused=left)
