@@ -40,7 +40,7 @@ _END: Final = struct.Struct("<BQQQI8s")
 
 _FOOTER_LENGTH: Final = struct.calcsize("<QQI")
 _UNSUMMED: Final = struct.calcsize("<I8s")
-_HEAD: Final = struct.Struct("<BQ")
+HEAD: Final = struct.Struct("<BQ")
 """Head of a record: opcode, length of the content."""
 CHECKSUM: Final = struct.Struct("<I")
 _PIECE: Final = 1 << 20
@@ -92,10 +92,10 @@ def read_frame(file: BinaryIO, size: int) -> tuple[int, bytes, bytes]:
         EndOfFile: it is not all there.
         McapError: it is longer than ``MOST_UNPACKED``.
     """
-    head = file.read(_HEAD.size)
-    if len(head) < _HEAD.size:
+    head = file.read(HEAD.size)
+    if len(head) < HEAD.size:
         raise EndOfFile
-    opcode, length = _HEAD.unpack(head)
+    opcode, length = HEAD.unpack(head)
     if length > size - file.tell():
         raise EndOfFile
     if length > MOST_UNPACKED:

@@ -38,10 +38,9 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.outside import MOST_UNPACKED
 from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.recorder.chunks import records_in, unpacked
-from monstertruckd.recorder.frames import DAMAGE, MAGIC, PRIVATE, checked_attachment, digest_of, index_is_sound
+from monstertruckd.recorder.frames import DAMAGE, HEAD, MAGIC, PRIVATE, checked_attachment, digest_of, index_is_sound
 from monstertruckd.recorder.log_file import CHANNELS
 
-_HEAD: Final = struct.Struct("<BQ")
 _CANDIDATE: Final = re.compile(rb"[\x01-\x0f].{5}\x00\x00\x00", re.DOTALL)
 """A known opcode, and a length below 1 TB."""
 _CHUNK_CANDIDATE: Final = re.compile(rb"(?=\x06.{5}\x00\x00\x00)", re.DOTALL)
@@ -123,7 +122,7 @@ class _Bytes:
     def next_candidate(self, at: int) -> int:
         """Return where a record may begin, from ``at`` on; the end if nowhere."""
         while at < self.size:
-            found = _CANDIDATE.search(self.at(at, _WINDOW + _HEAD.size))
+            found = _CANDIDATE.search(self.at(at, _WINDOW + HEAD.size))
             if found is not None:
                 return at + found.start()
             at += _WINDOW
@@ -301,11 +300,11 @@ class _WholeRecord(NamedTuple):
     @property
     def end(self) -> int:
         """Offset of what follows."""
-        return self.offset + _HEAD.size + self.length
+        return self.offset + HEAD.size + self.length
 
     def content(self, data: _Bytes) -> bytes:
         """Its content in the file."""
-        return data.at(self.offset + _HEAD.size, self.length)
+        return data.at(self.offset + HEAD.size, self.length)
 
     def read(self, data: _Bytes) -> Any:
         """The record, whose lengths add up.
@@ -430,7 +429,7 @@ class _Scan:
         """
         content = part.content(self._data)
         for found in _CHUNK_CANDIDATE.finditer(content):
-            chunk = self._part(part.offset + _HEAD.size + found.start(), in_step=False)
+            chunk = self._part(part.offset + HEAD.size + found.start(), in_step=False)
             if chunk is not None and self._is_sealed(chunk):
                 self._note_gap()
                 return False, chunk.offset
@@ -438,7 +437,7 @@ class _Scan:
         if self._is_followed(part):
             return True, part.end
         self._note_gap()
-        return False, part.offset + _HEAD.size
+        return False, part.offset + HEAD.size
 
     def _note_gap(self) -> None:
         self._sure, self._broken = False, True
@@ -447,10 +446,10 @@ class _Scan:
 
     def _part(self, at: int, *, in_step: bool) -> _WholeRecord | None:
         """The record that begins there, if it is whole."""
-        head = self._data.at(at, _HEAD.size)
-        if len(head) < _HEAD.size:
+        head = self._data.at(at, HEAD.size)
+        if len(head) < HEAD.size:
             return None
-        part = _WholeRecord(at, *_HEAD.unpack(head))
+        part = _WholeRecord(at, *HEAD.unpack(head))
         if part.end > self._data.size or part.length > MOST_UNPACKED:
             return None
         match part.opcode:
@@ -471,16 +470,16 @@ class _Scan:
     def _is_message_index(self, part: _WholeRecord) -> bool:
         if part.length < _INDEX_HEAD.size:
             return False
-        _, size = _INDEX_HEAD.unpack(self._data.at(part.offset + _HEAD.size, _INDEX_HEAD.size))
+        _, size = _INDEX_HEAD.unpack(self._data.at(part.offset + HEAD.size, _INDEX_HEAD.size))
         return bool(size == part.length - _INDEX_HEAD.size and size % _INDEX_ENTRY == 0)
 
     def _adds_up(self, part: _WholeRecord) -> bool:
         """Whether the lengths of a chunk add up, looked at before all of it is read."""
-        head = self._data.at(part.offset + _HEAD.size, _CHUNK_HEAD.size)
+        head = self._data.at(part.offset + HEAD.size, _CHUNK_HEAD.size)
         if len(head) < _CHUNK_HEAD.size:
             return False
         _, _, _, _, named = _CHUNK_HEAD.unpack(head)
-        size = self._data.at(part.offset + _HEAD.size + _CHUNK_HEAD.size + named, _SIZE.size)
+        size = self._data.at(part.offset + HEAD.size + _CHUNK_HEAD.size + named, _SIZE.size)
         return len(size) == _SIZE.size and _CHUNK_HEAD.size + named + _SIZE.size + _SIZE.unpack(size)[0] == part.length
 
     def _is_followed(self, part: _WholeRecord) -> bool:
@@ -488,10 +487,10 @@ class _Scan:
         rest = self._data.size - part.end
         if rest == 0 or self._data.is_magic(part.end):
             return True
-        if rest < _HEAD.size:
+        if rest < HEAD.size:
             return False
-        opcode, length = _HEAD.unpack(self._data.at(part.end, _HEAD.size))
-        return bool(0 < opcode <= Opcode.DATA_END or opcode >= PRIVATE) and length <= rest - _HEAD.size
+        opcode, length = HEAD.unpack(self._data.at(part.end, HEAD.size))
+        return bool(0 < opcode <= Opcode.DATA_END or opcode >= PRIVATE) and length <= rest - HEAD.size
 
     def _is_whole(self, part: _WholeRecord, *, in_step: bool) -> bool:
         try:
