@@ -1,5 +1,6 @@
 """A port named by hub and port number: its present node is opened, its adapter made quick, its power switched."""
 
+from collections import defaultdict
 from threading import Lock
 from typing import Final
 
@@ -83,8 +84,8 @@ class PortPower:
         self._machine = machine
         self._events = events
         self._cycles: dict[str, tuple[int, int]] = {}
-        self._writing = Lock()
-        """Keeps writes in their order, also after a caller was cancelled."""
+        self._writing: defaultdict[str, Lock] = defaultdict(Lock)
+        """By first attribute: keeps writes of one port in their order, also after a caller was cancelled."""
 
     async def cycle(self, name: str) -> None:
         """Switch the port ``name`` hangs on off and on; its device vanishes and comes back.
@@ -156,10 +157,10 @@ class PortPower:
         return [f"{port}/disable", *([peer] if there is not None else [])]
 
     async def _write_all(self, attributes: list[str], value: str) -> None:
-        sysfs = self._machine.sysfs
+        sysfs, in_order = self._machine.sysfs, self._writing[attributes[0]]
 
         def write() -> None:
-            with self._writing:
+            with in_order:
                 for attribute in attributes:
                     sysfs.write(attribute, value)
 

@@ -111,3 +111,18 @@ async def test_a_port_whose_power_is_being_taken_when_the_cycle_is_cancelled_get
     await asyncio.wait([cycling], timeout=5)
     assert cycling.cancelled()
     assert sysfs.text(f"{port_directory('1-1.3')}/disable") == "0"
+
+
+async def test_a_port_that_waits_for_its_device_keeps_no_other_from_being_switched(machine: Machine):
+    sysfs = machine.sysfs
+    assert isinstance(sysfs, HungSysfs)
+    sysfs.only_writes = True
+    power = PortPower(PowerConfig(method=CycleMethod.PORT), machine, Events())
+    waiting = asyncio.create_task(power.switch_off("1-1.3"))
+    async with asyncio.timeout(5):
+        while not sysfs.waited:
+            await asyncio.sleep(0.01)
+    async with asyncio.timeout(1):
+        await power.switch_off("1-1.2")
+    assert sysfs.text(f"{port_directory('1-1.2')}/disable") == "1"
+    await ended_soon(waiting)
