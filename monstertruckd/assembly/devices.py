@@ -1,5 +1,6 @@
 """Builds the drivers of a configuration: what each opens, and the ends of its role's topics."""
 
+import asyncio
 from collections.abc import Mapping
 from typing import Any
 
@@ -78,15 +79,18 @@ class Cabling:
         return PathSource(str(port.path), self._machine.clock)
 
     async def cut(self) -> None:
-        """Switch off the ports of ``usb.power.cut``; one that refuses is reported, and the next one is tried."""
-        for role in self._cut:
-            port = self._ports.get(role)
-            if not isinstance(port, UsbPortConfig):
-                continue
-            try:
-                await self._power.switch_off(port.device)
-            except DeviceError as error:
-                self._events(Reason.DEVICE_FAULT, Severity.ERROR, role, str(error))
+        """Switch off the ports of ``usb.power.cut`` at the same time: one that hangs or refuses holds up no other."""
+        ports = {role: self._ports.get(role) for role in self._cut}
+        async with asyncio.TaskGroup() as group:
+            for role, port in ports.items():
+                if isinstance(port, UsbPortConfig):
+                    group.create_task(self._cut_port(role, port))
+
+    async def _cut_port(self, role: str, port: UsbPortConfig) -> None:
+        try:
+            await self._power.switch_off(port.device)
+        except DeviceError as error:
+            self._events(Reason.DEVICE_FAULT, Severity.ERROR, role, str(error))
 
     def waiting(self, role: str) -> str | None:
         """What the device of ``role`` waits for before it may start; None if it does not wait."""

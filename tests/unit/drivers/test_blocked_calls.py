@@ -4,6 +4,7 @@ import asyncio
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,6 +16,8 @@ from monstertruck_drivers.usb.hub import HubCoordinator, UsbService
 from monstertruck_drivers.usb.port import HubNode, HubPort, PortPower
 from monstertruck_drivers.usb.tree import port_directory
 from monstertruck_runtime.clock import WallClock
+from monstertruckd.assembly.devices import Cabling
+from monstertruckd.bus.local import Bus
 from tests.unit.drivers.test_tty import LOOP_LIMIT, Watch
 from tests.unit.drivers.usb.rig import PORTS, Events, Kept, emulated_truck
 
@@ -126,3 +129,21 @@ async def test_a_port_that_waits_for_its_device_keeps_no_other_from_being_switch
         await power.switch_off("1-1.2")
     assert sysfs.text(f"{port_directory('1-1.2')}/disable") == "1"
     await ended_soon(waiting)
+
+
+async def test_a_port_that_waits_for_its_device_keeps_no_other_from_being_cut(machine: Machine):
+    sysfs = machine.sysfs
+    assert isinstance(sysfs, HungSysfs)
+    sysfs.only_writes = True
+    config: Any = SimpleNamespace(
+        devices=SimpleNamespace(present=lambda: {role: SimpleNamespace(port=port) for role, port in PORTS.items()}),
+        usb=UsbConfig(power=PowerConfig(method=CycleMethod.PORT, cut=("drive", "compass"))),
+    )
+    computer: Any = SimpleNamespace(machine=machine, watch=NoWatcher)
+    cutting = asyncio.create_task(Cabling(config, computer, Bus(machine.clock), {}).cut())
+    compass = f"{port_directory(PORTS['compass'].device)}/disable"
+    async with asyncio.timeout(2):
+        while sysfs.text(compass) != "1":
+            await asyncio.sleep(0.01)
+    assert sysfs.waited
+    await ended_soon(cutting)
