@@ -9,7 +9,6 @@ loads this table.
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 if TYPE_CHECKING:
@@ -111,8 +110,9 @@ class WizardKind:
         Raises:
             InputError: options do not fit together.
         """
-        module, _, name = self.procedure.partition(":")
-        procedure = getattr(import_module(module), name)
+        from monstertruck_runtime.plugins import load  # noqa: PLC0415 - not by every command line that reads the table
+
+        procedure = load(self.procedure)
         scaled = {
             option.name: value if option.scale == 1.0 else value * option.scale
             for option in self.options
