@@ -1,4 +1,4 @@
-"""Records of MCAP files: where each begins and ends, and which checksums hold."""
+"""Framing of MCAP files: records, the index at the end, and checksums."""
 
 import os
 import struct
@@ -33,7 +33,7 @@ DAMAGE: Final = (
     OverflowError,
     OSError,
 )
-"""What the libraries raise on bytes that are no MCAP record (lz4: RuntimeError; bad checksums: ValueError)."""
+"""Exceptions of the libraries on damaged bytes (lz4: RuntimeError; bad checksums: ValueError)."""
 
 _END: Final = struct.Struct("<BQQQI8s")
 """Footer and magic: opcode, length, where the summary and its offsets begin, checksum."""
@@ -60,10 +60,10 @@ def is_finished(path: Path) -> bool:
 
 
 def index_is_sound(file: BinaryIO) -> bool:
-    """Whether a log is finished, and its index at the end, if it has one, is what the checksum says.
+    """Whether a log is finished and its index, if it has one, matches the checksum.
 
     Args:
-        file: of the log; its position is another one afterwards.
+        file: the log; its position changes.
     """
     size = file.seek(0, os.SEEK_END)
     file.seek(-min(size, _END.size), os.SEEK_END)
@@ -77,7 +77,7 @@ def index_is_sound(file: BinaryIO) -> bool:
 
 
 def _checksum(file: BinaryIO, begin: int, end: int) -> int:
-    """Of the bytes from ``begin`` up to ``end``, which may be more than fit into memory."""
+    """CRC-32 of the bytes from ``begin`` up to ``end``, read in pieces."""
     file.seek(begin)
     value = 0
     for at in range(begin, end, _PIECE):
@@ -86,10 +86,10 @@ def _checksum(file: BinaryIO, begin: int, end: int) -> int:
 
 
 def read_frame(file: BinaryIO, size: int) -> tuple[int, bytes, bytes]:
-    """Opcode, head and content of the next record of a file of ``size`` bytes.
+    """Return opcode, head and content of the next record of a file of ``size`` bytes.
 
     Raises:
-        EndOfFile: it is not all there.
+        EndOfFile: the record is cut off.
         McapError: it is longer than ``MOST_UNPACKED``.
     """
     head = file.read(HEAD.size)
@@ -104,7 +104,7 @@ def read_frame(file: BinaryIO, size: int) -> tuple[int, bytes, bytes]:
 
 
 def read_statistics(file: BinaryIO, size: int) -> Statistics | None:
-    """Of a sound index that begins where ``file`` stands; None if it has none."""
+    """Return the statistics of the sound index at the position of ``file``, or None."""
     while True:
         opcode, _, content = read_frame(file, size)
         if opcode == Opcode.STATISTICS:
@@ -115,7 +115,7 @@ def read_statistics(file: BinaryIO, size: int) -> Statistics | None:
 
 
 def digest_of(opcode: int, content: bytes) -> bytes:
-    """Digest of a record, by which it is known when it is there again."""
+    """Return the digest by which a repeated record is recognised."""
     begin = _TIMES if opcode == Opcode.CHUNK else 0  # no checksum covers a chunk's times
     return blake2b(content[begin:], digest_size=16).digest()
 
@@ -134,7 +134,7 @@ def checked_attachment(record: Attachment, content: bytes) -> Attachment:
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a log for reading, whatever is in it.
+    """Open a log for reading, without a look at its content.
 
     Raises:
         NotFoundError: no such file.

@@ -1,4 +1,4 @@
-"""What a damaged log has kept and lost, in figures and words: the same for the reader and for the repair."""
+"""Damage of a log in figures and words, shared by the reader and the repair."""
 
 from dataclasses import dataclass
 
@@ -8,24 +8,24 @@ from monstertruckd.recorder.salvage import Salvage
 
 @dataclass(frozen=True, slots=True)
 class LogDamage:
-    """What is known of a log after all of it was read."""
+    """Damage of a log that was read to its end."""
 
     messages: int
-    """Kept."""
+    """Messages kept."""
     lost: int = 0
-    """Messages that are lost."""
+    """Messages lost."""
     counted: bool = True
-    """``lost`` is all; if not, the log has no sound index, and more may be lost."""
+    """Whether ``lost`` is exact; without a sound index more may be lost."""
     spans: tuple[tuple[float, float | None], ...] = ()
-    """Times in which messages are lost, s after the log's first message; None = to its end."""
+    """Begin and end of each loss, s after the log's first message; None = end of the log."""
     repeated: int = 0
     """Chunks that the log held twice."""
     damage: str | None = None
-    """What is wrong with the log; None when it is sound."""
+    """Description of the damage; None if the log is sound."""
 
     @property
     def costs(self) -> bool:
-        """Whether messages are lost, or may be."""
+        """Whether messages are or may be lost."""
         return self.lost > 0 or not self.counted
 
     @property
@@ -47,12 +47,12 @@ def _span_text(start: float, end: float | None) -> str:
 
 
 def repetition(chunks: int) -> str:
-    """Return what is wrong with a log that holds ``chunks`` twice."""
+    """Describe the damage of a log that holds this number of chunks twice."""
     return f"holds {chunks} chunk{'s' if chunks > 1 else ''} twice"
 
 
 def judged(salvage: Salvage) -> LogDamage:
-    """Return what is kept and lost, after all of the salvage's records were given."""
+    """Return the damage that a salvage met, once all its records were read."""
     spans = salvage.spans()
     begin = min((time for time in (salvage.first, *(span.start for span in spans)) if time is not None), default=0)
     damage = list(salvage.flaws)

@@ -202,7 +202,7 @@ class LogReader:
                 yield record
 
     def _learn(self, record: McapRecord) -> None:
-        """Note of which clock the times are.
+        """Note the offset of the log times from daemon time.
 
         Raises:
             ValueError: the offset is no number.
@@ -255,11 +255,11 @@ class LogReader:
             self.flaws.append("lacks an attachment or metadata")
 
     def _salvaged(self, file: BinaryIO, first: str) -> Iterator[McapRecord]:
-        """Whatever is whole from ``position`` on, and what is lost.
+        """Yield the whole records from ``position`` on; the damage is known after the last one.
 
         Args:
             file: the log.
-            first: what is wrong there.
+            first: damage at ``position``.
         """
         salvage = Salvage(file)
         introduced: set[int] = set()
@@ -317,7 +317,7 @@ class LogReader:
 
 
 def _resembles(head: bytes) -> bool:
-    """Whether the begin of a log may have become this: part of it is there, or a hole."""
+    """Whether these first bytes may be a damaged log's: part of the magic is left, or all are zeros."""
     return not any(head) or any(one == other for one, other in zip(head, MAGIC, strict=False))
 
 

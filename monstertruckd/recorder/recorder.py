@@ -217,7 +217,7 @@ class Recorder:
         digest: updated with every recorded message, in the thread.
         deterministic: for the virtual clock: ``record`` waits for the disk instead of dropping, chunks are closed
             by log time alone, and ``health`` names no file, so that two runs of one seed record the same.
-        on_repair: called on the event loop with words about every repair of an unfinished log.
+        on_repair: called on the event loop with the outcome, in words, of every repair of an unfinished log.
     """
 
     name = ServiceName.RECORDER.value
@@ -371,7 +371,7 @@ class Recorder:
         return process
 
     def _report(self, process: "subprocess.Popen[bytes]") -> None:
-        """A thread: hand on what the repair says."""
+        """Forward the outcomes of a repair to the event loop; runs in a thread."""
         with suppress(RuntimeError):  # the loop has ended
             for outcome in repairs(process):
                 if self._on_repair is not None:

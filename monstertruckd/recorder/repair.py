@@ -232,7 +232,7 @@ def start_repair(folder: Path) -> "subprocess.Popen[bytes] | None":
 
 
 def repairs(process: "subprocess.Popen[bytes]") -> Iterator[str]:
-    """Yield what the process says of every log, until it ends."""
+    """Yield the outcome for each log, in words, until the process ends."""
     assert process.stdout is not None
     with process.stdout as lines:
         for line in lines:
@@ -241,7 +241,7 @@ def repairs(process: "subprocess.Popen[bytes]") -> Iterator[str]:
 
 
 def _may_wait(path: Path) -> bool:
-    """Whether a log may wait for repair: of one that cannot be read the process tells."""
+    """Whether a log may wait for repair; the process reports one that cannot be read."""
     try:
         return _unfinished(path)
     except OSError:

@@ -1,4 +1,4 @@
-"""What of a damaged log is whole: every chunk whose checksum holds, wherever in the file it is.
+"""Search of a damaged log for whole records: every chunk whose checksum holds, wherever it is in the file.
 
 The file is read from its begin to its end, record by record. Where a record does not fit, the next one that does is
 looked for, byte by byte; a chunk fits by its checksum, another record by lengths that add up. Whatever lies between is
