@@ -66,7 +66,7 @@ from monstertruckd.recorder.recorder import LogDigest, Recorder
 from monstertruckd.recorder.recordings import Recordings
 
 STOPPED: Final = "the emergency stop is latched until you clear it"
-"""What follows of a file that is left out."""
+"""Consequence of a file that is left out."""
 LONGEST_WARNING: Final = 200
 """Characters of a warning that is acknowledged."""
 
@@ -84,7 +84,7 @@ class Daemon:
             nothing but the log is left: no Zenoh, no latch file. For the virtual clock.
         environment: what systemd gives a service: socket and watchdog period (``NOTIFY_SOCKET``, ``WATCHDOG_USEC``),
             ``RUNTIME_DIRECTORY``.
-        left_out: files that the start goes on without; the emergency stop is latched then, until an operator clears it.
+        left_out: unusable files; any of them latches the emergency stop until an operator clears it.
     """
 
     def __init__(

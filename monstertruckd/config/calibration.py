@@ -39,10 +39,10 @@ Grade = Literal["A", "B", "C"]
 
 
 def _known(name: str) -> str:
-    """Name of a wizard.
+    """Return the name of a wizard.
 
     Raises:
-        ValueError: there is none of it.
+        ValueError: no wizard has this name.
     """
     if name not in WIZARDS:
         raise ValueError(f"expected one of {', '.join(WIZARDS)}")

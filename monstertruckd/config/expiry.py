@@ -218,7 +218,7 @@ class CalibrationWatch:
         wrong, file = await self._offload(self.odometer.load), self.odometer.file
         if wrong and file is not None:
             where = await self._offload(lambda: put_aside(file))
-            text = f"{wrong}: the distance driven begins at 0, no calibration expires by it before; {where}"
+            text = f"{wrong}: the distance driven restarts at 0, which delays the end of calibrations; {where}"
             self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, text)
 
     def stamped(self, result: Result) -> Result:
@@ -262,7 +262,7 @@ class CalibrationWatch:
         try:
             await self._offload(odometer.save)
         except OSError as error:
-            text = f"{odometer.file}: the way driven is not kept: {error.strerror}"
+            text = f"{odometer.file}: the distance driven is not saved: {error.strerror}"
             self._events(disk_reason(error), Severity.WARNING, self.name, text)
 
     def _look(self) -> None:

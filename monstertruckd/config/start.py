@@ -1,4 +1,4 @@
-"""What a daemon starts with: its configuration and whatever is sound of the files that it wrote itself."""
+"""Start of a daemon: its configuration, with saved settings and calibration as far as their files are usable."""
 
 from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
@@ -16,13 +16,13 @@ T = TypeVar("T", bound=TruckConfig)
 
 
 class LeftOut(NamedTuple):
-    """A file that a start goes on without."""
+    """An unusable file that the daemon starts without."""
 
     file: Path
     source: str
     """Service whose values they are."""
     text: str
-    """What is wrong with the file, and what counts instead; after ``set_aside`` also where it is kept."""
+    """Damage and replacement of the file; after ``set_aside`` also the name under which it is kept."""
 
 
 def started(config: T, tree: Tree) -> tuple[T, Tree, tuple[LeftOut, ...]]:
@@ -55,7 +55,7 @@ async def set_aside(
 ) -> tuple[LeftOut, ...]:
     """Rename files that are left out, so that they are kept and later saves do not fail by them; see ``put_aside``.
 
-    The latched emergency stop is stored first: after a renaming alone, the next start would miss no file, and not stop.
+    The latched emergency stop is stored first: otherwise a start that dies here is followed by one that does not stop.
 
     Args:
         left_out: the files.

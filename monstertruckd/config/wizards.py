@@ -32,7 +32,7 @@ STRING: Final = "Standard error of the string's direction, mm per m."
 
 
 class Lifetime(NamedTuple):
-    """How long what a wizard measured counts."""
+    """Validity of a wizard's result."""
 
     days: int
     metres: float | None
@@ -40,15 +40,15 @@ class Lifetime(NamedTuple):
     role: str
     """Device that was measured."""
     topics: tuple[str, ...]
-    """What rests on it."""
+    """Topics that depend on the result."""
 
 
 class Goal(NamedTuple):
-    """Half-width of an interval that is meant, in the estimate's unit."""
+    """Confidence interval to be reached: its half-width, in the estimate's unit."""
 
     half: float
     share: bool = False
-    """Of the value."""
+    """``half`` is a fraction of the value."""
 
 
 class WizardOption(NamedTuple):
@@ -61,7 +61,7 @@ class WizardOption(NamedTuple):
     low: float | None = None
     high: float | None = None
     scale: float = 1.0
-    """Of the option's unit in that of the field."""
+    """Factor from the option's unit to that of the field."""
     choices: tuple[str, ...] = ()
 
 
@@ -78,7 +78,7 @@ class SequenceStep:
     options: Mapping[str, Any] = field(default_factory=dict)
     """Other than the defaults."""
     fits: Callable[["TruckConfig"], bool] = lambda _: True
-    """Whether this step, and not another one of the wizard, is for the robot."""
+    """Whether this step of the wizard applies to the robot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ class WizardKind:
     """By the estimate's name, ``*_x`` for each that ends so."""
     steps: tuple[SequenceStep, ...]
     fits: Callable[["TruckConfig"], bool]
-    """Whether a robot has what it measures."""
+    """Whether the wizard applies to the robot."""
     options: tuple[WizardOption, ...] = ()
     extra: str | None = None
     """Extra of the distribution without which the procedure does not load."""
@@ -419,7 +419,7 @@ class WizardRun(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Of the wizard."""
+        """Name of the wizard."""
         return self.wizard.name
 
 

@@ -16,7 +16,7 @@ _ADDRESSED: Final = ("tcp", "tls", "udp", "quic", "ws")
 """Protocols whose addresses are a host and a port."""
 _OTHERS: Final = ("unixsock-stream", "unixpipe", "vsock", "serial")
 ANNOUNCED: Final = "monstertruckd/"
-"""Beginning of the abstract Unix socket by which every user of this computer sees a daemon; its port follows."""
+"""Prefix of the abstract Unix socket that shows a daemon to all users of this computer; its port follows."""
 EVERYWHERE: Final = ("0.0.0.0", "::")  # noqa: S104
 """Addresses at which a program listens on all interfaces."""
 ANSWERS_WITHIN: Final = 0.2

@@ -20,10 +20,10 @@ class ConfigError(TruckError):
 
 
 class UnusableFileError(ConfigError):
-    """A file that the robot wrote itself, as saved settings or a calibration, cannot be used.
+    """A file written by the robot, such as saved settings or a calibration, cannot be used.
 
     Args:
-        file: which.
+        file: its path.
         why: text that names file, place and what was expected.
     """
 

@@ -74,7 +74,7 @@ class TrackerState(Message):
 
 
 class TaskState(Protocol):
-    """What the report on any task has: a goal, an exploration, a mission or a behaviour."""
+    """Common fields of the reports on tasks: goals, explorations, missions and behaviours."""
 
     @property
     def number(self) -> int:
@@ -90,7 +90,7 @@ class TaskState(Protocol):
 
     @property
     def activity(self) -> str:
-        """Say in words that it runs."""
+        """Description of the running task."""
 
     @property
     def outcome(self) -> Reason:
@@ -148,7 +148,7 @@ class GoalState(Message):
 
     @property
     def activity(self) -> str:
-        """Say in words that it runs."""
+        """Description of the running task."""
         return f"goal {self.number} of {self.source} is pursued"
 
 
@@ -178,7 +178,7 @@ class BehaviourState(Message):
 
     @property
     def activity(self) -> str:
-        """Say in words that it runs."""
+        """Description of the running task."""
         return f"the behaviour {self.behaviour} of {self.source} is running"
 
 
@@ -240,7 +240,7 @@ class ExplorationState(Message):
 
     @property
     def activity(self) -> str:
-        """Say in words that it runs."""
+        """Description of the running task."""
         return f"the exploration of {self.source} is running"
 
 
@@ -275,7 +275,7 @@ class MissionState(Message):
 
     @property
     def activity(self) -> str:
-        """Say in words that it runs."""
+        """Description of the running task."""
         return f"the mission of {self.source} is running"
 
 

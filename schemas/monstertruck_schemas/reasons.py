@@ -40,7 +40,7 @@ class Reason(StrEnum):
     NOT_PERMITTED = "not_permitted", 12, "the user may not do that"
     NOT_INSTALLED = "not_installed", 13, "something is not installed, or not as it should be"
     COMMAND_FAILED = "command_failed", 14, "a program of the computer failed"
-    FILE_DAMAGED = "file_damaged", 19, "a file of the robot's own cannot be used: it goes on without"
+    FILE_DAMAGED = "file_damaged", 19, "a file written by the robot cannot be used and is left out"
     REPLAY_DIFFERS = "replay_differs", 15, "the log computed again gives other outputs than it holds"
     ACKNOWLEDGED = "acknowledged", 0, "an operator has seen a warning"
     RECORDING_DELETED = "recording_deleted", 0, "a recording was deleted"

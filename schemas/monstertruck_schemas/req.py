@@ -179,7 +179,7 @@ class ControlRequest(Request):
 
 
 class Verb(StrEnum):
-    """What a request asks of a task server; the orders of every kind of task mean one of these."""
+    """Request to a task server; the orders of every kind of task map to these."""
 
     START = "start"
     RESUME = "resume"
@@ -213,7 +213,7 @@ class GoalRequest(Request):
 
     @property
     def verb(self) -> Verb:
-        """What it asks of the task server."""
+        """Request to the task server."""
         return Verb.START
 
     @property
@@ -239,7 +239,7 @@ class GoalControl(Request):
 
     @property
     def verb(self) -> Verb:
-        """What it asks of the task server."""
+        """Request to the task server."""
         return Verb.STOP if self.order is GoalOrder.CANCEL else Verb(self.order)
 
 
@@ -263,7 +263,7 @@ class BehaviourRequest(Request):
 
     @property
     def verb(self) -> Verb:
-        """What it asks of the task server."""
+        """Request to the task server."""
         return Verb(self.order)
 
 
@@ -289,7 +289,7 @@ class ExploreRequest(Request):
 
     @property
     def verb(self) -> Verb:
-        """What it asks of the task server."""
+        """Request to the task server."""
         return Verb(self.order)
 
 
@@ -314,7 +314,7 @@ class MissionRequest(Request):
 
     @property
     def verb(self) -> Verb:
-        """What it asks of the task server: one that a restart interrupted is started from its present step."""
+        """Request to the task server; resuming a mission is a start, from its present step."""
         return Verb.STOP if self.order is MissionOrder.STOP else Verb.START
 
 

@@ -170,7 +170,7 @@ class Joint:
     async def _stop_straying(self, session: Ax12Session, present: Present) -> None:
         """Take the unit's torque away for a rest."""
         await session.write(self.id, p.TORQUE_ENABLE, b"\x00")
-        self._straying, rest = 0, self._rested()
+        self._straying, rest = 0, self._begin_rest()
         self._strays += 1
         text = f"turned to {present.position} by itself, its goal is {self._goal}: no torque for {rest:g} s"
         self._report(Reason.UNCOMMANDED_MOTION, Severity.ERROR, text, position=present.position, goal=self._goal)
@@ -213,13 +213,13 @@ class Joint:
 
     def _go_limp(self) -> None:
         """The unit took its torque away itself: rest."""
-        reported, rest = self._outage, self._rested()
+        reported, rest = self._outage, self._begin_rest()
         if not reported:
             text = f"limp after {alarm_names(self._error)}: rests {rest:g} s"
             self._report(Reason.DEVICE_FAULT, Severity.ERROR, text, error=int(self._error))
 
-    def _rested(self) -> float:
-        """Begin a rest, the longer the sooner it is needed again; return its length, s."""
+    def _begin_rest(self) -> float:
+        """Begin a rest and return its length (s); it doubles with each rest that follows too soon."""
         alarm, now = self._config.alarm, self._clock.now()
         if self._held_at is not None and now - self._held_at >= alarm.settled_after * SECOND:
             self._rest = alarm.rest

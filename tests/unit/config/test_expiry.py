@@ -154,7 +154,7 @@ def test_an_odometer_that_cannot_be_written_is_reported_by_its_cause(code, reaso
     run_virtual(main)
     ((found, text),) = events
     assert found is reason
-    assert text.endswith(f"the way driven is not kept: {os.strerror(code)}")
+    assert text.endswith(f"the distance driven is not saved: {os.strerror(code)}")
 
 
 def test_a_value_of_zero_has_the_worst_grade_where_its_interval_is_meant_as_a_share_of_it():
