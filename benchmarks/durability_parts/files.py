@@ -79,7 +79,7 @@ WORDS: Final = (b"-1", b"0", b"1e999", b"nan", b"null", b"[]", b"{}", b"''", b"t
 RUN: Final = 1.0
 """Seconds of the log of a drive."""
 AT_ONCE: Final = 1e12
-"""Speed of a replay that waits for no message, whatever time it has."""
+"""Speed of a replay that waits for no message."""
 DATA: Final = Path(__file__).parents[2] / "tests" / "data"
 CONFIGS: Final = Path(__file__).parents[2] / "configs"
 
@@ -187,7 +187,7 @@ def _read_log(folder: Path) -> None:
 
 
 def _run(folder: Path) -> None:
-    """The begin of a drive, with all its topics."""
+    """First second of a drive, with all topics."""
     export_mcap(max(DATA.glob("golden/*/run.mcap")), folder / "log.mcap", Selection(end=RUN))
 
 
@@ -199,7 +199,7 @@ def _read_run(folder: Path) -> None:
 
 
 def as_a_command(log: Path) -> AbstractContextManager[object]:
-    """The door through which every command on logs looks at one."""
+    """Context in which every command on logs reads one."""
     return cli_logs.reading_log("read", log)
 
 

@@ -160,8 +160,8 @@ class Machine:
     sysfs: Sysfs = field(default_factory=Sysfs)
     dev: Path = Path("/dev")
     offload: Offload = in_daemon_thread
-    """Where its files are read and written: attributes of a device that hangs wait for it, some for half a minute, so
-    that neither other look-ups nor the end of a driver may wait for them."""
+    """Runs reads and writes of its files. A hung device blocks its attributes, some for half a minute; neither other
+    look-ups nor the end of a driver may wait for them."""
     run: Callable[[Sequence[str]], Awaitable[tuple[int, str]]] = run_command
     serial: OpenSerial = SerialPort
     """Makes the port of a serial node."""

@@ -103,20 +103,20 @@ async def run_task(
     clock: Clock | None = None,
     to_its_end: bool = False,
 ) -> TaskEnd[S]:
-    """Start a task and wait for its end; cancelled or without an answer, it is stopped, but nobody else's.
+    """Start a task and wait for its end. Cancelled or without an answer, stop it, but no task of another client.
 
     Args:
         client: who starts it.
         topic: of its reports.
-        needs: the service that does it.
-        start: asks for it; the answer has its ``number``.
-        stop: stops it, if this client started it.
+        needs: the service that runs the task.
+        start: requests it; the answer has its ``number``.
+        stop: stops the task, if this client started it.
         show: gets every report.
         arm: arm a robot that is disarmed.
         waits: a task of this kind is accepted by a disarmed robot, and waits until it is armed.
         report: gets why the robot stands, by ``clock``.
         clock: time.
-        to_its_end: one that is cancelled ends as any other does, once the robot has stopped it.
+        to_its_end: when cancelled, wait until the robot has stopped the task, and return how it ended.
 
     Raises:
         RequestRefusedError: the start or the arming was refused, the service failed, or the robot restarted.
@@ -450,7 +450,7 @@ async def _watched(
 
 @asynccontextmanager
 async def reported(stand: StandstillMonitor, clock: Clock | None, report: DriveReport | None) -> AsyncIterator[None]:
-    """Tell ``report`` meanwhile why the truck stands."""
+    """Report why the truck stands while the body runs."""
     watching = None
     if clock is not None and report is not None:
         watching = asyncio.create_task(_say_why_it_stands(stand, clock, report))

@@ -76,9 +76,9 @@ class HubCoordinator:
         self._config = config
         self._ports = ports
         self._places: dict[str, str] = {}
-        """Names of the places by role; those by topology as the kernel's once they were looked up."""
+        """Place of each role: the kernel's name; until the first look-up, the configured one."""
         self._roles: dict[str, str] = {}
-        """The same, the other way round."""
+        """Role of each place."""
         self._locate(lambda name: name)
         self._clock = clock
         self._events = events
@@ -174,7 +174,7 @@ class HubCoordinator:
         self._roles = {name: role for role, name in self._places.items()}
 
     def _follow_buses(self, snapshot: TreeSnapshot) -> None:
-        """Keep what is known of the places behind a controller whose buses came back with other numbers."""
+        """Carry the state of places over when their controller came back with other bus numbers."""
         roots = {(root.controller, root.speed): root.name for root in snapshot.roots()}
         buses = {
             before.removeprefix("usb"): root.removeprefix("usb")
@@ -195,7 +195,7 @@ class HubCoordinator:
         self._outages = {outage.hub: outage for outage in self._outages.values()}
 
     def _forget(self, name: str) -> None:
-        """Of a place whose name another place got."""
+        """Drop the state of a place whose name another place has taken."""
         del self._slots[name]
         self._judging.pop(name, None)
         self._outages.pop(name, None)

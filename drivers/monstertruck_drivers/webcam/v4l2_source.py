@@ -19,7 +19,7 @@ from monstertruck_runtime.threads import Offload, in_daemon_thread
 ENUMERATION_LIMIT: Final = 256
 """Rows at most: a broken driver may never say that there are no more."""
 PATIENCE: Final = 2.0
-"""Seconds that the end of a session waits for its camera to be let go."""
+"""Longest wait for the camera to stop at the end of a session (s)."""
 
 
 class V4l2Source:
@@ -133,7 +133,7 @@ class Camera:
 
 
 class _Starting:
-    """Start of a camera, which the kernel may complete only after its caller was cancelled.
+    """Start of a camera that its caller may give up before the kernel has completed it.
 
     Args:
         pattern: see ``V4l2Source``.
