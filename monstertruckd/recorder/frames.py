@@ -7,13 +7,24 @@ from dataclasses import replace
 from hashlib import blake2b
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Statistics
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Header,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.outside import MEGABYTE, MOST_UNPACKED
@@ -46,6 +57,20 @@ CHECKSUM: Final = struct.Struct("<I")
 _PIECE: Final = 1 << 20
 _TIMES: Final = 16
 """Bytes of a chunk's two times."""
+
+READERS: Final[dict[int, Any]] = {
+    Opcode.HEADER: Header,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK: Chunk,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.METADATA: Metadata,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.METADATA_INDEX: MetadataIndex,
+    Opcode.STATISTICS: Statistics,
+}
+"""Classes of records by opcode, but for messages, whose reader needs their length."""
 
 PRIVATE: Final = 0x80
 """Opcodes from here on are private ones; unknown ones below are damage."""

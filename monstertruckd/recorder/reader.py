@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, Final
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
 
 from monstertruck_runtime import wire
@@ -28,6 +28,7 @@ from monstertruckd.recorder.frames import (
     DAMAGE,
     MAGIC,
     PRIVATE,
+    READERS,
     checked_attachment,
     digest_of,
     index_is_sound,
@@ -44,12 +45,6 @@ CONFIG: Final = "config.json"
 
 _BEYOND: Final = 1 << 16
 """Numbers of schemas in a file are below."""
-_PLAIN: Final[dict[int, Any]] = {
-    Opcode.HEADER: Header,
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.METADATA: Metadata,
-}
 
 
 def spare_log(output: Path) -> None:
@@ -221,7 +216,7 @@ class LogReader:
             case Opcode.ATTACHMENT:
                 return (self._checked(Attachment.read(stream), content),)
             case Opcode.HEADER | Opcode.SCHEMA | Opcode.CHANNEL | Opcode.METADATA:
-                return (_PLAIN[opcode].read(stream),)
+                return (READERS[opcode].read(stream),)
         if opcode == 0:  # no opcode: the zeros of a file that a power cut left without its content
             raise McapError("zeros")
         if opcode != Opcode.MESSAGE_INDEX and opcode < PRIVATE:

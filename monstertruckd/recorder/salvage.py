@@ -21,7 +21,6 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
-    AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
@@ -29,7 +28,6 @@ from mcap.records import (
     McapRecord,
     Message,
     Metadata,
-    MetadataIndex,
     Schema,
     Statistics,
 )
@@ -38,7 +36,16 @@ from monstertruck_runtime import wire
 from monstertruck_runtime.outside import MOST_UNPACKED
 from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.recorder.chunks import records_in, unpacked
-from monstertruckd.recorder.frames import DAMAGE, HEAD, MAGIC, PRIVATE, checked_attachment, digest_of, index_is_sound
+from monstertruckd.recorder.frames import (
+    DAMAGE,
+    HEAD,
+    MAGIC,
+    PRIVATE,
+    READERS,
+    checked_attachment,
+    digest_of,
+    index_is_sound,
+)
 from monstertruckd.recorder.log_file import CHANNELS
 
 _CANDIDATE: Final = re.compile(rb"[\x01-\x0f].{5}\x00\x00\x00", re.DOTALL)
@@ -54,18 +61,6 @@ _LEAST_MESSAGE: Final = 22
 """Bytes of a message without its data."""
 _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17}
 """Of records whose content has one length."""
-_READERS: Final[dict[int, Any]] = {
-    Opcode.HEADER: Header,
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.CHUNK: Chunk,
-    Opcode.ATTACHMENT: Attachment,
-    Opcode.METADATA: Metadata,
-    Opcode.CHUNK_INDEX: ChunkIndex,
-    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
-    Opcode.METADATA_INDEX: MetadataIndex,
-    Opcode.STATISTICS: Statistics,
-}
 _WINDOW: Final = 1 << 20
 """Bytes searched at once."""
 _SECTOR: Final = 4096
@@ -316,7 +311,7 @@ class _WholeRecord(NamedTuple):
         stream = ReadDataStream(BytesIO(content))
         if self.opcode == Opcode.MESSAGE:
             return Message.read(stream, self.length)
-        record = _READERS[self.opcode].read(stream)
+        record = READERS[self.opcode].read(stream)
         if stream.count != self.length:
             raise McapError("lengths that do not add up")
         return record
@@ -461,7 +456,7 @@ class _Scan:
                 whole = part.length == _LENGTHS[opcode]
             case Opcode.CHUNK:
                 whole = self._adds_up(part) and self._is_whole(part, in_step=in_step)
-            case opcode if opcode in _READERS:
+            case opcode if opcode in READERS:
                 whole = self._is_whole(part, in_step=in_step)
             case opcode:
                 whole = opcode >= PRIVATE and in_step and self._is_followed(part)
