@@ -151,9 +151,10 @@ class Mapper:
             match = self._matched(scan, delta, noise)
         self._since_key = _moved(*self._since_key, delta, noise)
         if self._submap is not None:
-            led = self._motion.by_wheels(delta)
+            led = self._led_over_gap(match, delta, *_moved(self._pose, self._covariance, delta, noise))
             driven = math.hypot(delta[0], delta[1]) / self.config.key_distance
-            self._loss.take(match, (driven, self._key_share(delta)) if led else (0.0, 0.0))
+            moved = (driven, self._key_share(delta)) if self._motion.by_wheels(delta) else (0.0, 0.0)
+            self._loss.take(match, moved, led=led)
         trusted = not self._motion.check.contradicted
         self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
         if trusted and self._motion.check.contradicted:
@@ -198,8 +199,7 @@ class Mapper:
             return rejected(guess, covariance, MatchStatus.EMPTY)
         match = self._front.match(scan, delta, guess, covariance, self._submap)
         suspect, after_gap = self._loss.suspects(match, guess, covariance), self._loss.after_gap and match.accepted
-        if after_gap and not suspect and self._motion.by_wheels(delta) and led_there(match, guess, covariance):
-            self._loss.resolve()
+        if self._led_over_gap(match, delta, guess, covariance):
             return match
         most = PART_CONTRADICTION if suspect else CONTRADICTION
         if match.accepted and (off := self._motion.off(between(self._pose, match.pose))):
@@ -212,6 +212,11 @@ class Mapper:
         if after_gap and not prediction_is_certain(covariance) and self._has_moved(match.pose):
             return rejected(guess, covariance, MatchStatus.UNSURE)
         return match
+
+    def _led_over_gap(self, match: ScanMatch, delta: Array, guess: Array, covariance: Array) -> bool:
+        """Whether ``match`` is where the wheels led over a gap in the scans: ``guess``, of ``covariance``."""
+        found = self._loss.after_gap and match.accepted and self._motion.by_wheels(delta)
+        return found and led_there(match, guess, covariance)
 
     def finish(self) -> bool:
         """Search for open submaps and remaining loop closures, register all keyframes jointly: seconds of work.

@@ -96,14 +96,17 @@ class LossDetector:
             self._period += (dt - self._period) * (PERIOD_GAIN if self._period else 1.0)
         self._stamp = stamp
 
-    def take(self, match: ScanMatch, moved: tuple[float, float] = (0.0, 0.0)) -> None:
+    def take(self, match: ScanMatch, moved: tuple[float, float] = (0.0, 0.0), *, led: bool = False) -> None:
         """Take the match of the scan that arrived.
 
         Args:
             match: the match.
             moved: distance, and motion, since the scan before by wheels that agree with the scans, as multiples of
                 those between keyframes; 0 without such wheels.
+            led: the match is where the wheels led over a gap.
         """
+        if led:
+            self._misfits, self.after_gap, self._path = 0, False, 0.0
         self._path += moved[0]
         self._spacing += (moved[1] - self._spacing) * PERIOD_GAIN
         doubt = self._misfits or self.after_gap
@@ -114,14 +117,9 @@ class LossDetector:
         self._usual += (match.overlap - self._usual) * (OVERLAP_GAIN if self._usual else 1.0)
         self.restart()
 
-    def resolve(self) -> None:
-        """The newest match is where the wheels led over the gap."""
-        self._misfits, self.after_gap, self._path = 0, False, 0.0
-
     def restart(self) -> None:
         """The newest scan fits, for it is part of the map."""
-        self._misfits, self.after_gap, self.fitted = 0, False, self._stamp or 0
-        self._path = 0.0
+        self._misfits, self.after_gap, self.fitted, self._path = 0, False, self._stamp or 0, 0.0
 
 
 CERTAIN_PREDICTION: Final = (0.5, 0.5)

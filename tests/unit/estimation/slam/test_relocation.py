@@ -1,6 +1,7 @@
 """A robot that is carried while it maps: lost, a submap of its own, joined to the map by a verified closure."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -239,6 +240,23 @@ def test_over_a_gap_wheels_lead_to_a_match_within_their_deviation(off, deviation
     covariance = np.diag(np.square((deviation[0], *deviation)))
     match = dataclasses.replace(fit(0.5), pose=np.array(off))
     assert led_there(match, np.zeros(3), covariance) is led
+
+
+def test_over_a_gap_a_half_fit_where_the_wheels_led_does_not_spare_another_match_the_check():
+    outline, rng = box(-2.5, -2.0, 2.5, 2.0), np.random.default_rng(3)
+    cupboards = [*box(1.2, -0.5, 1.6, 0.9), *box(-1.0, 1.1, 0.3, 1.4), *box(-0.8, -1.6, 0.6, -1.2)]
+    mapper, way = Mapper(), np.linspace((-1.4, 0.0, 0.0), (0.2, 0.0, 0.0), 60)
+    for k, pose in enumerate(way):
+        mapper.step(scan([*outline, *cupboards], pose, noise=0.01, rng=rng), int(k * 1e8), pose)
+    # The scan shows a room without the cupboards: by the wheels it fits by half, by the last motion as a whole.
+    overlaps = iter((0.5, 0.9))
+
+    def match(_scan, _delta, guess, covariance, _submap):
+        return dataclasses.replace(fit(next(overlaps)), pose=guess, covariance=covariance)
+
+    mapper._front = SimpleNamespace(match=match)
+    step = mapper.step(scan(outline, way[-1], noise=0.01, rng=rng), 60 * SECOND, way[-1])
+    assert step.match.overlap == 0.5, "the other one was checked, and rejected"
 
 
 def test_after_a_misfit_a_half_fit_is_none():
