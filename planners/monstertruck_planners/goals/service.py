@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2, placed
+from monstertruck_kinematics.se2 import Pose2, placed, poses_relative
 from monstertruck_planners.collision import scan_points_at
 from monstertruck_planners.goals import goal_run
 from monstertruck_planners.goals.deformation import RouteDeformation, event_of
@@ -331,7 +331,7 @@ class GoalService:
         odometry = self._odometry(now)
         pose = None if odometry is None else pose_of(odometry)
         if odometry is not None and pose is not None:
-            self._trail.append((odometry.stamp, pose))
+            self._keep_pose(odometry.stamp, pose)
         while self._trail and now - self._trail[0][0] > TRAIL:
             self._trail.popleft()
         if pose is None or self._before is None or math.dist(pose[:2], self._before[:2]) > JUMP:
@@ -342,14 +342,22 @@ class GoalService:
         if len(points := self._scan(odometry, now)):
             self._seen.append((pose, points))
 
+    def _keep_pose(self, stamp: int, pose: Pose2) -> None:
+        """Keep a pose; after a jump the poses before it move along: not the robot has moved, but the map's frame."""
+        if self._trail and math.dist(pose[:2], self._trail[-1][1][:2]) > JUMP:
+            stamps, poses = zip(*self._trail, strict=True)
+            moved = placed(poses_relative(np.array(poses), poses[-1]), pose).tolist()
+            self._trail = deque((at, (x, y, yaw)) for at, (x, y, yaw) in zip(stamps, moved, strict=True))
+        self._trail.append((stamp, pose))
+
     def _ground_seen(self) -> SeenGround | None:
-        """The newest survey of seen ground; None if there is none, or nobody asks for it."""
+        """The newest survey of seen ground; None if there is none, its place is not known, or the gate needs none."""
         grid = None if self._in.seen is None else self._in.seen.latest
         scan = None if self._in.scan is None else self._in.scan.latest
         if self._setup.seen_for is None or grid is None or scan is None or not self._trail:
             return None
         at, pose = min(self._trail, key=lambda kept: abs(kept[0] - grid.stamp))
-        if abs(at - grid.stamp) > TRAIL:
+        if abs(at - grid.stamp) > (1.0 / self._config.rate + ODOMETRY.fresh_for()) * SECOND:
             return None
         return SeenGround(grid, pose, (scan.start_angle, scan.end_angle), scan.range_max)
 

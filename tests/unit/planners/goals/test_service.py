@@ -1,6 +1,7 @@
 """The goal service before it runs, what it answers, and what it does about planners that fail."""
 
 import asyncio
+from collections import deque
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,14 +14,15 @@ from monstertruck_planners.goals.deform_step import DeformStep, Window
 from monstertruck_planners.goals.deformation import RouteDeformation
 from monstertruck_planners.goals.exchange import DeformTask, pose_of, twist_of
 from monstertruck_planners.goals.service import GoalService
-from monstertruck_runtime.clock import run_virtual
+from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import InputError, RequestRefusedError, WorkerError
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_runtime.requests import inner_request
-from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.plan import GoalPhase, GoalState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalRequest
+from monstertruck_schemas.state import Odometry
 from tests.unit.planners.kit import scanned_on_the_move
 
 GOAL = GoalRequest(**inner_request(1, None, 0, "ann"), goal=Pose2D(x=1.0, y=0.0, yaw=0.0))
@@ -89,6 +91,34 @@ def test_who_waits_for_the_way_to_a_goal_is_not_informed_of_another_goals_way():
         assert refused.value.refusal is Reason.CANCELLED
 
     asyncio.run(main())
+
+
+def test_the_ground_seen_moves_with_a_pose_that_jumps_and_is_not_placed_by_a_later_one():
+    service = GoalService.__new__(GoalService)
+    service._setup, service._config = SimpleNamespace(seen_for=30.0), PlannerConfig()
+    service._seen, service._trail, service._before = deque(), deque(), None
+    service._scan = lambda *_: np.empty((0, 2))
+    pose, seen, scan = (SimpleNamespace(latest=None) for _ in range(3))
+    service._in = SimpleNamespace(pose=pose, seen=seen, scan=scan)
+    scan.latest = SimpleNamespace(start_angle=-2.0, end_angle=2.0, range_max=4.0)
+
+    def at(tick: int, x: float) -> None:
+        now = 10 * SECOND + tick * SECOND // 10
+        pose.latest = Odometry(
+            stamp=now, received=now, seq=tick, pose=Pose2D(x=x, y=0.0, yaw=0.0), frame="map",
+            twist=Twist2D(vx=0.0, vy=0.0, wz=0.0), pose_covariance=np.zeros(9), twist_covariance=np.zeros(9), age=0.0,
+        )  # fmt: skip
+        service._keep_scan(now)
+
+    for tick in range(5):
+        at(tick, 0.02 * tick)
+    seen.latest = SimpleNamespace(stamp=10 * SECOND)
+    assert service._ground_seen().pose == (0.0, 0.0, 0.0)
+    at(5, 3.08)  # the map's frame has moved under the robot
+    assert service._ground_seen().pose == pytest.approx((3.0, 0.0, 0.0))
+    for tick in range(6, 46):
+        at(tick, 3.08 + 0.02 * (tick - 5))
+    assert service._ground_seen() is None, "the pose at its stamp is no longer kept"
 
 
 def test_a_planner_in_the_loop_that_refuses_its_input_is_an_answer_and_an_event():
