@@ -72,15 +72,6 @@ def compose_jacobians(outer: Array, inner: Array) -> tuple[Array, Array]:
     return by_outer, by_inner
 
 
-def interpolate(stamps: Array, poses: Array, at: Array) -> Array:
-    """Poses at the times ``at``, straight between the samples of a trajectory (``stamps`` rising), held at its ends."""
-    yaw = np.unwrap(poses[:, 2])
-    columns = (poses[:, 0], poses[:, 1], yaw)
-    result = np.stack([np.interp(at, stamps, column) for column in columns], axis=-1)
-    result[:, 2] = wrap(result[:, 2])
-    return result
-
-
 def between_jacobians(origin: Array, target: Array) -> tuple[Array, Array]:
     """Derivatives, shape (3, 3), of ``between(origin, target)`` by ``origin`` and by ``target``."""
     c, s = np.cos(origin[2]), np.sin(origin[2])
@@ -91,13 +82,25 @@ def between_jacobians(origin: Array, target: Array) -> tuple[Array, Array]:
     return by_origin, by_target
 
 
-def placed(poses: Array, at: Pose2) -> Array:
-    """Poses (n, 3) given in the frame of ``at``, in the frame that ``at`` is given in."""
+def interpolate(stamps: Array, poses: Array, at: Array) -> Array:
+    """Poses at the times ``at``, straight between the samples of a trajectory (``stamps`` rising), held at its ends."""
+    yaw = np.unwrap(poses[:, 2])
+    columns = (poses[:, 0], poses[:, 1], yaw)
+    result = np.stack([np.interp(at, stamps, column) for column in columns], axis=-1)
+    result[:, 2] = wrap(result[:, 2])
+    return result
+
+
+def points_placed(points: Array, at: Pose2) -> Array:
+    """Points (n, 2) given in the frame of ``at``, in the frame that ``at`` is given in."""
     x, y, yaw = at
     c, s = math.cos(yaw), math.sin(yaw)
-    return np.column_stack(
-        (x + c * poses[:, 0] - s * poses[:, 1], y + s * poses[:, 0] + c * poses[:, 1], yaw + poses[:, 2])
-    )
+    return np.column_stack((x + c * points[:, 0] - s * points[:, 1], y + s * points[:, 0] + c * points[:, 1]))
+
+
+def placed(poses: Array, at: Pose2) -> Array:
+    """Poses (n, 3) given in the frame of ``at``, in the frame that ``at`` is given in."""
+    return np.column_stack((points_placed(poses, at), at[2] + poses[:, 2]))
 
 
 def points_relative(points: Array, at: Pose2) -> Array:

@@ -16,7 +16,7 @@ from scipy.ndimage import binary_dilation
 
 from monstertruck_estimation.slam.grid import trace
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2, placed, points_relative, poses_relative
+from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_relative, poses_relative
 from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, scan_points_at
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Setup, explained_within
 from monstertruck_planners.goals.plan_step import answer_of
@@ -238,7 +238,7 @@ class DeformStep:
         """
         pose, points = task.pose, scan_points_at(task.scan, setup.lidar, task.stamp, task.twist)
         (sensor,) = placed(np.array([setup.lidar]), pose)
-        ends = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
+        ends = points_placed(points, pose)
         self._window.add_scan((sensor[0], sensor[1]), pose[:2], ends, np.ones(len(points), np.bool_))
         before = self._window.obstacles
         beams = _beams(points_relative(before, tuple(sensor)), task.scan)

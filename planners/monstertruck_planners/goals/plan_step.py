@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2, placed, points_relative
+from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_relative
 from monstertruck_planners.collision import OCCUPIED, DistanceField, Footprint, rectangle_distance
 from monstertruck_planners.goals.escape import escape
 from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Setup, explained_within
@@ -185,9 +185,8 @@ class StaticMap:
     def obstacles(self, cells: Cells, pose: Pose2, reach: float) -> Array:
         """Centres of the occupied cells round a pose, shape (n, 2), in the frame of the pose."""
         rows, columns = np.nonzero(cells >= OCCUPIED)
-        centres = (np.column_stack((columns, rows)) + 0.5) * self.resolution
-        flat = np.column_stack((centres, np.zeros(len(centres))))
-        there = points_relative(placed(flat, self.origin)[:, :2], pose)
+        centres = np.column_stack((columns + 0.5, rows + 0.5)) * self.resolution
+        there = points_relative(points_placed(centres, self.origin), pose)
         return np.asarray(there[np.hypot(there[:, 0], there[:, 1]) < reach])
 
 
@@ -223,8 +222,8 @@ def standing_free(
         max(int(at[1]) - reach, 0) : min(int(at[1]) + reach + 1, rows),
         max(int(at[0]) - reach, 0) : min(int(at[0]) + reach + 1, columns),
     ].reshape(2, -1)
-    centres = np.column_stack((column + 0.5, row + 0.5, np.zeros(len(row)))) * resolution
-    gap = rectangle_distance(footprint, np.array([pose]), placed(centres, origin)[:, :2])[0]
+    centres = np.column_stack((column + 0.5, row + 0.5)) * resolution
+    gap = rectangle_distance(footprint, np.array([pose]), points_placed(centres, origin))[0]
     unknown, touched = cells[row, column] < 0, resolution * math.sqrt(0.5)
     freed = np.where(unknown, gap < touched + beside, (gap < touched) & (gap > -MAP_OVERLAP * resolution))
     kept = cells.copy()
@@ -240,11 +239,11 @@ def ground_layers(ground: Ground, grid: StaticMap, reach: float) -> tuple[Array,
     pad = math.ceil(reach / ground.resolution)
     shape = np.array((ground.height, ground.width)) + 2 * pad
     origin = (ground.origin.x, ground.origin.y, ground.origin.yaw)
-    x0, y0, yaw = placed(np.array([(-pad * ground.resolution, -pad * ground.resolution, 0.0)]), origin)[0].tolist()
-    corner = (x0, y0, yaw)
+    x0, y0 = points_placed(np.full((1, 2), -pad * ground.resolution), origin)[0].tolist()
+    corner = (x0, y0, origin[2])
     row, column = _cells_within(grid, corner, shape * ground.resolution)
-    centres = np.column_stack((column + 0.5, row + 0.5, np.zeros(len(row)))) * grid.resolution
-    there = points_relative(placed(centres, grid.origin)[:, :2], corner) / ground.resolution
+    centres = np.column_stack((column + 0.5, row + 0.5)) * grid.resolution
+    there = points_relative(points_placed(centres, grid.origin), corner) / ground.resolution
     x, y = np.floor(there).astype(int).T
     inside = (x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0])
     row, column, x, y = row[inside], column[inside], x[inside], y[inside]
@@ -260,8 +259,8 @@ def ground_layers(ground: Ground, grid: StaticMap, reach: float) -> tuple[Array,
 
 def _cells_within(grid: StaticMap, corner: Pose2, size: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns of a map's cells round a rectangle: the pose of its corner, and its height and width, m."""
-    flat = np.array([(x, y, 0.0) for x in (0.0, size[1]) for y in (0.0, size[0])])
-    box = points_relative(placed(flat, corner)[:, :2], grid.origin) / grid.resolution
+    corners = np.array([(x, y) for x in (0.0, size[1]) for y in (0.0, size[0])])
+    box = points_relative(points_placed(corners, corner), grid.origin) / grid.resolution
     rows, columns = grid.cells.shape
     left, bottom = np.clip(np.floor(box.min(axis=0)), 0, (columns, rows)).astype(int)
     right, top = np.clip(np.ceil(box.max(axis=0)), 0, (columns, rows)).astype(int)
@@ -344,7 +343,7 @@ class PlanningStep:
             memory.keep(scan.points)
         if task.clear:
             memory.suspend(np.hypot(*(memory.places - task.pose[:2]).T) > NEARBY)
-        memory.look(task.points, placed(np.array([setup.lidar]), task.pose)[0, :2])
+        memory.look(task.points, points_placed(np.array([setup.lidar[:2]]), task.pose)[0])
         memory.keep(task.points)
         tolerance = explained_within(setup.config, task.deviation)
         memory.drop_explained(lambda places: static_map.unexplained(places, tolerance))
@@ -496,7 +495,7 @@ class PlanningStep:
         assert self._setup is not None
         footprint = self._setup.footprint
         margin = math.ceil(2 * footprint.circumscribed_radius / static_map.resolution)
-        corner = placed(np.array([(-margin * static_map.resolution,) * 2 + (0.0,)]), static_map.origin)[0]
+        corner = points_placed(np.full((1, 2), -margin * static_map.resolution), static_map.origin)[0]
         origin = (float(corner[0]), float(corner[1]), static_map.origin[2])
         outside = np.pad(np.zeros(cells.shape, np.bool_), margin, constant_values=True)
         around = np.pad(cells, margin, constant_values=-1)

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2, placed, poses_relative
+from monstertruck_kinematics.se2 import Pose2, placed, points_placed, poses_relative
 from monstertruck_planners.collision import scan_points_at
 from monstertruck_planners.goals import goal_run
 from monstertruck_planners.goals.deformation import RouteDeformation, event_of
@@ -402,14 +402,14 @@ class GoalService:
         ground = None if self._in.ground is None else self._in.ground.latest
         if ground is not None and ground.frame != odometry.frame:
             ground = None
-        lidar = np.array([self._setup.lidar])
-        seen = tuple(SeenScan(_in_map(points, at), placed(lidar, at)[0, :2]) for at, points in self._seen)
+        lidar = np.array([self._setup.lidar[:2]])
+        seen = tuple(SeenScan(points_placed(points, at), points_placed(lidar, at)[0]) for at, points in self._seen)
         self._seen.clear()
         task = PlanTask(
             plan.what,
             pose,
             run.goal,
-            _in_map(self._scan(odometry, now), pose),
+            points_placed(self._scan(odometry, now), pose),
             setup=self._setup if self._fresh else None,
             grid=grid if grid is not self._sent_grid or self._fresh else None,
             ground=ground if ground is not self._sent_ground or self._fresh else None,
@@ -495,11 +495,6 @@ class GoalService:
 
 def _estopped(gate: GateState | None) -> bool:
     return gate is not None and gate.mode is GateMode.ESTOPPED
-
-
-def _in_map(points: Array, pose: Pose2) -> Array:
-    """Points in base, shape (n, 2), in the frame of the pose."""
-    return placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
 
 
 def _moved_on(before: Pose2, pose: Pose2) -> bool:

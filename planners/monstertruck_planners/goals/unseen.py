@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2, placed, points_relative
+from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_relative
 from monstertruck_planners.collision import DistanceField, Footprint, rectangle_distance
 from monstertruck_planners.goals.exchange import PlanAnswer, SeenGround
 
@@ -131,8 +131,8 @@ def unseen_around(seen: SeenGround, keep: float, lidar: Pose2, footprint: Footpr
     grid = seen.grid
     ages = grid.cells.reshape(grid.height, grid.width)
     rows, columns = np.nonzero(ages != 0)
-    flat = np.column_stack((columns + 0.5, rows + 0.5, np.zeros(len(rows)))) * grid.resolution
-    there = placed(placed(flat, (grid.origin.x, grid.origin.y, grid.origin.yaw)), seen.pose)[:, :2]
+    centres = np.column_stack((columns + 0.5, rows + 0.5)) * grid.resolution
+    there = points_placed(points_placed(centres, (grid.origin.x, grid.origin.y, grid.origin.yaw)), seen.pose)
     age = ages[rows, columns].astype(float)
     left = np.where(age < 0, 0.0, keep * (1.0 - age / 100))
     return Unseen(there, left, lidar, seen.field, seen.reach, footprint)
