@@ -30,7 +30,7 @@ from monstertruck_estimation.slam.scans import Scan
 from monstertruck_estimation.slam.storage import SavedGraph, SavedMap, surface_elements
 from monstertruck_estimation.slam.worker_io import GridPatch, ScanInput, SlamEstimate
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2, between, compose, compose_jacobians, inverse
+from monstertruck_kinematics.se2 import Pose2, Twist2, between, compose, compose_jacobians, inverse
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
@@ -112,7 +112,7 @@ class LocalisationEstimator:
         self.counts = {"scans": 0, "keys": 0, "closures": 0, "rejected": 0, "searches": int(start is None)}
 
     @property
-    def twist(self) -> Pose2:
+    def twist(self) -> Twist2:
         """See ``Estimator``."""
         return self._motion.twist
 

@@ -41,7 +41,7 @@ from monstertruck_estimation.slam.scans import Scan, prepare_input
 from monstertruck_estimation.slam.storage import SavedGraph, saved_graph
 from monstertruck_estimation.slam.worker_io import GridPatch, ScanIncrement, ScanInput, SlamEstimate
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2, between, compose, compose_jacobians, inverse
+from monstertruck_kinematics.se2 import Pose2, Twist2, between, compose, compose_jacobians, inverse
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
@@ -118,7 +118,7 @@ class Mapper:
         return self._loss.lost or not self.map.joined()[-1:].all()
 
     @property
-    def twist(self) -> Pose2:
+    def twist(self) -> Twist2:
         """Velocity of base over the last two scans (vx, vy, wz; m/s, rad/s), to deskew the next one."""
         return self._motion.twist
 
@@ -127,7 +127,7 @@ class Mapper:
         scan: Scan,
         stamp: int,
         odom: Array | None = None,
-        again: Callable[[Pose2], Scan] | None = None,
+        again: Callable[[Twist2], Scan] | None = None,
         period: float = 0.0,
     ) -> Step | None:
         """Take one scan.
@@ -359,7 +359,7 @@ class Estimator(Protocol):
     """Scans, keyframes, closures, rejected matches."""
 
     @property
-    def twist(self) -> Pose2:
+    def twist(self) -> Twist2:
         """Velocity of base by the last scans, m/s and rad/s."""
 
     @property
@@ -421,7 +421,7 @@ class MappingEstimator:
         self._scan_odometry = ScanOdometry()
 
     @property
-    def twist(self) -> Pose2:
+    def twist(self) -> Twist2:
         """See ``Estimator``."""
         return self.mapper.twist
 

@@ -11,7 +11,7 @@ from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.scan_matcher import LOW_OVERLAP, ScanMatch, deviations
 from monstertruck_estimation.slam.worker_io import ScanIncrement
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import between, compose, rotation
+from monstertruck_kinematics.se2 import Twist2, between, compose, rotation
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import OdometryUse
 
@@ -31,7 +31,7 @@ MISSING_AFTER: Final = 1.0
 """Seconds without finite odometry after which it is missing."""
 
 
-def velocity(delta: Array, dt: float) -> tuple[float, float, float]:
+def velocity(delta: Array, dt: float) -> Twist2:
     """Velocity in base (vx, vy, wz; m/s, rad/s) of the motion ``delta``, shape (3,), in ``dt`` s; 0 if dt is."""
     if dt <= 0:
         return 0.0, 0.0, 0.0
@@ -280,7 +280,7 @@ class MotionPredictor:
         return self._odom
 
     @property
-    def twist(self) -> tuple[float, float, float]:
+    def twist(self) -> Twist2:
         """Velocity of base between the last two scans (vx, vy, wz; m/s, rad/s)."""
         return velocity(self._delta, self._dt)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2
+from monstertruck_kinematics.se2 import Twist2
 
 RANGE_NOISE: Final = 0.012
 """Standard deviation of a range close by, m (URG-04LX and SICK LMS200 manuals: 10 to 15 mm)."""
@@ -132,7 +132,7 @@ def prepare(
     return Scan(*elements)
 
 
-def prepare_input(inputs: ScanInput, longest: float, twist: Pose2 = (0.0, 0.0, 0.0)) -> Scan:
+def prepare_input(inputs: ScanInput, longest: float, twist: Twist2 = (0.0, 0.0, 0.0)) -> Scan:
     """Points of a scan in base: motion undone, level_ranges, without what hit the ground or the ceiling.
 
     Args:

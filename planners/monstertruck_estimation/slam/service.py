@@ -23,7 +23,7 @@ from monstertruck_estimation.slam.worker_io import (
 )
 from monstertruck_estimation.transforms import planar
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2, between, interpolate, rotation
+from monstertruck_kinematics.se2 import Pose2, Twist2, between, interpolate, rotation
 from monstertruck_runtime.actors.actor import WorkerActor
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DamagedFileError, WorkerError
@@ -291,7 +291,7 @@ class SlamService:
             ceiling=self._config.ceiling,
         )
 
-    def _motion(self, begin: int, end: int) -> tuple[Pose2 | None, Pose2]:
+    def _motion(self, begin: int, end: int) -> tuple[Pose2 | None, Twist2]:
         """Base in odom at ``begin``, and the velocity until ``end``; both ns."""
         history = self._history
         if not history or begin - history[-1][0] > STALE or begin < history[0][0]:

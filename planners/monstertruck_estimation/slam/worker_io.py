@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2
+from monstertruck_kinematics.se2 import Pose2, Twist2
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 
@@ -48,7 +48,7 @@ class ScanInput:
     """Planar pose of the sensor in base, m and rad."""
     odom: Pose2 | None = None
     """Base in odom at ``stamp``; None without odometry."""
-    twist: Pose2 = (0.0, 0.0, 0.0)
+    twist: Twist2 = (0.0, 0.0, 0.0)
     """The base's velocity during the scan, m/s and rad/s."""
     slopes: tuple[float, float] | None = None
     """Rise per metre along the sensor's x and y axis; None = not known, assumed level."""
