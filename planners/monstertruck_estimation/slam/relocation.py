@@ -36,7 +36,8 @@ GAP: Final = (5.0, 3.0)
 """A longer pause, s, that is also so many times the usual one, is a gap: the robot may be elsewhere after it."""
 LOST_PATH: Final = 7.0
 """Distance by wheels that agree with sparse scans, as a multiple of that between keyframes, after which the robot is
-lost: three such scans, or a turn among people, are no more than three looks at a crowd."""
+lost. Three scans so far apart, or a turn among people, may show the same crowd. By default it is 2.1 m, less than
+``VIEW``: a submap that begins there still shares surroundings with the last keyframe."""
 PERIOD_GAIN: Final = 0.1
 """Weight of one period in the usual one."""
 
@@ -136,8 +137,11 @@ def prediction_is_certain(covariance: Array) -> bool:
 
 
 LED: Final = 1.5
-"""Standard deviations from the predicted pose up to which a match is where the wheels led: of a robot that was carried
-one in fifteen is so near, anywhere in the window of three on each axis."""
+"""Mahalanobis distance from the predicted pose up to which a match is where the wheels led.
+
+Half of the right matches are so near (chi-square of three degrees of freedom: 48 %), and of wrong ones, spread over the
+matcher's ``WINDOW`` of three standard deviations on each axis, one in fifteen (a ball in a cube).
+"""
 
 
 def led_there(match: ScanMatch, guess: Array, covariance: Array) -> bool:
