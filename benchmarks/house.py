@@ -293,7 +293,9 @@ def places(files: list[Source]) -> dict[str, list[str]]:
     for kind, pattern in EXAMPLES.items():
         named_in = [source.path for source in files if re.search(pattern, (ROOT / source.path).read_text())]
         own = {str(Path(path).parent) for path in named_in if re.search(pattern, Path(path).parent.name)}
-        found[kind] = sorted({next((folder for folder in own if path.startswith(folder)), path) for path in named_in})
+        found[kind] = sorted(
+            {next((folder for folder in own if path.startswith(f"{folder}/")), path) for path in named_in}
+        )
     return found
 
 
