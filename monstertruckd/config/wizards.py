@@ -36,7 +36,7 @@ class Lifetime(NamedTuple):
 
     days: int
     metres: float | None
-    """Distance driven, m; None: not limited."""
+    """Distance travelled, m; None: not limited."""
     role: str
     """Device that was measured."""
     topics: tuple[str, ...]
@@ -276,7 +276,7 @@ _ROWS: Final = (
             "roll": Goal(0.0087),
             "pitch": Goal(0.0087),
         },
-        steps=(  # how level it is, too, where no stabiliser levels it, whose zeros are that
+        steps=(  # a stabiliser's zeros level the lidar; without one its own tilt is measured
             SequenceStep(
                 "pitch",
                 needs=("odometry.wheelbase",),

@@ -16,7 +16,7 @@ Pose2 = tuple[float, float, float]
 Twist2 = tuple[float, float, float]
 """vx, vy (m/s) and wz (rad/s) of a point, in the body frame."""
 TwistOf = tuple[Real, Real, Real]
-"""The same of one state or, as arrays, of many at once."""
+"""The same for one state, or as arrays for many."""
 
 
 def wrap(angle: Array | float) -> Array:

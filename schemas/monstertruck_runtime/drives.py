@@ -103,7 +103,7 @@ async def run_task(
     clock: Clock | None = None,
     to_its_end: bool = False,
 ) -> TaskEnd[S]:
-    """Start a task and wait for its end. Cancelled or without an answer, stop it, but no task of another client.
+    """Start a task and wait for its end; stop it if cancelled or unanswered, unless another client started it.
 
     Args:
         client: who starts it.

@@ -61,7 +61,7 @@ class Unseen:
         return points_relative(self.places[self.left < SOON], pose)
 
     def met(self, answer: PlanAnswer, obstacles: DistanceField) -> Array:
-        """Unseen places at and near the first pose at which a path backs onto one; shape (k, 2), m, none: it does not.
+        """Unseen places at and near the first pose at which a path backs onto one; shape (k, 2), m; empty if none.
 
         Args:
             answer: the path.

@@ -488,9 +488,9 @@ class MissionService:
         Args:
             server: of its kind of task.
             start: makes the request.
-            stop: makes the request to stop it, which is sent when this is cancelled, out of time, or ``enough``.
+            stop: makes the request that stops it, sent when this is cancelled, out of time, or ``enough``.
             reports: of that service.
-            enough: the end of a running one that has done what is wanted.
+            enough: returns the end of a running task that has done enough, else None.
 
         Raises:
             TruckError: it was refused.
@@ -520,7 +520,7 @@ class MissionService:
         """Number of what ``take`` requests; it is requested again while what refuses it passes.
 
         Raises:
-            TruckError: something else does, it has not passed, or somebody else drives.
+            TruckError: it was refused for another reason or for longer than ``PATIENCE``, or another source drives.
         """
         until, refused = self._clock.now() + PATIENCE * SECOND, False
         while True:
