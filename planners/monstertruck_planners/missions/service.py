@@ -347,7 +347,8 @@ class MissionService:
             raise
         finally:
             self._parts.goals.hold(SOURCE, on=False)
-        await self._forget()
+        assert self._group is not None
+        self._keeping = self._group.create_task(self._forget())  # not awaited: the next mission may start
 
     def _finish(self, end: StepEnd) -> None:
         severity = Severity.INFO if end.reason.exit_code == 0 else Severity.WARNING

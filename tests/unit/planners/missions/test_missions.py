@@ -653,6 +653,26 @@ def test_a_request_is_answered_once_it_outlasts_a_power_cut(tmp_path: Path, late
     played(story, file)
 
 
+def test_the_next_mission_starts_while_the_disk_still_forgets_the_one_before(tmp_path: Path):
+    file = tmp_path / "mission.json"
+
+    async def story(robot: Pretended) -> None:
+        async def offload(work):
+            await robot.clock.sleep(0.3)
+            return work()
+
+        robot.service._offload = offload
+        robot.order(MissionOrder.START, {"do": "record", "note": "here"})
+        while robot.reports[-1].running:
+            await robot.clock.sleep(0.01)
+        assert robot.order(MissionOrder.START, WAIT) == 2
+        await robot.clock.sleep(1.0)
+        assert robot.held == {"missions"}
+        assert json.loads(file.read_text())["mission"]["steps"][0]["do"] == "wait"
+
+    played(story, file)
+
+
 SAVED = SavedProgress.of(progress(GO), "ann").model_dump_json()
 
 
