@@ -318,6 +318,8 @@ class BodyWatch:
     ) -> Runaway | None:
         """Take the motion over a time that follows the one before; returns what nobody commanded.
 
+        A motion that is published again is passed over.
+
         Args:
             since: beginning of the time, ns.
             stamp: its end, ns.
@@ -327,6 +329,8 @@ class BodyWatch:
             now: until when the motion goes on alike, ns.
             driven: a motor may be what moves the robot.
         """
+        if stamp == self._stamp:
+            return None
         goes_on, self._stamp, self.runs = since == self._stamp, stamp, driven
         speed = moved / (stamp - since) * SECOND
         if not goes_on or not driven:
@@ -463,9 +467,10 @@ class RunawayCheck(Check):
 
     def _pulled(self, now: int) -> bool:
         """Whether a motor may be what moves the body: one that falls over or slides down is moved by its weight."""
-        if self.view.samples.tilt >= self.view.config.tilt.stop:
+        samples = self.view.samples
+        if samples.attitude_fresh(now) and samples.tilt >= self.view.config.tilt.stop:
             return False
-        fresh = bool(self.view.samples.shaft_speeds(now))
+        fresh = bool(samples.shaft_speeds(now))
         return any(watch.pulls(self._config, fresh=fresh) for watch in self._shafts)
 
     def _take(self, found: Runaway | None, now: int) -> None:

@@ -421,6 +421,22 @@ def test_a_body_that_moves_after_a_stop_while_the_drive_is_lost_is_found():
     assert moved(rig, 0.2) <= 1.0
 
 
+def test_a_robot_that_falls_over_or_slides_down_is_moved_by_its_weight():
+    rig = Rig().armed()
+    rig.current, rig.driver, rig.tilt = 0.3, {"speed": 0.0}, 0.5
+    rig.tick(30)
+    assert moved(rig, 0.5, 2.0) is None
+
+
+def test_a_tilt_that_is_no_longer_measured_hides_no_motion():
+    rig = Rig().armed()
+    rig.current, rig.driver, rig.tilt = 0.3, {"speed": 0.0}, 0.5
+    rig.tick(30)
+    rig.silent = {"attitude"}
+    rig.tick(100)
+    assert moved(rig, 0.2) is not None
+
+
 def test_an_emergency_stopped_truck_whose_motor_draws_no_current_may_be_carried():
     rig = Rig().driving()
     rig.current = 0.0
@@ -480,6 +496,18 @@ def test_short_motions_of_the_scans_that_follow_each_other_count_together():
             since = stamp
         rig.tick()
         assert bool(rig.reported(Reason.UNCOMMANDED_MOTION)) is (apart == 0)
+
+
+def test_a_motion_of_the_scans_that_is_published_again_counts_once():
+    """The lidar falls silent after a short motion that the points prove."""
+    rig = Rig().armed()
+    rig.current, rig.driver = 0.3, {"speed": 0.0}
+    rig.tick(30)
+    motion = UnshownMotion(since=rig.now - SECOND, stamp=rig.now, distance=0.02, turn=0.0)
+    for _ in range(5):
+        rig.gate.observe(Consistency(**header(rig.now), measures=("wheels",), unshown=motion), topics.CONSISTENCY)
+        rig.tick(50)
+    assert not rig.reported(Reason.UNCOMMANDED_MOTION)
 
 
 def test_motion_from_before_the_drives_obeyed_does_not_count():
