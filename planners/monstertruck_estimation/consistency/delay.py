@@ -53,15 +53,11 @@ class ScanStep(NamedTuple):
 class LagQuestion:
     """Motion by the scans and by other measures, of which the lag is to be found; light enough for the event loop."""
 
-    stamp: int
-    """Ns."""
     tolerated: int
     """Greatest lag that is none, in ``SHIFT``."""
-    steps: tuple[ScanStep, ...]
-    """Of the scans, one after the other."""
-    others: tuple[tuple[Errors, Array], ...]
-    """Of every other measure its errors and its motion during the newest steps, shape (lags, n, 3), each lag earlier
-    than the one before."""
+    others: tuple[tuple[Errors, tuple[ScanStep, ...], Array], ...]
+    """Of every other measure its errors, the n steps of the scans whose time it covers, one after the other, and its
+    motion during them, shape (lags, n, 3), each lag earlier than the one before."""
 
 
 class Delay(NamedTuple):
@@ -83,17 +79,17 @@ def lag_question(steps: list[ScanStep], others: list[tuple[Errors, MotionTrack]]
     shifts = SHIFT * np.arange(LONGEST + 1)[:, None]
     known = []
     for errors, track in others:
-        usable = np.array([row[:2] for row in steps if track.covers(row.since - LONGEST * SHIFT, row.stamp)])
+        usable = tuple(row for row in steps if track.covers(row.since - LONGEST * SHIFT, row.stamp))
         if len(usable) >= FEWEST:
-            known.append((errors, track.motions(usable[None, :, 0] - shifts, usable[None, :, 1] - shifts)))
-    return LagQuestion(steps[-1].stamp, int(tolerated * SECOND / SHIFT), tuple(steps), tuple(known))
+            begins, ends = (np.array([row[end] for row in usable]) - shifts for end in (0, 1))
+            known.append((errors, usable, track.motions(begins, ends)))
+    return LagQuestion(int(tolerated * SECOND / SHIFT), tuple(known))
 
 
 def scan_delay(question: LagQuestion) -> Delay | None:
     """Lag of the scans behind all other measures, where it is more than tolerated beyond chance."""
     cost, squares, places = np.zeros(LONGEST + 1), np.zeros(LONGEST + 1), 0
-    for errors, moved in question.others:
-        steps = question.steps[-moved.shape[1] :]
+    for errors, steps, moved in question.others:
         for axis in _axes(errors):
             mahalanobis, volume = _fit(steps, moved, axis)
             cost += mahalanobis + volume

@@ -28,8 +28,11 @@ def starting(at):
     return 0.15 * seconds**2 if seconds < 1.0 else 0.3 * seconds - 0.15, 0.0
 
 
-def delay_of(seconds, slip=1.0, way=swinging, measure=Measure.WHEELS, deviations=(0.01, 0.003)):
-    """Lag that is found of scans this late; the registration's errors are as great as it states."""
+def delay_of(seconds, slip=1.0, way=swinging, measure=Measure.WHEELS, deviations=(0.01, 0.003), silent=0):
+    """Lag that is found of scans this late; the registration's errors are as great as it states.
+
+    The other measure has not been heard for the last ``silent`` steps.
+    """
     track, steps, rng = MotionTrack(), [], np.random.default_rng(2)
     noise = rng.normal(0.0, deviations, (121, 2))
 
@@ -39,7 +42,8 @@ def delay_of(seconds, slip=1.0, way=swinging, measure=Measure.WHEELS, deviations
     for k in range(120):
         at = k / 10
         ahead, turn = moved(at)
-        track.add(SECOND + k * STEP, (float(ahead), 0.0, float(turn)))
+        if k < 120 - silent:
+            track.add(SECOND + k * STEP, (float(ahead), 0.0, float(turn)))
         shown = moved(at - seconds) * slip + noise[k + 1] - noise[k]
         steps.append(ScanStep(SECOND + (k - 1) * STEP, SECOND + k * STEP, tuple(shown.tolist()), deviations))
     return scan_delay(lag_question(steps[-NEWEST:], [(ERRORS[measure], track)], 0.2))
@@ -60,6 +64,12 @@ def test_a_delay_is_found(seconds, slip, measure):
 @pytest.mark.parametrize("slip", [0.7, 1.0])
 def test_a_tolerated_one_is_none(seconds, way, slip):
     assert delay_of(seconds, slip, way) is None
+
+
+@pytest.mark.parametrize("silent", [3, 6])
+def test_a_measure_that_is_behind_is_compared_with_the_scans_of_its_time(silent):
+    assert delay_of(0.8, silent=silent).seconds == pytest.approx(0.8, abs=0.1)
+    assert delay_of(-0.1, silent=silent) is None
 
 
 def test_a_start_straight_ahead_shows_it():
