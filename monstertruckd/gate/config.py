@@ -144,7 +144,8 @@ class ContactConfig(Schema):
     current: Annotated[float, Field(gt=0, le=1)] = 0.15
     """Rise of a motor's current above that of rolling, A: less than half of what it rises by until the clutch slips."""
     rolling: Annotated[float, Field(gt=0, le=2)] = 0.25
-    """Current of rolling until the robot has measured it, A."""
+    """Current of rolling until the robot has measured it, A. A robot whose motors draw more than this and ``current``
+    together when it rolls needs a greater one: such a current is taken for a contact and never learned."""
     share: Annotated[float, Field(gt=0, lt=1)] = 0.3
     """Shafts, free wheels and turns slower than this share of what is commanded are held."""
     within: Annotated[float, Field(gt=0, le=0.3)] = 0.15

@@ -166,15 +166,18 @@ class ContactCheck(Check):
         return self._backed < distance and now - self._began < longest * SECOND
 
     def _same_direction(self, request: DriveRequest, other: DriveRequest) -> bool:
-        one, two = (self.view.motion.target(each).twist for each in (request, other))
-        return sum(a * b for a, b in zip(one, two, strict=True)) > 0.0
+        return self._leads(request, self.view.motion.target(other).twist)
+
+    def _leads(self, request: DriveRequest, twist: Twist2) -> bool:
+        """Whether a request asks for the direction of a twist."""
+        asked = self.view.motion.target(request).twist
+        return sum(a * b for a, b in zip(asked, twist, strict=True)) > 0.0
 
     def _opposite(self, request: DriveRequest) -> DriveRequest:
         """The motion of a request the other way, slowly."""
         target = self.view.motion.target(request)
-        share = -self.view.config.obstacle.confirmed_speed / max(
-            self.view.motion.pace(target.twist, target.shafts), 1e-6
-        )
+        pace = self.view.motion.pace(target.twist, target.shafts)
+        share = -self.view.config.obstacle.confirmed_speed / max(pace, LEAST)
         if request.twist is not None:
             vx, vy, wz = scaled((request.twist.vx, request.twist.vy, request.twist.wz), share)
             return request.model_copy(update={"twist": request.twist.model_copy(update={"vx": vx, "vy": vy, "wz": wz})})
@@ -236,8 +239,8 @@ class ContactCheck(Check):
             self._touch(ContactFinding(f"speed of {name}", measured, unit, least), seen.received)
 
     def _touch(self, found: ContactFinding, now: int) -> None:
-        """A measure tells of a contact; it counts while an operator drives into unseen ground."""
-        if self.view.confirmed and self._request is not None:
+        """A measure tells of a contact; it counts while an operator drives on into unseen ground, not yet away."""
+        if self.view.confirmed and self._request is not None and self._leads(self._request, self._steady):
             self._touched, self._finding, self._began, self._backed = self._request, found, now, 0.0
             self._reached.clear()
             self._slow.clear()

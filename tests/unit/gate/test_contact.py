@@ -85,6 +85,17 @@ def test_an_operator_who_lets_go_or_drives_away_decides_again(asked):
     assert rig.until(Reason.CONTACT) is not None, "and it is noticed again"
 
 
+def test_an_operator_who_already_drives_away_is_not_sent_back():
+    rig = backing()
+    rig.driver = {"speed": 0.1, "unseen": True}
+    rig.tick()
+    rig.load = PUSHING
+    rig.tick()
+    rig.load = ROLLING
+    rig.tick(40)
+    assert rig.out.speeds[0] == pytest.approx(0.1)
+
+
 def test_a_drive_that_is_switched_on_while_it_accelerates_is_not_taken_for_a_contact():
     rig = Backing()
     rig.load = PUSHING
