@@ -315,8 +315,7 @@ class ObstacleCheck(Check):
             known = view.mode.active or view.samples.at_rest(seen.now)
             self.guard.move(seen.now, view.samples.twist(seen.now) if known else None, seen.elapsed / SECOND)
         elif isinstance(seen, LaserScan) and seen is view.samples.scan:
-            if not view.mode.active:
-                self.guard.memory.rest(seen)
+            self.guard.memory.rest(None if view.mode.active else seen)
             self.guard.observe(seen)
         elif isinstance(seen, Odometry) and topic is ODOMETRY:
             self.guard.memory.doubt(seen.pose_covariance)

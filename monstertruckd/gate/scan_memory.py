@@ -41,7 +41,8 @@ MAP_SIZE: Final = 64
 MAP_CELL: Final = 0.05
 """Cells on each side of a survey, and their size, m: what a truck covers in reverse until it has seen more."""
 CHANGED: Final = 0.1
-"""Difference of a beam from that of an earlier scan that neither noise nor rounding makes, m."""
+"""Difference of a beam from that of an earlier scan that neither noise nor rounding makes, m; wheels that have moved
+the robot less far explain none."""
 ELSEWHERE: Final = 0.3
 """Share of the beams with a range that differ so once a robot was carried; people who pass change fewer."""
 
@@ -94,7 +95,8 @@ class ScanMemory:
         self._time = round(time * SECOND)
         self._variance_kept = deviation**2
         self._variance = 0.0
-        self._rested: LaserScan | None = None
+        self._rested: tuple[LaserScan, Pose2] | None = None
+        """Scan that shows where a robot at rest stands, and the pose by its wheels."""
         self.forget()
 
     def forget(self) -> None:
@@ -109,7 +111,6 @@ class ScanMemory:
     def move(self, now: int, twist: Twist2, dt: float) -> None:
         """The body moved with ``twist``, m/s and rad/s, for the ``dt`` s until ``now``, ns."""
         if twist != STILL:
-            self._rested = None
             self._pose = integrate(self._pose, *twist, dt)
             self._travelled += self._footprint.corner_speed(twist) * dt
         self._ticks.append((now, self._pose, self._travelled))
@@ -118,13 +119,19 @@ class ScanMemory:
         """Take the covariance of the pose in odometry, row-major of (x, y, yaw), shape (9,), m^2, m rad, rad^2."""
         self._variance = position_deviation(covariance) ** 2 + LEVER**2 * float(covariance[8])
 
-    def rest(self, scan: LaserScan) -> None:
-        """Take a scan of a robot whose wheels stand and that may be carried; forget everything once it was."""
-        if self._rested is None:
-            self._rested = scan
-        elif elsewhere(self._rested, scan):
+    def rest(self, scan: LaserScan | None) -> None:
+        """Take a scan of a robot whose wheels stand and that may be carried; forget everything once it was.
+
+        None: it is armed, and nobody carries it.
+        """
+        if scan is None:
+            self._rested = None
+            return
+        if self._rested is not None and _apart(self._pose, self._rested[1]) < CHANGED:
+            if not elsewhere(self._rested[0], scan):
+                return
             self.forget()
-            self._rested = scan
+        self._rested = scan, self._pose
 
     def observe(self, scan: LaserScan, points: Array) -> None:
         """Take a scan.

@@ -1,5 +1,6 @@
 """What earlier scans saw guards the truck where its lidar does not look."""
 
+import itertools
 import math
 
 import numpy as np
@@ -486,6 +487,26 @@ def test_a_truck_that_was_carried_or_pushed_while_it_was_not_armed_has_seen_noth
     rig.speed, rig.mode = 0.0, DriveMode.ENABLED
     rig._obey = type(rig)._obey.__get__(rig)
     rig.tick(20)
+    assert backs_up(rig) == (Reason.UNSEEN_STOP,)
+
+
+def test_a_drive_whose_velocity_trembles_at_rest_does_not_hide_that_the_truck_was_carried():
+    rig = rested(Rig(disarm_after=5.0))
+    sense, obey = rig.sense, rig._obey
+    rig._obey = lambda: None
+    signs = itertools.cycle((1.0, -1.0))
+
+    def trembling():
+        rig.speed = 0.002 * next(signs)
+        sense()
+
+    rig.sense = trembling
+    rig.tick(20)
+    rig.silent = {"scan"}
+    rig.sense = lambda: (trembling(), rig.gate.observe(wall(rig.now, 1.5), topics.SCAN))
+    rig.tick(20)
+    rig.sense, rig._obey, rig.silent = sense, obey, set()
+    rig.speed = 0.0
     assert backs_up(rig) == (Reason.UNSEEN_STOP,)
 
 
