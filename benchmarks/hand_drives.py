@@ -106,15 +106,18 @@ class _Touch:
             self.noticed = (now - self.at) / SECOND
         self.away = max(self.away, math.dist(place, self.place))
 
-    def end(self, now: int, out: Drive) -> None:
-        """The operator asks for another motion; what lasted less than the time to notice is left out."""
-        lasted = (now - self.at) / SECOND
-        if self.noticed is not None:
-            out.confirmed.append(self.noticed)
-            if lasted > BACKED_WITHIN:
-                out.backed.append(self.away)
-        elif lasted > NOTICED:
-            out.unnoticed.append(f"{self.why}, {lasted:.2f} s")
+
+def end_touch(touched: _Touch | None, now: int, out: Drive) -> None:
+    """The operator asks for another motion, or the drive ends; what was shorter than the time to notice is left out."""
+    if touched is None:
+        return
+    lasted = (now - touched.at) / SECOND
+    if touched.noticed is not None:
+        out.confirmed.append(touched.noticed)
+        if lasted > BACKED_WITHIN:
+            out.backed.append(touched.away)
+    elif lasted > NOTICED:
+        out.unnoticed.append(f"{touched.why}, {lasted:.2f} s")
 
 
 def truck(world: str, seed: int) -> SimulatedTruckConfig:
@@ -151,9 +154,8 @@ async def drive(
     while clock.now() < end:
         now = clock.now()
         if now >= change:
-            if touched is not None:
-                touched.end(now, out)
-                touched = None
+            end_touch(touched, now, out)
+            touched = None
             name, (of_front, of_rear) = rng.choice(list(MODES.items()))
             angle = rng.uniform(-ANGLE, ANGLE)
             speed = rng.choice((-1, 1)) * rng.uniform(*SPEEDS)
@@ -181,13 +183,15 @@ async def drive(
             out.reasons.update(reason.value for reason in state.reasons)
         if true.stuck and not stuck:
             why = f"{out.world} {out.number}: {name} at {speed:.2f} m/s, truly {last.v:.3f}"
-            if unseen and touched is None and (state is None or Reason.CONTACT not in state.reasons):
-                touched = _Touch(clock.now(), why, (true.x, true.y))
-            elif touched is None and not (unseen and state is not None and Reason.CONTACT in state.reasons):
+            backs_off = state is not None and Reason.CONTACT in state.reasons
+            if touched is None and not unseen:
                 out.contacts.append(why)
+            elif touched is None and not backs_off:
+                touched = _Touch(clock.now(), why, (true.x, true.y))
         if touched is not None and state is not None:
             touched.look(clock.now(), state, (true.x, true.y))
         stuck, last = true.stuck, true
+    end_touch(touched, clock.now(), out)
     rig.bus.inject(topics.REQ_DRIVE, DriveRequest(**await hand.header(0.25), speed=0.0, front=0.0, rear=0.0))
 
 
@@ -253,7 +257,7 @@ def main() -> int:
             f"{kept:.0%} | {sum(len(o.contacts) for o in ones)} | {sum(len(o.confirmed + o.unnoticed) for o in ones)} |"
         )
     for one in drives:
-        for contact in (*one.contacts, *(f"unnoticed: {one}" for one in one.unnoticed)):
+        for contact in (*one.contacts, *(f"unnoticed: {why}" for why in one.unnoticed)):
             print(contact)
     reasons: Counter[str] = sum((one.reasons for one in drives), Counter())
     print("kept standing by:", ", ".join(f"{name} {count * PERIOD:.0f} s" for name, count in reasons.most_common(8)))
