@@ -136,10 +136,6 @@ class ContactCheck(Check):
         if (found := self._finding) is not None:
             yield Measurement(name=found.name, value=found.value, unit=found.unit, limit=found.limit)
 
-    def reset(self) -> None:
-        """The robot may be moved by hand."""
-        self._touched = self._finding = None
-
     # The commanded motion
 
     def _follow(self, tick: Tick) -> None:

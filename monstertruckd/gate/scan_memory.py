@@ -41,8 +41,7 @@ MAP_SIZE: Final = 64
 MAP_CELL: Final = 0.05
 """Cells on each side of a survey, and their size, m: what a truck covers in reverse until it has seen more."""
 CHANGED: Final = 0.1
-"""Difference of a beam from that of an earlier scan that neither noise nor rounding makes, m; wheels that have moved
-the robot less far explain none."""
+"""Difference of a beam from that of an earlier scan that neither noise nor rounding makes, m."""
 ELSEWHERE: Final = 0.3
 """Share of the beams with a range that differ so once a robot was carried; people who pass change fewer."""
 
@@ -95,8 +94,8 @@ class ScanMemory:
         self._time = round(time * SECOND)
         self._variance_kept = deviation**2
         self._variance = 0.0
-        self._rested: tuple[LaserScan, Pose2] | None = None
-        """Scan that shows where a robot at rest stands, and the pose by its wheels."""
+        self._rested: LaserScan | None = None
+        """First scan since the robot was disarmed or carried; None = it is armed."""
         self.forget()
 
     def forget(self) -> None:
@@ -124,14 +123,11 @@ class ScanMemory:
 
         None: it is armed, and nobody carries it.
         """
-        if scan is None:
-            self._rested = None
-            return
-        if self._rested is not None and _apart(self._pose, self._rested[1]) < CHANGED:
-            if not elsewhere(self._rested[0], scan):
-                return
+        if scan is None or self._rested is None:
+            self._rested = scan
+        elif elsewhere(self._rested, scan):
             self.forget()
-        self._rested = scan, self._pose
+            self._rested = scan
 
     def observe(self, scan: LaserScan, points: Array) -> None:
         """Take a scan.

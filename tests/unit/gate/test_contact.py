@@ -7,6 +7,7 @@ import pytest
 
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import Imu, Vector3, WheelEncoders
 from monstertruckd.gate.config import ContactConfig, GateConfig, weakened
 from monstertruckd.gate.contact import ContactCheck
@@ -135,6 +136,42 @@ def test_a_motor_that_stalls_is_noticed():
     assert rig.until(Reason.CONTACT) <= 0.3
     (figure,) = check_of(rig.gate, ContactCheck).figures(Reason.CONTACT, rig.now)
     assert (figure.name, figure.value) == ("speed of shaft 0", 0.0)
+
+
+def test_a_truck_that_cannot_back_off_gives_up():
+    rig = backing(blocked=None)
+    rig.load = PUSHING
+    rig.until(Reason.CONTACT)
+    rig._obey = lambda: None
+    rig.load, rig.speed = ROLLING, 0.0
+    rig.tick(40)
+    assert rig.out.speeds[0] == pytest.approx(0.05)
+    rig.tick(40)
+    assert rig.out.speeds[0] == 0.0
+
+
+def test_the_distance_backed_off_does_not_count_the_way_to_a_stop():
+    rig = Backing(deceleration=0.5)
+    rig.driver = {"speed": 0.2, "unseen": True}
+    rig.tick(60)
+    rig.load, before = PUSHING, rig.travelled
+    rig.until(Reason.CONTACT)
+    rig.load = ROLLING
+    rig.tick(150)
+    stopping = 0.2**2 / 2 / 0.5
+    assert rig.travelled - before == pytest.approx(stopping + ContactConfig().back_off, abs=0.012)
+
+
+def test_an_operator_who_was_gone_may_drive_there_again():
+    rig = backing()
+    rig.load = PUSHING
+    rig.until(Reason.CONTACT)
+    rig.load, driver, rig.driver = ROLLING, rig.driver, None
+    rig.tick(60)
+    rig.order(Order.ARM)
+    rig.driver = driver
+    rig.tick(60)
+    assert rig.out.speeds[0] == pytest.approx(-0.05)
 
 
 def test_only_an_operator_who_holds_the_second_control_is_backed_off():

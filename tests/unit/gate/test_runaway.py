@@ -398,7 +398,9 @@ def test_a_body_that_moves_while_its_drive_reads_standstill_is_found(speed, wz):
     rig.driver = {"speed": 0.0}
     rig.tick(30)
     assert moved(rig, speed, wz) <= 0.5
-    assert "stands by its own measure" in rig.reported(Reason.UNCOMMANDED_MOTION)[0].text
+    text = rig.reported(Reason.UNCOMMANDED_MOTION)[0].text
+    assert "stands by its own measure" in text
+    assert text.endswith("power stage off"), "a drive that reads standstill cannot confirm a quick stop"
 
 
 def test_a_body_that_moves_after_a_stop_is_found_after_days_as_well():
@@ -508,6 +510,18 @@ def test_a_motion_of_the_scans_that_is_published_again_counts_once():
         rig.gate.observe(Consistency(**header(rig.now), measures=("wheels",), unshown=motion), topics.CONSISTENCY)
         rig.tick(50)
     assert not rig.reported(Reason.UNCOMMANDED_MOTION)
+
+
+@pytest.mark.parametrize("late", [0, 25])
+def test_a_motion_that_the_scans_prove_late_is_taken_to_go_on(late):
+    rig = Rig().armed()
+    rig.current, rig.driver = 0.3, {"speed": 0.0}
+    rig.tick(50)
+    motion = UnshownMotion(since=rig.now - SECOND // 2, stamp=rig.now, distance=0.03, turn=0.0)
+    rig.tick(late)
+    rig.gate.observe(Consistency(**header(rig.now), measures=("wheels",), unshown=motion), topics.CONSISTENCY)
+    rig.tick()
+    assert bool(rig.reported(Reason.UNCOMMANDED_MOTION)) is bool(late)
 
 
 def test_motion_from_before_the_drives_obeyed_does_not_count():

@@ -510,6 +510,19 @@ def test_a_drive_whose_velocity_trembles_at_rest_does_not_hide_that_the_truck_wa
     assert backs_up(rig) == (Reason.UNSEEN_STOP,)
 
 
+def test_a_truck_that_has_driven_to_another_place_was_not_carried():
+    rig = rested(Rig(disarm_after=5.0))
+    rig.order(Order.ARM)
+    sense, rig.silent = rig.sense, {"scan"}
+    rig.sense = lambda: (sense(), rig.gate.observe(wall(rig.now, 3.0), topics.SCAN))
+    rig.driver = {"speed": 0.2}
+    rig.tick(50)
+    rig.driver = None
+    rig.order(Order.DISARM)
+    rig.tick(60)
+    assert backs_up(rig) == ()
+
+
 def test_a_truck_whose_wheels_are_not_heard_may_have_been_moved():
     rig = rested(Rig(disarm_after=5.0))
     rig.silent.add("drive")
