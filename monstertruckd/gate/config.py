@@ -139,17 +139,18 @@ class ShaftCheckConfig(Schema):
 
 
 class ContactConfig(Schema):
-    """When a robot that an operator drives into unseen ground has touched something, and how far it backs off."""
+    """Detection of contact while an operator drives into unseen ground, and how far the robot backs off."""
 
     current: Annotated[float, Field(gt=0, le=1)] = 0.15
-    """Rise of a motor's current above that of rolling, A: less than half of what it rises by until the clutch slips."""
+    """Rise of a motor's current above the rolling current that shows a contact, A: less than half of its rise until the
+    clutch slips."""
     rolling: Annotated[float, Field(gt=0, le=2)] = 0.25
-    """Current of rolling until the robot has measured it, A. A robot whose motors draw more than this and ``current``
-    together when it rolls needs a greater one: such a current is taken for a contact and never learned."""
+    """Rolling current until the robot has measured its own, A. Raise it for motors that draw more than ``rolling`` plus
+    ``current`` while they roll: such currents are taken for contact, and never learned."""
     share: Annotated[float, Field(gt=0, lt=1)] = 0.3
-    """Shafts, free wheels and turns slower than this share of what is commanded are held."""
+    """Shafts, free wheels and turns below this fraction of the commanded speed are held."""
     within: Annotated[float, Field(gt=0, le=0.3)] = 0.15
-    """Time for which they have to be, s."""
+    """Time for which they must be that slow, s."""
     back_off: Annotated[float, Field(gt=0, le=0.2)] = 0.03
     """Distance backed off, m."""
 

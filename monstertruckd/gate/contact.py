@@ -1,10 +1,10 @@
-"""Contact with what no sensor has seen, while an operator drives there knowingly: noticed, and backed off from.
+"""Detects contact while an operator drives into ground that no sensor has seen, and backs off.
 
-Each measure tells that something holds the body although its wheels are driven: a motor draws more than rolling needs,
-a shaft or a free wheel is slower than commanded, or the body turns less than commanded. They are compared while the
-commanded motion is steady, since a motor that accelerates its gears draws as much as one that pushes. The gate then
-drives the last motion the other way for a few centimetres, and stands until the operator releases the stick or asks for
-another direction.
+Three measures show that something holds the body while its wheels are driven: a motor draws more current than rolling
+needs, a shaft or a free wheel is slower than commanded, or the body turns less than commanded. They are compared only
+while the commanded motion is steady, because a motor that accelerates its gears draws as much as one that pushes. After
+a contact the gate reverses the last motion for a few centimetres, and stands until the operator releases the stick or
+asks for another direction.
 """
 
 import math
@@ -27,35 +27,35 @@ from monstertruckd.gate.config import ContactConfig
 from monstertruckd.gate.motion import Course, scaled
 
 SETTLED: Final = SECOND // 10
-"""Time for which a shaft has to have its commanded speed before anything is compared, ns."""
+"""Time for which a shaft must have reached its commanded speed before measures are compared, ns."""
 REACHED: Final = 0.8
-"""Share of its commanded speed at which a shaft has it: a drive that is switched on follows half a second later."""
+"""Share of the commanded speed at which a shaft has reached it; a drive that is switched on takes half a second."""
 STEADY: Final = 1e-3
-"""Commanded velocities that differ by less are one motion, m/s and rad/s."""
+"""Commanded velocities that differ by less are the same motion, m/s and rad/s."""
 LEARNED: Final = 20
-"""Currents of rolling that are kept for each motor."""
+"""Number of rolling currents kept for each motor."""
 ENOUGH: Final = 3
-"""Currents from which that of rolling is known."""
+"""Number of rolling currents whose median replaces ``ContactConfig.rolling``."""
 TURNING: Final = 0.1
-"""Slower commanded turns are not compared, rad/s."""
+"""Minimum commanded yaw rate that is compared with the gyroscope, rad/s."""
 LEAST: Final = 1e-6
-"""A smaller pace is none, m/s."""
+"""Minimum pace of a request that is scaled, m/s."""
 PATIENCE: Final = 2.0
-"""The robot gives up backing off after this many times the time that the distance takes."""
+"""The robot stops backing off after this multiple of the time that the distance takes at ``confirmed_speed``."""
 
 
 class ContactFinding(NamedTuple):
-    """What showed a contact."""
+    """The measure that showed a contact."""
 
     name: str
-    """Of the figure."""
+    """Name of the measure."""
     value: float
     unit: str
     limit: float
 
 
 class Lasting:
-    """A condition that has to hold for some time, by the stamps of what shows it."""
+    """A condition that must hold for some time, by the stamps of the messages that show it."""
 
     def __init__(self) -> None:
         self._since: int | None = None
@@ -86,20 +86,20 @@ class ContactCheck(Check):
         self._steady: Twist2 = STILL
         """Commanded motion."""
         self._reached: dict[int, int] = {}
-        """Since when each shaft has had its commanded speed, ns."""
+        """When each shaft reached its commanded speed, ns."""
         self._rolling: dict[int, deque[float]] = {}
-        """Currents of every motor while the robot rolled freely, along its motion, A."""
+        """Newest motor currents of each shaft while the robot rolled freely, positive along the motion, A."""
         self._slow: dict[str, Lasting] = {}
         self._encoders: WheelEncoders | None = None
         self._request: DriveRequest | None = None
-        """The holder's newest."""
+        """Newest request of the holder."""
         self._touched: DriveRequest | None = None
-        """What was asked for when the robot touched something; None = it does not."""
+        """Request in force when the robot made contact; None without a contact."""
         self._finding: ContactFinding | None = None
         self._began = 0
         """When it began to back off, ns."""
         self._backed = 0.0
-        """How far, m."""
+        """Distance backed off, m."""
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
         """Take the commanded motion of the newest tick, or a measure of the real one."""
@@ -114,7 +114,7 @@ class ContactCheck(Check):
                 self._take_gyro(seen)
 
     def instead(self, request: DriveRequest, now: int) -> DriveRequest:
-        """What the gate drives: the holder's request, or after a contact its counterpart."""
+        """Return what the gate drives: the holder's request or, after a contact, its opposite."""
         self._request = request
         touched = self._touched
         if touched is None:
@@ -125,14 +125,14 @@ class ContactCheck(Check):
         return self._opposite(touched) if self._backing(now) else request
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Slow while it backs off, then standstill."""
+        """Limit the pace while the robot backs off, then keep it at standstill."""
         if courses is None:
             self._touched = self._request = None
         elif self._touched is not None:
             yield PaceLimit(Reason.CONTACT, self.view.config.obstacle.confirmed_speed if self._backing(now) else 0.0)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """What showed it."""
+        """The measure that showed the contact."""
         if (found := self._finding) is not None:
             yield Measurement(name=found.name, value=found.value, unit=found.unit, limit=found.limit)
 
@@ -150,13 +150,13 @@ class ContactCheck(Check):
             self._backed += away * max(map(abs, speeds), default=0.0) * tick.elapsed / SECOND
 
     def _away(self, speeds: Sequence[float]) -> bool:
-        """Whether commanded shaft speeds lead away from what was touched."""
+        """Whether commanded shaft speeds lead away from the contact."""
         assert self._touched is not None
         towards = self.view.chassis.shafts_along(self.view.motion.target(self._touched).twist, *self.view.motion.angles)
         return sum(speed * other for speed, other in zip(speeds, towards, strict=True)) < 0.0
 
     def _backing(self, now: int) -> bool:
-        """Whether it has not come far enough away yet."""
+        """Whether the robot still has to back off."""
         distance = self._config.back_off
         longest = PATIENCE * distance / self.view.config.obstacle.confirmed_speed
         return self._backed < distance and now - self._began < longest * SECOND
@@ -170,7 +170,7 @@ class ContactCheck(Check):
         return sum(a * b for a, b in zip(asked, twist, strict=True)) > 0.0
 
     def _opposite(self, request: DriveRequest) -> DriveRequest:
-        """The motion of a request the other way, slowly."""
+        """Return the opposite of a request, at ``confirmed_speed``."""
         target = self.view.motion.target(request)
         pace = self.view.motion.pace(target.twist, target.shafts)
         share = -self.view.config.obstacle.confirmed_speed / max(pace, LEAST)
@@ -184,7 +184,7 @@ class ContactCheck(Check):
     # The measures
 
     def _driven(self, stamp: int) -> bool:
-        """Whether all shafts have had the speeds of a steady motion for some time at ``stamp``, ns."""
+        """Whether all shafts have held the speeds of a steady motion for ``SETTLED`` at ``stamp``, ns."""
         reached = self._reached.values()
         return len(reached) == len(self.view.motion.shaft_speeds) and stamp - max(reached) >= SETTLED
 
@@ -228,14 +228,14 @@ class ContactCheck(Check):
         self._compare("body", imu, math.hypot(rate.x, rate.y, rate.z), expected, "rad/s")
 
     def _compare(self, name: str, seen: Message, measured: float, expected: float, unit: str = "m/s") -> None:
-        """Something that is held is much slower than expected, for some time."""
+        """Begin to back off if a speed stays far below the expected one."""
         least = self._config.share * expected
         slow = self._slow.setdefault(name, Lasting())
         if slow.holds(seen.stamp, self._config.within, true=measured < least):
             self._touch(ContactFinding(f"speed of {name}", measured, unit, least), seen.received)
 
     def _touch(self, found: ContactFinding, now: int) -> None:
-        """A measure tells of a contact; it counts while an operator drives on into unseen ground, not yet away."""
+        """Begin to back off if an operator drives on into unseen ground, and not away already."""
         if self.view.confirmed and self._request is not None and self._leads(self._request, self._steady):
             self._touched, self._finding, self._began, self._backed = self._request, found, now, 0.0
             self._reached.clear()

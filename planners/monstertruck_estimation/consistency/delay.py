@@ -22,7 +22,7 @@ from monstertruck_runtime.clock import SECOND
 SHIFT: Final = SECOND // 10
 """Step of the lags that are tried, ns."""
 LONGEST: Final = 16
-"""Greatest lag that is tried, in ``SHIFT``."""
+"""Greatest lag that is tried, in ``SHIFT``; only shorter ones are found."""
 SIGMAS: Final = 5.0
 """Standard deviations by which all tolerated lags and the longest must be rejected: chance does it once in 3 million
 looks."""
@@ -54,7 +54,7 @@ class LagQuestion:
     """Motion by the scans and by other measures, of which the lag is to be found; light enough for the event loop."""
 
     tolerated: int
-    """Greatest lag that is none, in ``SHIFT``."""
+    """Greatest tolerated lag, in ``SHIFT``."""
     others: tuple[tuple[Errors, tuple[ScanStep, ...], Array], ...]
     """Of every other measure its errors, the n steps of the scans whose time it covers, one after the other, and its
     motion during them, shape (lags, n, 3), each lag earlier than the one before."""
@@ -69,12 +69,12 @@ class Delay(NamedTuple):
 
 
 def lag_question(steps: list[ScanStep], others: list[tuple[Errors, MotionTrack]], tolerated: float) -> LagQuestion:
-    """Collect what tells the lag.
+    """Collect the motions by which ``scan_delay`` finds the lag.
 
     Args:
         steps: of the scans, one after the other, at least one.
         others: other measures of the same motion.
-        tolerated: lag that is none, s.
+        tolerated: greatest tolerated lag, s.
     """
     shifts = SHIFT * np.arange(LONGEST + 1)[:, None]
     known = []

@@ -1,7 +1,7 @@
-"""Motion of the body while the wheels show standstill, by the scans: a second source beside the drives.
+"""Detects motion of the body by scans while the wheels show standstill.
 
-A robot at rest is compared with the scans from when it began to rest, or of the newest seconds. The scans' odometry
-alone proves nothing where people walk by: the claim that the body stands must leave points unexplained that its motion
+The newest scan is compared with the first one since the wheels stopped, or one ``OVER`` earlier. Scan odometry alone
+proves nothing where people walk by: the claim that the body stands must leave points unexplained that its motion
 explains, see ``ScanVerdict``.
 """
 
@@ -15,13 +15,13 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.state import UnshownMotion
 
 OVER: Final = 4 * SECOND
-"""Time over which motion is looked for, ns."""
+"""Maximum time between the two scans that are compared, ns."""
 ASKED: Final = 2.0
-"""Standard deviations of the registration from which on motion is judged by points."""
+"""Motion beyond this many standard deviations of the registration is judged by points."""
 
 
 class RestWatch:
-    """Compares the newest scan with one of the same rest.
+    """Compares the newest scan with an earlier one since the wheels stopped.
 
     Args:
         track: motion by the scans.
@@ -30,12 +30,12 @@ class RestWatch:
     def __init__(self, track: MotionTrack) -> None:
         self._track = track
         self._rest: deque[int] = deque()
-        """Stamps of the scans since the wheels stand, ns."""
+        """Stamps of the scans since the wheels stopped, ns."""
         self._deviations = 1.0, 1.0
         self._asked: int | None = None
         """Stamp of the earlier scan of the open claim, ns."""
         self.motion: UnshownMotion | None = None
-        """Of the body, proven by the newest scan; None = none, or the points do not prove it."""
+        """Motion of the body that the newest scan proves, or None."""
 
     def observe(self, output: StepOutput, *, still: bool) -> None:
         """Take the motion between two scans, and what the points say of the claim; ``still``: the wheels stand."""
@@ -58,7 +58,7 @@ class RestWatch:
             self._rest = deque([output.stamp])  # what is proven next is new motion
 
     def claim(self) -> Claim | None:
-        """That the body has stood since it rests, where the scans show otherwise."""
+        """Return the claim that the body stands, if scan odometry shows otherwise."""
         motion = self._track.motion(self._rest[0], self._rest[-1]) if len(self._rest) > 1 else None
         if motion is None:
             return None
