@@ -131,7 +131,7 @@ class OdometryEstimate:
 
     pose: Pose2
     """x, y (m), yaw (rad, in [-pi, pi])."""
-    twist: Pose2
+    twist: Twist2
     """vx, vy (m/s), wz (rad/s)."""
     pose_covariance: Array
     """Shape (9,), row-major."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from monstertruck_kinematics.chassis import Angles, Chassis, Speeds
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2, Twist2
+from monstertruck_kinematics.se2 import Twist2
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import DriveFeedback, SteeringFeedback
 
@@ -26,7 +26,7 @@ class WheelIncrement:
     """ns."""
     stamp: int
     """ns."""
-    twist: Pose2
+    twist: Twist2
     """Mean vx, vy (m/s) and wz (rad/s) in between."""
     distance: float
     """Travelled by the fastest shaft, m, not negative."""
@@ -111,7 +111,9 @@ class WheelMotion:
         return WheelIncrement(since, stamp, self._chassis.twist(self._pace, *angles), distance, self._pace, angles)
 
 
-def increment_covariance(chassis: Chassis, roll: WheelIncrement, shaft: float, angle: float, slip: Pose2) -> Array:
+def increment_covariance(
+    chassis: Chassis, roll: WheelIncrement, shaft: float, angle: float, slip: tuple[float, float, float]
+) -> Array:
     """Covariance of the motion (dx, dy, dyaw) of ``roll`` in base, shape (3, 3); m and rad.
 
     It grows with the distance, not with the number of readings.
