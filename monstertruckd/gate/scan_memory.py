@@ -144,7 +144,7 @@ class ScanMemory:
         free = np.where((scan.codes == VALID_BEAM) | (scan.codes <= NO_ECHO), scan.ranges, 0.0)
         self._newest = _Taken(scan, pose, tuple(lidar), travelled, there, np.pad(free, 1), self._variance)
         # What a body that stands sees does not age; what its first scan there saw may be out of sight since.
-        stood = [travelled - scan.travelled < STANDING for scan in (*self._taken, self._newest)[-3:-1]]
+        stood = [travelled - scan.travelled < STANDING for scan in list(self._taken)[-2:]]
         if stood == [True, True]:
             self._taken[-1] = self._newest
         elif stood[-1:] == [True] or not stood or travelled - self._taken[-1].travelled >= MEMORY_STEP:
