@@ -355,6 +355,7 @@ class Daemon:
             battery_measured=measures_battery(config),
             latched=latch.engaged() or bool(self._left_out),
             sonars=self._body.sonars,
+            rear_sonars=self._body.rear_sonars,
             peers=self._body.peers,
             compared=True,
             own=config.checks,

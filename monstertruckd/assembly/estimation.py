@@ -38,6 +38,7 @@ from monstertruck_schemas.topics import Writer
 from monstertruckd.assembly.devices import measures_battery, scan_angles
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.gate.rear_sonars import rear
 
 SCANS: Final = 16
 """Scans that may wait for the estimation worker."""
@@ -54,7 +55,9 @@ class Body:
     points: ScanPoints
     """Of the newest scan."""
     sonars: Mapping[str, tuple[float, float, float]]
-    """Pose of every sonar in base that guards the robot, m, m, rad: of one without a lidar."""
+    """Pose in base of every sonar of a robot without a lidar, m, m, rad."""
+    rear_sonars: Mapping[str, tuple[float, float, float]]
+    """Pose in base of every sonar that looks backwards on a robot with a lidar, m, m, rad."""
     peers: Mapping[str, Footprint]
     """Outlines of the robots whose poses it receives, by name."""
 
@@ -63,11 +66,12 @@ class Body:
         """Of a configured robot."""
         lidar = config.devices.lidar
         points = ScanPoints(lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0))
-        sonar = config.devices.sonar if lidar is None else None
+        sonar = config.devices.sonar
         mounts = {} if sonar is None else {name: one.mount.planar for name, one in sonar.driver.sonars.items()}
         length, width = config.geometry.length, config.geometry.width
         peers = {name: Footprint(peer.length or length, peer.width or width) for name, peer in config.peers.items()}
-        return cls(config.chassis(), Footprint(length, width), points, mounts, peers)
+        sonars, rear_sonars = (mounts, {}) if lidar is None else ({}, rear(mounts))
+        return cls(config.chassis(), Footprint(length, width), points, sonars, rear_sonars, peers)
 
 
 def sensor_mounts(config: TruckConfig) -> dict[str, Mount]:

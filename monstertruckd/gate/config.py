@@ -117,14 +117,16 @@ class ObstacleLimits(Schema):
 
 
 class SonarLimits(Schema):
-    """Limits for the sonars of a robot without a lidar."""
+    """Limits for the sonars of a robot without a lidar, and for those that look backwards on a robot with one."""
 
     stale_after: Annotated[float, Field(gt=0, le=1)] = topics.SONAR.fresh_for()
     """Age from which on the newest round of pings, or the newest answer of a sonar, is stale, s."""
     core: Annotated[float, Field(gt=0, le=1)] = 0.2
-    """Half angle of the cone of a sonar that does not look in the direction of travel, rad: where its echoes may be."""
+    """Half angle of the cone of a sonar that does not look in the direction of travel, rad: where its echoes may be.
+    Without a lidar only."""
     unseen_speed: Positive = 0.1
-    """Speed limit where a sonar does not answer, or no sonar looks in the direction of travel, m/s."""
+    """Speed limit where a sonar does not answer, or no sonar looks in the direction of travel, m/s; without a lidar
+    only."""
 
 
 class ShaftCheckConfig(Schema):

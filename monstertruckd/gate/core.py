@@ -52,7 +52,7 @@ from monstertruckd.gate.sensors import (
     TickCheck,
     TiltCheck,
 )
-from monstertruckd.gate.sonars import SonarCheck
+from monstertruckd.gate.sonars import Place, SonarCheck
 from monstertruckd.gate.stops import Outages, StopLog, lease_cause
 
 URGENT: Final = frozenset(
@@ -115,11 +115,12 @@ def sensor_checks(view: GateView, *, battery_measured: bool, compared: bool = Fa
 def obstacle_checks(
     view: GateView,
     points: ScanPoints,
-    sonars: Mapping[str, tuple[float, float, float]] | None,
+    sonars: Mapping[str, Place] | None,
+    rear_sonars: Mapping[str, Place] | None,
     peers: Mapping[str, Footprint] | None,
 ) -> Iterator[Check]:
     """Checks of the way ahead; arguments as of ``Gate``."""
-    lidar = None if sonars else ObstacleCheck(view, points)
+    lidar = None if sonars else ObstacleCheck(view, points, rear_sonars)
     sonar = SonarCheck(view, sonars) if sonars else None
     yield from (check for check in (lidar, sonar) if check is not None)
     if peers:
@@ -193,6 +194,7 @@ class Gate:
         battery_measured: something is there to measure the battery.
         latched: whether the emergency stop was latched when the daemon last ran.
         sonars: pose (x, y, yaw) of every sonar in base by name, of a robot that has no lidar; m, m, rad.
+        rear_sonars: the same of those that look backwards on a robot with a lidar.
         peers: outlines of other robots whose poses are received, by name.
         compared: whether the robot has to compare its measures of motion.
         own: settings of the checks that the configuration adds, by name.
@@ -209,7 +211,8 @@ class Gate:
         nonce: str,
         battery_measured: bool,
         latched: bool,
-        sonars: Mapping[str, tuple[float, float, float]] | None = None,
+        sonars: Mapping[str, Place] | None = None,
+        rear_sonars: Mapping[str, Place] | None = None,
         peers: Mapping[str, Footprint] | None = None,
         compared: bool = False,
         own: Mapping[str, CheckConfig] = MappingProxyType({}),
@@ -229,7 +232,7 @@ class Gate:
                 *sensor_checks(view, battery_measured=battery_measured, compared=compared),
                 self._limiter,
                 *(() if self._contact is None else (self._contact,)),
-                *obstacle_checks(view, points, sonars, peers),
+                *obstacle_checks(view, points, sonars, rear_sonars, peers),
                 *(OwnCheck(view, name, settings) for name, settings in own.items()),
             )
         )

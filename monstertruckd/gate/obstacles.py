@@ -1,7 +1,7 @@
 """Obstacles by the lidar: the swept footprint against the newest scan, and what earlier scans saw behind the body."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -22,15 +22,17 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Measurement
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.sensor import LaserScan, SonarRanges
 from monstertruck_schemas.state import Odometry
-from monstertruck_schemas.topics import ODOMETRY, Topic
+from monstertruck_schemas.topics import ODOMETRY, SONAR, Topic
 from monstertruckd.gate.approach import Approach, comfortable_speed, reach, stopping
 from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
 from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.motion import AHEAD, Course
+from monstertruckd.gate.rear_sonars import RearSonars
 from monstertruckd.gate.samples import age
 from monstertruckd.gate.scan_memory import DRIFT, ScanMemory
+from monstertruckd.gate.sonars import Place
 from monstertruckd.gate.visibility import Sectors, Visibility
 
 POSES: Final = 20
@@ -109,10 +111,14 @@ class ObstacleGuard:
         limits: in force.
         footprint: the body's outline.
         points: of scans, in base.
+        sonars: pose (x, y, yaw) of every sonar that looks backwards in base by name, m, m, rad.
     """
 
-    def __init__(self, limits: InForce, footprint: Footprint, points: ScanPoints) -> None:
+    def __init__(
+        self, limits: InForce, footprint: Footprint, points: ScanPoints, sonars: Mapping[str, Place] | None = None
+    ) -> None:
         self._limits = limits
+        self._sonars = RearSonars(limits, sonars or {})
         self._footprint = footprint
         self._scan_points = points
         self._visibility = Visibility(footprint, points.mount, limits.config.obstacle.seen)
@@ -165,6 +171,15 @@ class ObstacleGuard:
             self.memory.forget()
         else:
             self.memory.move(now, twist, dt)
+        for sonar in self._sonars.silenced(now):
+            self.memory.silence(sonar)
+            self._checked = None
+
+    def hear(self, ranges: SonarRanges) -> None:
+        """Take a round of pings."""
+        for ping in self._sonars.pings(ranges):
+            self.memory.hear(*ping)
+            self._checked = None
 
     def observe(self, scan: LaserScan) -> None:
         """Take a scan."""
@@ -191,7 +206,8 @@ class ObstacleGuard:
             self._update_unseen(rounded)
             hidden = [twist for twist in rounded if twist[0] * TWIST_STEP < AHEAD]
             behind = self.memory.points() if hidden else None
-            self._free = min(self._free_distance(*twist, behind) for twist in rounded)
+            echoes = self.memory.echoes()
+            self._free = min(self._free_distance(*twist, behind, echoes) for twist in rounded)
             self.known = self.known_aside = math.inf
             if behind is not None:
                 self._check_ground(hidden, np.concatenate((self._points, behind)))
@@ -213,7 +229,7 @@ class ObstacleGuard:
         ground = ground.reshape(-1, 2)
         return _Sweep(distances, poses, ground, before, self._visibility.travelled(ground))
 
-    def _free_distance(self, x: int, y: int, turn: int, remembered: Array | None) -> float:
+    def _free_distance(self, x: int, y: int, turn: int, remembered: Array | None, echoes: Array) -> float:
         sweep = self._sweep(x, y, turn)
         clearance = self._limits.config.obstacle.side_clearance
         leaving = LEAVING * sweep.distances
@@ -221,6 +237,8 @@ class ObstacleGuard:
         if remembered is not None:
             # Without a clearance, as their places may be off by as much.
             contacts.append(first_contact(self._footprint, sweep.poses, remembered, -self._footprint.padding))
+        if x < 0 and not _on_the_spot(x, y):
+            contacts.append(first_contact(self._footprint, sweep.poses, echoes, clearance, leaving))
         return min(
             (float(sweep.distances[contact - 1]) for contact in contacts if contact is not None), default=math.inf
         )
@@ -235,7 +253,7 @@ class ObstacleGuard:
         sweeps = [self._sweep(*twist) for twist in twists]
         ground = np.concatenate([sweep.ground for sweep in sweeps])
         before = np.concatenate([sweep.before for sweep in sweeps])
-        turns = [math.hypot(*twist[:2]) * TWIST_STEP < AHEAD for twist in twists]
+        turns = [_on_the_spot(*twist[:2]) for twist in twists]
         turning = np.repeat(turns, [len(sweep.ground) for sweep in sweeps])
         hidden = ~self.memory.seen(ground)
         back = np.repeat([twist[0] < 0 for twist in twists], [len(sweep.ground) for sweep in sweeps]) & ~turning
@@ -282,6 +300,7 @@ class ObstacleCheck(Check):
     Args:
         view: what it may look at.
         points: of scans, in base.
+        sonars: pose (x, y, yaw) of every sonar that looks backwards in base by name, m, m, rad.
     """
 
     reasons = (
@@ -293,11 +312,11 @@ class ObstacleCheck(Check):
         Reason.UNSEEN_DRIVE,
         Reason.UNSEEN_SLOW,
     )
-    reads = (ODOMETRY,)
+    reads = (ODOMETRY, SONAR)
 
-    def __init__(self, view: GateView, points: ScanPoints) -> None:
+    def __init__(self, view: GateView, points: ScanPoints, sonars: Mapping[str, Place] | None = None) -> None:
         super().__init__(view)
-        self.guard = ObstacleGuard(view.limits, view.footprint, points)
+        self.guard = ObstacleGuard(view.limits, view.footprint, points, sonars)
         self._approach = Approach(view)
         self._before_unseen = False
         """Stands before ground that was not seen."""
@@ -308,7 +327,7 @@ class ObstacleCheck(Check):
         return self._approach.emergency
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take valid scans, and the motion of the body at every tick."""
+        """Take valid scans, rounds of pings, and the motion of the body at every tick."""
         view = self.view
         if isinstance(seen, Tick):
             # A robot that is not armed may be pushed or carried; what it saw counts while its wheels stand.
@@ -319,6 +338,8 @@ class ObstacleCheck(Check):
             self.guard.observe(seen)
         elif isinstance(seen, Odometry) and topic is ODOMETRY:
             self.guard.memory.doubt(seen.pose_covariance)
+        elif isinstance(seen, SonarRanges):
+            self.guard.hear(seen)
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
         """Sweep along the motions, and along those of the measured steering angles."""
@@ -371,6 +392,11 @@ class ObstacleCheck(Check):
             yield Measurement(name="seen distance", value=_finite(self.guard.known), unit="m", limit=DRIFT)
         elif reason is Reason.OBSTACLE_STOP:
             yield self._approach.free_distance(age(self.view.samples.scan, now))
+
+
+def _on_the_spot(x: int, y: int) -> bool:
+    """Whether a motion, in steps of ``TWIST_STEP``, is a turn on the spot."""
+    return math.hypot(x, y) * TWIST_STEP < AHEAD
 
 
 def _finite(value: float) -> float | None:

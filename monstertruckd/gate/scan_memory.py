@@ -3,7 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Generator, Iterable, Sequence
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,10 @@ VIEW_STEP: Final = 0.3
 than a truck's length in half of all directions."""
 VIEWS: Final = 32
 """The most of them: at 0.21 m/s the truck takes 21 in 30 s."""
+SONAR_VIEWS: Final = 8
+"""Maximum number of views kept per sonar: 2.1 m of travel, longer than a cone needs to become as wide as the body."""
+ROUNDS: Final = 2
+"""Number of newest echoes per sonar that count as obstacles: a single one may be reflected away."""
 DRIFT: Final = 0.03
 """Ground this near to where the body stood counts as free, m: the error of dead reckoning; less by as much as the
 pose's standard deviation has grown since, beyond the padding of the footprint."""
@@ -46,14 +50,34 @@ ELSEWHERE: Final = 0.3
 """Share of the beams with a range that differ so once a robot was carried; people who pass change fewer."""
 
 
-class _Taken(NamedTuple):
-    """A scan, and where it was taken."""
+class Beams(NamedTuple):
+    """How far a sensor sees free ground around itself."""
 
-    scan: LaserScan
+    stamp: int
+    """Ns."""
+    start: float
+    """Angle of the first beam, rad."""
+    step: float
+    """Angle between neighbouring beams, rad."""
+    free: Array
+    """Free distance along every beam, shape (n,), m; 0 = not known."""
+
+    @classmethod
+    def of(cls, scan: LaserScan) -> Self:
+        """Convert a scan."""
+        known = (scan.codes == VALID_BEAM) | (scan.codes <= NO_ECHO)
+        step = scan.angle_increment or math.tau
+        return cls(scan.stamp, scan.start_angle, step, np.where(known, scan.ranges, 0.0))
+
+
+class _Taken(NamedTuple):
+    """A scan or a ping, and where it was taken."""
+
+    beams: Beams
     pose: Pose2
     """Of base, in the frame of the memory."""
-    lidar: Pose2
-    """Of the lidar, in the frame of the memory."""
+    sensor: Pose2
+    """Pose of the lidar or sonar, in the frame of the memory."""
     travelled: float
     """m."""
     points: Array
@@ -62,6 +86,15 @@ class _Taken(NamedTuple):
     """Free distance of every beam, m; padded with a 0 before the first and after the last."""
     variance: float
     """Of the pose in odometry when it was taken, m^2."""
+
+
+class _Heard(NamedTuple):
+    """Pings of one sonar."""
+
+    views: deque[_Taken]
+    """Those kept to know which ground is free."""
+    rounds: deque[_Taken]
+    """The newest."""
 
 
 class GroundSurvey(NamedTuple):
@@ -106,6 +139,7 @@ class ScanMemory:
         self._newest: _Taken | None = None
         self._taken: deque[_Taken] = deque(maxlen=MEMORY_SCANS)
         self._views: deque[_Taken] = deque(maxlen=VIEWS)
+        self._heard: dict[str, _Heard] = {}
 
     def move(self, now: int, twist: Twist2, dt: float) -> None:
         """The body moved with ``twist``, m/s and rad/s, for the ``dt`` s until ``now``, ns."""
@@ -136,23 +170,42 @@ class ScanMemory:
             scan: the revolution.
             points: its returns near the body in base, shape (n, 2), m.
         """
-        present = scan.stamp, self._pose, self._travelled
-        _, pose, travelled = min(self._ticks, key=lambda tick: abs(tick[0] - scan.stamp), default=present)
-        points = spaced(points, SPACING)
-        there = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
-        (lidar,) = placed(np.array([self._mount]), pose).tolist()
-        free = np.where((scan.codes == VALID_BEAM) | (scan.codes <= NO_ECHO), scan.ranges, 0.0)
-        self._newest = _Taken(scan, pose, tuple(lidar), travelled, there, np.pad(free, 1), self._variance)
+        self._newest = self._take(Beams.of(scan), spaced(points, SPACING), self._mount)
+        travelled = self._newest.travelled
         # What a body that stands sees does not age; what its first scan there saw may be out of sight since.
         stood = [travelled - scan.travelled < STANDING for scan in list(self._taken)[-2:]]
         if stood == [True, True]:
             self._taken[-1] = self._newest
         elif stood[-1:] == [True] or not stood or travelled - self._taken[-1].travelled >= MEMORY_STEP:
             self._taken.append(self._newest)
-        if self._views and travelled - self._views[-1].travelled < STANDING:
-            self._views[-1] = self._newest
-        elif not self._views or _apart(pose, self._views[-1].pose) >= VIEW_STEP:
-            self._views.append(self._newest)
+        _keep(self._views, self._newest)
+
+    def hear(self, sonar: str, mount: Pose2, beams: Beams, arc: Array) -> None:
+        """Take an answer of a sonar.
+
+        Args:
+            sonar: its name.
+            mount: its pose in base, m, m, rad.
+            beams: across its cone.
+            arc: where the echo may come from, in base, shape (n, 2), m.
+        """
+        heard = self._heard.setdefault(sonar, _Heard(deque(maxlen=SONAR_VIEWS), deque(maxlen=ROUNDS)))
+        taken = self._take(beams, arc, mount)
+        heard.rounds.append(taken)
+        if beams.free.any():
+            _keep(heard.views, taken)
+
+    def silence(self, sonar: str) -> None:
+        """Forget all pings of a sonar."""
+        self._heard.pop(sonar, None)
+
+    def _take(self, beams: Beams, points: Array, mount: Pose2) -> _Taken:
+        """Place a view of the sensor at ``mount`` and its points (n, 2) in base, m, at the pose of its stamp."""
+        present = beams.stamp, self._pose, self._travelled
+        _, pose, travelled = min(self._ticks, key=lambda tick: abs(tick[0] - beams.stamp), default=present)
+        there = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
+        (sensor,) = placed(np.array([mount]), pose).tolist()
+        return _Taken(beams, pose, tuple(sensor), travelled, there, np.pad(beams.free, 1), self._variance)
 
     def points(self) -> Array:
         """Remembered points where the newest scan does not look, in base as of that scan, shape (n, 2), m."""
@@ -163,16 +216,28 @@ class ScanMemory:
         kept = [scan.points for scan in taken if newest.travelled - scan.travelled < self._distance]
         there = np.concatenate((newest.points[:0], *kept))
         beams = _beams((newest,), there)[0][0]
-        edge = FIELD_EDGE / abs(newest.scan.angle_increment or math.tau)
-        looked = (beams >= edge) & (beams < len(newest.scan.ranges) - edge)
+        edge = FIELD_EDGE / abs(newest.beams.step)
+        looked = (beams >= edge) & (beams < len(newest.beams.free) - edge)
         points = points_relative(there[~looked], newest.pose)
         return points[~on_body(self._footprint, points, 0.0)]
+
+    def echoes(self) -> Array:
+        """Points of the newest arcs of all sonars, in base as of the newest scan, shape (n, 2), m."""
+        if self._newest is None or not self._heard:
+            return np.empty((0, 2))
+        arcs = np.concatenate([ping.points for heard in self._heard.values() for ping in heard.rounds])
+        return points_relative(arcs, self._newest.pose)
+
+    def _seeing(self, newest: _Taken) -> list[_Taken]:
+        """Scans and pings that count as views of the ground, the oldest first, ``newest`` last."""
+        views = (*self._views, *(view for heard in self._heard.values() for view in heard.views))
+        return [*sorted(self._fresh(views, newest), key=lambda view: view.beams.stamp), newest]
 
     def _fresh(self, kept: Iterable[_Taken], newest: _Taken) -> list[_Taken]:
         return [
             taken
             for taken in kept
-            if newest.scan.stamp - taken.scan.stamp < self._time
+            if newest.beams.stamp - taken.beams.stamp < self._time
             and newest.variance - taken.variance < self._variance_kept
         ]
 
@@ -182,7 +247,7 @@ class ScanMemory:
         if newest is None:
             return np.zeros(len(points), np.bool_)
         there = placed(np.column_stack((points, np.zeros(len(points)))), newest.pose)[:, :2]
-        return np.asarray(self._free((newest, *self._fresh(self._views, newest)), there).any(axis=0))
+        return np.asarray(self._free(self._seeing(newest), there).any(axis=0))
 
     def survey(self) -> Generator[None, None, GroundSurvey | None]:
         """Ground around the body that counts as seen, in steps that take well below a millisecond each."""
@@ -193,11 +258,11 @@ class ScanMemory:
         cells = np.column_stack((np.tile(middle, MAP_SIZE), np.repeat(middle, MAP_SIZE), np.zeros(MAP_SIZE**2)))
         there = placed(cells, newest.pose)[:, :2]
         ages = np.full(len(there), -1, np.int8)
-        for view in (*self._fresh(self._views, newest), newest):  # the newest last
+        for view in self._seeing(newest):
             (seen,) = self._free((view,), there)
-            ages[seen] = min(100 * (newest.scan.stamp - view.scan.stamp) // self._time, 100)
+            ages[seen] = min(100 * max(newest.beams.stamp - view.beams.stamp, 0) // self._time, 100)
             yield
-        return GroundSurvey(newest.scan.stamp, ages.reshape(MAP_SIZE, MAP_SIZE))
+        return GroundSurvey(newest.beams.stamp, ages.reshape(MAP_SIZE, MAP_SIZE))
 
     def _free(self, taken: Sequence[_Taken], there: Array) -> NDArray[np.bool_]:
         """Which points (n, 2) of the memory's frame each scan saw free, or the body stood on there; shape (m, n)."""
@@ -233,6 +298,14 @@ def spaced(points: Array, spacing: float) -> Array:
     return points[np.diff(along // spacing, prepend=-1.0) > 0]
 
 
+def _keep(views: deque[_Taken], taken: _Taken) -> None:
+    """Add a scan to those kept to know which ground is free, or have it replace that of a body that stood."""
+    if views and taken.travelled - views[-1].travelled < STANDING:
+        views[-1] = taken
+    elif not views or _apart(taken.pose, views[-1].pose) >= VIEW_STEP:
+        views.append(taken)
+
+
 def _apart(one: Pose2, other: Pose2) -> float:
     """Distance (m) and turn (rad) together."""
     return math.dist(one[:2], other[:2]) + abs(one[2] - other[2])
@@ -248,7 +321,7 @@ def _beams(scans: Sequence[_Taken], points: Array) -> tuple[NDArray[np.intp], Ar
     Returns:
         Two of shape (m, n).
     """
-    x, y = relative(points, np.array([scan.lidar for scan in scans]))
-    first = np.array([scan.scan.start_angle for scan in scans])
-    step = np.array([scan.scan.angle_increment or math.tau for scan in scans])
+    x, y = relative(points, np.array([scan.sensor for scan in scans]))
+    first = np.array([scan.beams.start for scan in scans])
+    step = np.array([scan.beams.step for scan in scans])
     return np.rint((np.arctan2(y, x) - first[:, None]) / step[:, None]).astype(np.intp), np.hypot(x, y)

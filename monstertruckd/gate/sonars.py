@@ -28,7 +28,7 @@ from monstertruck_schemas.sensor import SonarRanges
 from monstertruck_schemas.topics import SONAR, Topic
 from monstertruckd.gate.approach import Approach, comfortable_speed, reach
 from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
-from monstertruckd.gate.config import InForce
+from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.motion import Course
 
 ALIGNED: Final = 0.3
@@ -76,7 +76,7 @@ class SonarGuard:
 
     def observe(self, ranges: SonarRanges) -> None:
         """Take a round of pings; one that is too late is left out."""
-        if abs(ranges.received - ranges.stamp) > self._limits.config.max_latency * SECOND:
+        if is_late(ranges, self._limits.config):
             return
         self._rounds.append(ranges)
         self._answered |= {sonar.name: ranges.received for sonar in ranges.sonars if sonar.answered}
@@ -182,6 +182,11 @@ class SonarCheck(Check):
         """Free distance."""
         if reason in (Reason.OBSTACLE_STOP, Reason.SONAR_BLIND):
             yield self._approach.free_distance(None)
+
+
+def is_late(ranges: SonarRanges, config: GateConfig) -> bool:
+    """Whether a round of pings came too late to count."""
+    return abs(ranges.received - ranges.stamp) > config.max_latency * SECOND
 
 
 def arc(place: Place, distance: float, half: float) -> Array:

@@ -67,6 +67,7 @@ def make_gate(
     chassis=CHASSIS,
     services=SERVICES,
     battery_measured=False,
+    rear_sonars=None,
     peers=None,
     own=None,
     **config,
@@ -80,6 +81,7 @@ def make_gate(
         nonce=nonce,
         battery_measured=battery_measured,
         latched=latched,
+        rear_sonars=rear_sonars,
         peers=peers,
         own=own or {},
     )
@@ -202,8 +204,10 @@ def health(now, state=ServiceState.READY, name="planner", **more):
 class Rig:
     """A gate, the time, and a truck whose speed follows the commands as the drive controller's profile does."""
 
-    def __init__(self, latched=False, chassis=CHASSIS, battery_measured=False, **config):
-        self.gate = make_gate(latched, chassis=chassis, battery_measured=battery_measured, **config)
+    def __init__(self, latched=False, chassis=CHASSIS, battery_measured=False, rear_sonars=None, **config):
+        self.gate = make_gate(
+            latched, chassis=chassis, battery_measured=battery_measured, rear_sonars=rear_sonars, **config
+        )
         self.config = GateConfig(**config)
         self.now = SECOND
         self.speed = 0.0

@@ -1,0 +1,77 @@
+"""Sonars that look backwards on a robot with a lidar: sight of the ground behind it.
+
+An echo shows that the ground within the cone is free up to its range, and that something stands on the arc at that
+range. A ping without an echo shows nothing: a surface may have reflected the sound elsewhere.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.sensor import SonarEcho, SonarRanges
+from monstertruckd.gate.config import InForce
+from monstertruckd.gate.scan_memory import Beams
+from monstertruckd.gate.sonars import ALIGNED, Place, arc, is_late
+
+
+class Ping(NamedTuple):
+    """Answer of one sonar."""
+
+    sonar: str
+    mount: Place
+    """Pose of the sonar in base, m, m, rad."""
+    beams: Beams
+    """Two, each for half of the cone."""
+    arc: Array
+    """Possible places of the echo in base, shape (n, 2), m."""
+
+
+def rear(mounts: Mapping[str, Place]) -> dict[str, Place]:
+    """Sonars of ``mounts`` (pose in base by name: m, m, rad) that look backwards."""
+    return {
+        name: place for name, place in mounts.items() if abs(math.remainder(place[2] - math.pi, math.tau)) <= ALIGNED
+    }
+
+
+class RearSonars:
+    """Splits rounds of pings and notes which sonars are silent.
+
+    Args:
+        limits: the gate's, in force.
+        mounts: pose (x, y, yaw) of every sonar that looks backwards in base by name, m, m, rad.
+    """
+
+    def __init__(self, limits: InForce, mounts: Mapping[str, Place]) -> None:
+        self._limits = limits
+        self._mounts = mounts
+        self._answered: dict[str, int] = {}
+        """Time of the last answer of every sonar that is not silent, ns."""
+
+    def pings(self, ranges: SonarRanges) -> Iterator[Ping]:
+        """Answers in a round of pings; none in one that is too late."""
+        if is_late(ranges, self._limits.config):
+            return
+        for echo in ranges.sonars:
+            if echo.answered and echo.name in self._mounts:
+                self._answered[echo.name] = ranges.received
+                yield _ping(ranges, echo, self._mounts[echo.name])
+
+    def silenced(self, now: int) -> list[str]:
+        """Sonars that have become silent since the last call, at ``now`` (ns)."""
+        oldest = now - round(self._limits.config.sonar.stale_after * SECOND)
+        names = [name for name, answered in self._answered.items() if answered < oldest]
+        for name in names:
+            del self._answered[name]
+        return names
+
+
+def _ping(ranges: SonarRanges, echo: SonarEcho, mount: Place) -> Ping:
+    half = ranges.field_of_view / 2
+    if echo.range is None:
+        return Ping(echo.name, mount, Beams(echo.stamp, -half / 2, half, np.zeros(2)), np.empty((0, 2)))
+    free = echo.range if echo.range > ranges.range_min else 0.0  # what is nearer is reported as about range_min
+    return Ping(echo.name, mount, Beams(echo.stamp, -half / 2, half, np.full(2, free)), arc(mount, free, half))
