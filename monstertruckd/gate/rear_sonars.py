@@ -18,7 +18,7 @@ from monstertruckd.gate.scan_memory import Beams
 from monstertruckd.gate.sonars import ALIGNED, Place, arc, is_late
 
 
-class Ping(NamedTuple):
+class MountedEcho(NamedTuple):
     """Answer of one sonar."""
 
     sonar: str
@@ -51,7 +51,7 @@ class RearSonars:
         self._answered: dict[str, int] = {}
         """Time of the last answer of every sonar that is not silent, ns."""
 
-    def pings(self, ranges: SonarRanges) -> Iterator[Ping]:
+    def pings(self, ranges: SonarRanges) -> Iterator[MountedEcho]:
         """Answers in a round of pings; none in one that is too late."""
         if is_late(ranges, self._limits.config):
             return
@@ -69,9 +69,9 @@ class RearSonars:
         return names
 
 
-def _ping(ranges: SonarRanges, echo: SonarEcho, mount: Place) -> Ping:
+def _ping(ranges: SonarRanges, echo: SonarEcho, mount: Place) -> MountedEcho:
     half = ranges.field_of_view / 2
     if echo.range is None:
-        return Ping(echo.name, mount, Beams(echo.stamp, -half / 2, half, np.zeros(2)), np.empty((0, 2)))
+        return MountedEcho(echo.name, mount, Beams(echo.stamp, -half / 2, half, np.zeros(2)), np.empty((0, 2)))
     free = echo.range if echo.range > ranges.range_min else 0.0  # what is nearer is reported as about range_min
-    return Ping(echo.name, mount, Beams(echo.stamp, -half / 2, half, np.full(2, free)), arc(mount, free, half))
+    return MountedEcho(echo.name, mount, Beams(echo.stamp, -half / 2, half, np.full(2, free)), arc(mount, free, half))

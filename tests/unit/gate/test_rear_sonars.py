@@ -19,7 +19,7 @@ WALL = 1.2
 
 
 class SonarRig(Rig):
-    """A truck before a wall behind it, which its sonars measure unless told otherwise."""
+    """A truck before a wall behind it, which its sonars measure, except those that are dead."""
 
     def __init__(self, mounts=MOUNTS, **config):
         super().__init__(rear_sonars=mounts, **config)
