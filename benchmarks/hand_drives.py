@@ -1,6 +1,6 @@
 """Random drives by hand in both directions and four worlds; contacts are judged by the simulated world alone.
 
-    python benchmarks/hand_drives.py [--count 200] [--seed 1] [--confirm 0.0] [--worlds loop rooms ...]
+    python benchmarks/hand_drives.py [--count 200] [--seed 1] [--confirm 0.0] [--worlds loop rooms ...] [--minutes M]
 
 Each drive lasts a minute and begins at a random place, the truck put down by hand. The operator asks for a random speed
 forward or in reverse, with a random steering mode and angle, and changes all of them every 0.5 to 4 s, whatever is in
@@ -8,6 +8,9 @@ the way. With a share of --confirm of these motions the operator holds the secon
 unseen ground; contacts then are counted apart, with the time until the gate moves the truck away from the obstacle. A
 contact that the gate does not notice while the operator goes on, or from which it does not back off, is counted as
 unnoticed.
+
+Drives are kept in ``runs/hand_drives.jsonl``, so that a run that ended early (``--minutes``) goes on where it was; one
+of other sources begins anew.
 
 A contact is one of the world's own footprint with its walls, whatever the gate sees. That they are avoided must not be
 bought by standing still: the distance travelled and the share of the time that the truck was kept standing are printed.
@@ -21,7 +24,8 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from hashlib import blake2s
 from pathlib import Path
 from time import perf_counter
 
@@ -63,6 +67,13 @@ BACKED = 0.02
 """Distance from the place of a contact, m."""
 PER_TRUCK = 5
 """Drives of one daemon, with a carry in between."""
+OUTPUT = ROOT / "runs" / "hand_drives.jsonl"
+SOURCES = ("monstertruckd", "drivers", "planners", "schemas", "configs", "benchmarks/hand_drives.py")
+"""A drive is kept for as long as these stay as they are."""
+
+
+Leg = tuple[str, int, int]
+"""World, first number and count of drives."""
 
 
 @dataclass
@@ -84,7 +95,7 @@ class Drive:
     kept: float = 0.0
     """Seconds for which motion was asked for and the truck was kept standing."""
     reasons: Counter[str] = field(default_factory=Counter)
-    """Ticks of 50 ms with each reason while it was kept standing."""
+    """Ticks of 50 ms with each reason, by the direction asked for, while it was kept standing."""
 
 
 @dataclass
@@ -180,7 +191,8 @@ async def drive(
         state = gate.latest
         if state is not None and way < 0.005 * PERIOD:
             out.kept += PERIOD
-            out.reasons.update(reason.value for reason in state.reasons)
+            direction = "forward" if speed > 0 else "in reverse"
+            out.reasons.update(f"{direction}: {reason}" for reason in (state.reasons or ("no reason",)))
         if true.stuck and not stuck:
             why = f"{out.world} {out.number}: {name} at {speed:.2f} m/s, truly {last.v:.3f}"
             backs_off = state is not None and Reason.CONTACT in state.reasons
@@ -218,13 +230,54 @@ def leg(world: str, first: int, count: int, seed: int, confirm: float) -> list[D
     return run_virtual(main, start=SECOND)
 
 
-def legs(worlds: Iterable[str], count: int) -> Iterable[tuple[str, int, int]]:
-    """World, first number and count of every leg, evenly over the worlds."""
+def legs(worlds: Iterable[str], count: int) -> Iterable[Leg]:
+    """Every leg: evenly over the worlds, and so from the start."""
     worlds = tuple(worlds)
-    for index, world in enumerate(worlds):
-        total = count // len(worlds) + (index < count % len(worlds))
-        for first in range(0, total, PER_TRUCK):
-            yield world, first, min(PER_TRUCK, total - first)
+    totals = {world: count // len(worlds) + (index < count % len(worlds)) for index, world in enumerate(worlds)}
+    for first in range(0, count, PER_TRUCK):
+        for world, total in totals.items():
+            if first < total:
+                yield world, first, min(PER_TRUCK, total - first)
+
+
+def digest(options: argparse.Namespace) -> str:
+    """Name of drives with these options by the present sources."""
+    made = blake2s(repr((options.seed, options.confirm)).encode(), digest_size=10)
+    for place in map(ROOT.joinpath, SOURCES):
+        files = sorted(place.rglob("*")) if place.is_dir() else [place]
+        for file in (file for file in files if file.suffix in (".py", ".yaml", ".csv", ".png")):
+            made.update(file.read_bytes())
+    return made.hexdigest()
+
+
+def kept(name: str) -> dict[Leg, list[Drive]]:
+    """Drives of earlier runs with this digest."""
+    lines = OUTPUT.read_text(encoding="utf-8").splitlines() if OUTPUT.exists() else []
+    return {
+        (entry["world"], entry["first"], len(entry["drives"])): [
+            Drive(**{**one, "reasons": Counter(one["reasons"])}) for one in entry["drives"]
+        ]
+        for entry in map(json.loads, lines)
+        if entry["digest"] == name
+    }
+
+
+def driven(options: argparse.Namespace) -> list[Drive]:
+    """All drives that the time allows, those of earlier runs included."""
+    end, name = perf_counter() + 60 * options.minutes, digest(options)
+    found = kept(name)
+    work = list(legs(options.worlds, options.count))
+    todo = [one for one in work if one not in found]
+    OUTPUT.parent.mkdir(parents=True, exist_ok=True)
+    with ProcessPoolExecutor(options.jobs) as pool, OUTPUT.open("a", encoding="utf-8") as out:
+        while todo and perf_counter() < end:
+            some, todo = todo[: options.jobs], todo[options.jobs :]
+            running = [pool.submit(leg, *one, options.seed, options.confirm) for one in some]
+            for one, done in zip(some, running, strict=True):
+                found[one] = done.result()
+                entry = {"digest": name, "world": one[0], "first": one[1], "drives": list(map(asdict, found[one]))}
+                print(json.dumps(entry), file=out, flush=True)
+    return [drive for one in work if one in found for drive in found[one]]
 
 
 def main() -> int:
@@ -235,16 +288,10 @@ def main() -> int:
     parser.add_argument("--confirm", type=float, default=0.0)
     parser.add_argument("--worlds", nargs="+", default=WORLDS, choices=sorted(BUILT_IN))
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=math.inf, help="begin no drive after this time")
     arguments = parser.parse_args()
     began = perf_counter()
-    drives: list[Drive] = []
-    with ProcessPoolExecutor(arguments.jobs) as pool:
-        work = [
-            pool.submit(leg, world, first, count, arguments.seed, arguments.confirm)
-            for world, first, count in legs(arguments.worlds, arguments.count)
-        ]
-        for done in work:
-            drives += done.result()
+    drives = driven(arguments)
     print("| world | drives | forward m | reverse m | kept standing | contacts | confirmed contacts |")
     print("|---|---:|---:|---:|---:|---:|---:|")
     by_world: dict[str, list[Drive]] = defaultdict(list)
