@@ -468,7 +468,7 @@ class RunawayCheck(Check):
     def _pulled(self, now: int) -> bool:
         """Whether a motor may be what moves the body: one that falls over or slides down is moved by its weight."""
         samples = self.view.samples
-        if samples.attitude_fresh(now) and samples.tilt >= self.view.config.tilt.stop:
+        if samples.tips(now):
             return False
         fresh = bool(samples.shaft_speeds(now))
         return any(watch.pulls(self._config, fresh=fresh) for watch in self._shafts)

@@ -82,6 +82,8 @@ class Samples:
         self.attitude: Attitude | None = None
         self.tilt = 0.0
         """Angle between the robot's z axis and the vertical, rad, by the newest valid attitude."""
+        self._shaken: Attitude | None = None
+        """Newest attitude whose tilt an acceleration hides."""
         self.battery: Battery | None = None
         self._lost: dict[Reason, int] = {}
         self._refused: dict[Reason, Measurement] = {}
@@ -104,9 +106,13 @@ class Samples:
                     self.steering = message
                     self.angles = self._chassis.steering(*message.servos)
             case Attitude():
-                if self._valid(message, Reason.ATTITUDE_STALE) and message.tilt_valid:
+                if not self._valid(message, Reason.ATTITUDE_STALE):
+                    return
+                if message.tilt_valid:
                     self.attitude = message
                     self.tilt = math.acos(math.cos(message.roll) * math.cos(message.pitch))
+                else:
+                    self._shaken = message
             case Battery():
                 if self._valid(message, Reason.BATTERY_STALE) and message.level in MEASURED:
                     self.battery = message
@@ -163,6 +169,14 @@ class Samples:
     def attitude_fresh(self, now: int) -> bool:
         """Whether the attitude is fresh."""
         return self._fresh(self.attitude, self._limits.config.attitude, now, Reason.ATTITUDE_STALE)
+
+    def tips(self, now: int) -> bool:
+        """Whether the robot falls over or slides down at ``now`` (ns): by the last tilt that was measured.
+
+        While it falls, its acceleration hides the tilt from the sensor.
+        """
+        shaken = self._fresh(self._shaken, self._limits.config.attitude, now, Reason.ATTITUDE_STALE)
+        return (shaken or self.attitude_fresh(now)) and self.tilt >= self._limits.config.tilt.stop
 
     def battery_fresh(self, now: int) -> bool:
         """Whether the battery voltage is fresh."""

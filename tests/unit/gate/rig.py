@@ -215,6 +215,7 @@ class Rig:
         self.obstacles = ()
         self.unknown = ()
         self.tilt = 0.0
+        self.tilt_valid = True
         self.level = BatteryLevel.NORMAL
         self.fault = False
         self.out = None
@@ -263,7 +264,7 @@ class Rig:
         mode = DriveMode.FAULT if self.fault else self.mode
         samples = {
             "scan": lambda: show(self.gate, scan(self.now, *self.obstacles, unknown=self.unknown)),
-            "attitude": lambda: show(self.gate, attitude(self.now, roll=self.tilt)),
+            "attitude": lambda: show(self.gate, attitude(self.now, roll=self.tilt, tilt_valid=self.tilt_valid)),
             "drive": lambda: show(self.gate, feedback(self.now, self.speed, mode, current=self.current)),
             "steering": lambda: show(self.gate, servos(self.now)),
             "battery": lambda: show(self.gate, battery(self.now, self.level)),

@@ -430,6 +430,16 @@ def test_a_robot_that_falls_over_or_slides_down_is_moved_by_its_weight():
     assert moved(rig, 0.5, 2.0) is None
 
 
+def test_while_a_robot_falls_its_last_tilt_holds():
+    """Its acceleration hides the tilt from the sensor, which goes on to deliver."""
+    rig = Rig().armed()
+    rig.current, rig.driver, rig.tilt = 0.3, {"speed": 0.0}, 0.5
+    rig.tick(30)
+    rig.tilt_valid = False
+    rig.tick(100)
+    assert moved(rig, 0.5, 2.0) is None
+
+
 def test_a_tilt_that_is_no_longer_measured_hides_no_motion():
     rig = Rig().armed()
     rig.current, rig.driver, rig.tilt = 0.3, {"speed": 0.0}, 0.5
