@@ -209,6 +209,8 @@ def _scan(head: dict[str, int], seed: int, first: float, last: float) -> LaserSc
         range_max=4.0,
         ranges=np.array(ranges),
         codes=np.array(codes, np.uint8),
+        intensities=None,
+        tilt=None,
     )
 
 

@@ -14,6 +14,8 @@ from monstertruck_drivers.signals import Signals
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.threads import Offload, in_thread
 
+Array = NDArray[np.float64]
+
 
 class FileTree:
     """Files below a folder; each changes at once and whole, and only if its text does.
@@ -111,6 +113,36 @@ class RangeSource(Protocol):
 
         Shape (769,), step 0..768; values below 20 are the sensor's error codes.
         """
+
+
+class RangeSheet(NamedTuple):
+    """Ranges of a scanner by its data sheet."""
+
+    least: float
+    """Shortest range, m."""
+    greatest: float
+    """Longest range, m."""
+    error: float
+    """Bound of the error of short ranges, m."""
+    relative_error: float
+    """Bound of the error of longer ranges, as a share of the range."""
+
+
+class BeamSource(Protocol):
+    """What the beams of a scanner of any geometry meet."""
+
+    def beams(self, bearings: Array, times_ns: NDArray[np.int64], sheet: RangeSheet) -> Array:
+        """Ranges of single beams, shape (n,), m: +inf = nothing within range, NaN = the measurement failed.
+
+        Args:
+            bearings: counter-clockwise from the scanner's x axis, shape (n,), rad.
+            times_ns: instants of the beams, shape (n,), rising, over at most half a second.
+            sheet: reach and noise.
+        """
+
+
+class ScannedRoom(RangeSource, BeamSource, Protocol):
+    """What any lidar sees."""
 
 
 class MotorReading(NamedTuple):
@@ -251,7 +283,7 @@ class Physics(Protocol):
     """The simulated world, as far as devices feel it."""
 
     @property
-    def lidar(self) -> RangeSource:
+    def lidar(self) -> ScannedRoom:
         """What the lidar sees."""
 
     @property

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from monstertruck_kinematics.beams import is_full_turn, nearest_beams
 from monstertruck_kinematics.chassis import STILL
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, Twist2, integrate, placed, points_relative
@@ -58,7 +59,7 @@ class Beams(NamedTuple):
     start: float
     """Angle of the first beam, rad."""
     step: float
-    """Angle between neighbouring beams, rad."""
+    """Angle from a beam to the next, rad, negative clockwise."""
     free: Array
     """Free distance along every beam, shape (n,), m; 0 = not known."""
 
@@ -216,8 +217,9 @@ class ScanMemory:
         kept = [scan.points for scan in taken if newest.travelled - scan.travelled < self._distance]
         there = np.concatenate((newest.points[:0], *kept))
         beams = _beams((newest,), there)[0][0]
-        edge = FIELD_EDGE / abs(newest.beams.step)
-        looked = (beams >= edge) & (beams < len(newest.beams.free) - edge)
+        count, step = len(newest.beams.free), newest.beams.step
+        edge = 0.0 if is_full_turn(count, step) else FIELD_EDGE / abs(step)
+        looked = (beams >= edge) & (beams < count - edge)
         points = points_relative(there[~looked], newest.pose)
         return points[~on_body(self._footprint, points, 0.0)]
 
@@ -281,7 +283,7 @@ class ScanMemory:
 def elsewhere(before: LaserScan, now: LaserScan) -> bool:
     """Whether two scans of a robot whose wheels stood were taken in different places."""
     if len(before.ranges) != len(now.ranges):
-        return True
+        now = _towards(before, now)
     measured = [scan.codes == VALID_BEAM for scan in (before, now)]
     first, second = (
         np.where(valid, scan.ranges, scan.range_max) for valid, scan in zip(measured, (before, now), strict=True)
@@ -290,6 +292,18 @@ def elsewhere(before: LaserScan, now: LaserScan) -> bool:
     compared = known[0] & known[1] & (measured[0] | measured[1])
     differ = compared & (np.abs(first - second) > CHANGED)
     return bool(np.count_nonzero(differ) > ELSEWHERE * np.count_nonzero(compared))
+
+
+def _towards(like: LaserScan, scan: LaserScan) -> LaserScan:
+    """The beams of ``scan`` nearest to those of ``like``; without a code that says anything where it has none."""
+    count, step = len(scan.ranges), scan.angle_increment
+    if not count:
+        return like.model_copy(update={"codes": np.full(len(like.codes), NO_ECHO + 1, np.uint8)})
+    bearings = like.start_angle + like.angle_increment * np.arange(len(like.ranges))
+    beams = nearest_beams(bearings, scan.start_angle, step)
+    there = np.minimum(beams, count - 1)
+    codes = np.where(beams < count, scan.codes[there], np.uint8(NO_ECHO + 1))
+    return scan.model_copy(update={"ranges": scan.ranges[there], "codes": codes})
 
 
 def spaced(points: Array, spacing: float) -> Array:
@@ -324,4 +338,4 @@ def _beams(scans: Sequence[_Taken], points: Array) -> tuple[NDArray[np.intp], Ar
     x, y = relative(points, np.array([scan.sensor for scan in scans]))
     first = np.array([scan.beams.start for scan in scans])
     step = np.array([scan.beams.step for scan in scans])
-    return np.rint((np.arctan2(y, x) - first[:, None]) / step[:, None]).astype(np.intp), np.hypot(x, y)
+    return nearest_beams(np.arctan2(y, x), first[:, None], step[:, None]), np.hypot(x, y)

@@ -9,9 +9,10 @@ from monstertruck_schemas.base import Float64Array, Message, Nanoseconds, Pose2D
 
 
 class LaserScan(Message):
-    """One lidar revolution, counter-clockwise, beam i at ``start_angle + i * angle_increment``.
+    """One lidar revolution, beam i at ``start_angle + i * angle_increment``, in the order in which they were measured.
 
-    ``stamp`` is the time of the FIRST beam in ``ranges``; beam i is ``i * time_increment`` later.
+    A scanner that turns clockwise has ``end_angle`` below ``start_angle``. ``stamp`` is the time of the FIRST beam in
+    ``ranges``; beam i is ``i * time_increment`` later. The number of beams may vary from scan to scan.
     """
 
     start_angle: float
@@ -31,13 +32,20 @@ class LaserScan(Message):
     codes: UInt8Array
     """Shape (n,): ``VALID_BEAM``, a code up to ``NO_ECHO`` where the sensor saw nothing within its range, or another
     code of the sensor's own (its manual) where it does not know."""
+    intensities: UInt8Array | None = None
+    """Shape (n,): strength of the returns in the sensor's own measure, 0 where there is none; None = not measured."""
     tilt: Annotated[float, Field(ge=0)] | None = None
     """Angle between the scanning plane and the horizontal in the middle of the scan, rad; None = not measured."""
 
     @property
     def angle_increment(self) -> float:
-        """Angle between neighbouring beams, rad."""
+        """Angle from a beam to the next, rad, negative clockwise."""
         return (self.end_angle - self.start_angle) / max(len(self.ranges) - 1, 1)
+
+    @property
+    def field(self) -> tuple[float, float]:
+        """Least and greatest bearing of a beam, rad."""
+        return min(self.start_angle, self.end_angle), max(self.start_angle, self.end_angle)
 
 
 VALID_BEAM = 255

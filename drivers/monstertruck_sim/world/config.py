@@ -266,7 +266,7 @@ class BatteryModelConfig(Schema):
 
 
 class LidarConfig(Schema):
-    """Hokuyo URG-04LX: steps 0..768, 1024 steps a turn, ten turns a second."""
+    """The lidar: its true mount and its faults. Directions, rate and range are those of the device that is emulated."""
 
     x: float = 0.14
     """Mount before the geometric centre, m."""
@@ -281,13 +281,15 @@ class LidarConfig(Schema):
     height: Positive = 0.25
     """Height of the scanning plane over the ground, m."""
     first_step: Annotated[int, Field(ge=0, le=768)] = 44
+    """First step of 0..768 at which a URG-04LX measures."""
     last_step: Annotated[int, Field(ge=0, le=768)] = 725
-    min_range: NotNegative = 0.02
-    """Nearer surfaces give an error code, m."""
-    max_range: Positive = 5.6
-    """m."""
+    """Its last one."""
+    min_range: NotNegative | None = None
+    """Shortest range, m; null: by the device's data sheet."""
+    max_range: Positive | None = None
+    """Longest range, m; null: by the device's data sheet."""
     accuracy_sigmas: Positive = 2.0
-    """How many standard deviations the data sheet's bound (10 mm to 1 m, 1 % beyond) is."""
+    """How many standard deviations the data sheet's bound on the error is."""
     dropout: Fraction = 0.002
     """Chance of a single beam to fail."""
     wall_height: Positive = 0.6
@@ -297,7 +299,7 @@ class LidarConfig(Schema):
     def _check_order(self) -> Self:
         if self.first_step > self.last_step:
             raise ValueError(f"first_step {self.first_step} > last_step {self.last_step}")
-        if self.min_range >= self.max_range:
+        if self.min_range is not None and self.max_range is not None and self.min_range >= self.max_range:
             raise ValueError(f"min_range {self.min_range} m >= max_range {self.max_range} m")
         return self
 

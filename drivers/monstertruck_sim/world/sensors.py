@@ -7,7 +7,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_drivers.emulation import CompassReading, ImuReading, JointSource, MotorReading, PulseSource
+from monstertruck_drivers.emulation import (
+    CompassReading,
+    ImuReading,
+    JointSource,
+    MotorReading,
+    PulseSource,
+    RangeSheet,
+)
 from monstertruck_kinematics.elementary import Array, Real, cos, rotation, sin
 from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.clock import SECOND
@@ -29,12 +36,15 @@ from monstertruck_sim.world.noise import (
     IMU,
     IMU_FIXED,
     LIDAR,
+    LIDAR_BEAMS,
     WhiteNoise,
     generator,
 )
 from monstertruck_sim.world.plant import GRAVITY, Caster, Plant, Xyz
 from monstertruck_sim.world.terrain import Terrain
 
+URG_SHEET = RangeSheet(0.02, 5.6, 0.01, 0.01)
+"""URG-04LX: 10 mm to 1 m, 1 % beyond."""
 STEPS = 769
 SWEEP_NS = 100_000_000
 NO_RETURN, TOO_NEAR, FAILED = 0, 6, 19
@@ -52,15 +62,16 @@ LEVEL_BEAMS: Beams = np.cos(BEAM_ANGLES), np.sin(BEAM_ANGLES), np.zeros(STEPS)
 
 
 class Sweep(Protocol):
-    """One revolution of a lidar's beams through the world."""
+    """Beams of a lidar through the world."""
 
-    def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64], /) -> Array:
+    def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64], reach: float, /) -> Array:
         """Ranges, m; inf = nothing.
 
         Args:
-            poses: of the robot at the beams' instants, (6, 769): x, y, yaw, pitch, roll, height.
+            poses: of the robot at the beams' instants, (6, n): x, y, yaw, pitch, roll, height.
             beams: directions in the body frame; None: ``BEAM_ANGLES`` in the body's plane.
-            times_ns: instants of the beams, (769,), rising.
+            times_ns: instants of the beams, (n,), rising.
+            reach: greatest horizontal distance looked at, m.
         """
 
 
@@ -89,40 +100,42 @@ class PlaneSweep:
     def __init__(self, cast: Caster, terrain: Terrain | None, config: LidarConfig) -> None:
         self._cast, self._terrain, self._config = cast, terrain, config
 
-    def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64]) -> Array:
+    def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64], reach: float) -> Array:
         """As ``Sweep``."""
         x, y, yaw, pitch, roll, _ = poses
         xs, ys = self._places(x, y, yaw)
         if beams is None and self._terrain is None and np.abs(poses[3:5]).max() < _LEVEL:
-            return self._cast(xs, ys, yaw + BEAM_ANGLES, self._config.max_range, times_ns)
+            return self._cast(xs, ys, yaw + BEAM_ANGLES, reach, times_ns)
         beams = turned(LEVEL_BEAMS if beams is None else beams, pitch, roll)
         if self._terrain is None:
-            return self._tilted(xs, ys, yaw, beams, times_ns)
-        return self._over(self._terrain, poses, beams, times_ns)
+            return self._tilted(xs, ys, yaw, beams, times_ns, reach)
+        return self._over(self._terrain, poses, beams, times_ns, reach)
 
     def _places(self, x: Array, y: Array, yaw: Array) -> tuple[Array, Array]:
         """Of the mount in the map frame where the body is at (x, y, yaw)."""
         ahead, aside, c, s = self._config.x, self._config.y, np.cos(yaw), np.sin(yaw)
         return x + ahead * c - aside * s, y + ahead * s + aside * c
 
-    def _tilted(self, xs: Array, ys: Array, yaw: Array, beams: Beams, times_ns: NDArray[np.int64]) -> Array:
+    def _tilted(
+        self, xs: Array, ys: Array, yaw: Array, beams: Beams, times_ns: NDArray[np.int64], reach: float
+    ) -> Array:
         """Ranges along beams whose directions are given in the truck's level frame."""
         config = self._config
         forward, left, up = beams
         level = np.hypot(forward, left)
-        ranges = self._cast(xs, ys, yaw + np.arctan2(left, forward), config.max_range, times_ns) / level
+        ranges = self._cast(xs, ys, yaw + np.arctan2(left, forward), reach, times_ns) / level
         with np.errstate(divide="ignore", invalid="ignore"):
             ground = np.where(up < 0, config.height / -up, np.inf)
             ranges[config.height + ranges * up > config.wall_height] = np.inf
         nearest: Array = np.minimum(ranges, ground)
         return nearest
 
-    def _over(self, terrain: Terrain, poses: Array, beams: Beams, times_ns: NDArray[np.int64]) -> Array:
+    def _over(self, terrain: Terrain, poses: Array, beams: Beams, times_ns: NDArray[np.int64], reach: float) -> Array:
         """Ranges over uneven ground; arguments as of ``_tilted``."""
         config, (x, y, yaw, pitch, *_) = self._config, poses
         xs, ys = self._places(x, y, yaw)
         zs = terrain.height(x, y) - config.x * np.sin(pitch) + config.height
-        return over(self._cast, terrain, config, (xs, ys, zs), yaw, beams, times_ns)
+        return over(self._cast, terrain, config, (xs, ys, zs), yaw, beams, times_ns, reach)
 
 
 def over(
@@ -133,6 +146,7 @@ def over(
     yaw: Array,
     beams: Beams,
     times_ns: NDArray[np.int64],
+    reach: float,
 ) -> Array:
     """Ranges over uneven ground to it and to walls that stand on it, m; inf = nothing.
 
@@ -144,25 +158,26 @@ def over(
         yaw: of the robot, (n,).
         beams: directions in the robot's level frame.
         times_ns: instants of the beams.
+        reach: greatest horizontal distance looked at, m.
     """
     (xs, ys, zs), (forward, left, up) = origins, beams
     level = np.hypot(forward, left)
     headings, rises = yaw + np.arctan2(left, forward), up / level
-    walls = cast(xs, ys, headings, config.max_range, times_ns)
+    walls = cast(xs, ys, headings, reach, times_ns)
     hit = np.isfinite(walls)
     way = np.where(hit, walls, 0.0)
     foot = ground.height(xs + way * np.cos(headings), ys + way * np.sin(headings))
     walls[hit & (zs + rises * way > foot + config.wall_height)] = np.inf
-    found = ground.cast(xs, ys, zs, headings, rises, config.max_range)
+    found = ground.cast(xs, ys, zs, headings, rises, reach)
     ranges: Array = np.minimum(walls, found) / level
     return ranges
 
 
 class SimulatedLidar:
-    """``RangeSource``: every beam leaves from where the truck is at that beam's instant.
+    """``ScannedRoom``: every beam leaves from where the truck is at that beam's instant.
 
-    Noise is Gaussian with the data sheet's bound (10 mm to 1 m, 1 % of the range beyond) at two standard deviations,
-    as a maker's accuracy covers nearly all readings. Joints of a mount turn it about its own centre.
+    Noise is Gaussian with the data sheet's bound at two standard deviations, as a maker's accuracy covers nearly all
+    readings. Joints of a mount turn it about its own centre.
 
     Args:
         plant: what carries it.
@@ -178,7 +193,7 @@ class SimulatedLidar:
         self._plant, self._sweep, self._config, self._seed = plant, sweep, config, seed
         self._lost = (np.arange(STEPS) < config.first_step) | (np.arange(STEPS) > config.last_step)
         """Steps that never measure."""
-        self._mounted = _mounted(config)
+        self._mounted = _mounted(config, LEVEL_BEAMS)
 
     def scan(self, time_ns: int) -> NDArray[np.int32]:
         """Distances in mm of the revolution that began at ``time_ns``, (769,); codes below 20 are errors.
@@ -187,15 +202,45 @@ class SimulatedLidar:
         sweep is extrapolated.
         """
         self._plant.advance(time_ns)
-        times = time_ns + _BEAM_DELAYS
-        poses = self._plant.poses(times)
-        beams = self._mounted
+        sheet = self._sheet(URG_SHEET)
+        ranges = self._cast(self._mounted, LEVEL_BEAMS, time_ns + _BEAM_DELAYS, sheet.greatest)
+        return self._measure(ranges, time_ns, sheet)
+
+    def beams(self, bearings: Array, times_ns: NDArray[np.int64], sheet: RangeSheet) -> Array:
+        """As ``BeamSource``."""
+        first = int(times_ns[0])
+        self._plant.advance(int(times_ns[-1]))
+        sheet = self._sheet(sheet)
+        level = np.cos(bearings), np.sin(bearings), np.zeros(len(bearings))
+        ranges = self._cast(_mounted(self._config, level) or level, level, times_ns, sheet.greatest)
+        if self._seed is not None:
+            noise = generator(self._seed, LIDAR_BEAMS, self._plant.slot(first, 1))
+            ranges = ranges + self._sigma(ranges, sheet) * noise.standard_normal(len(ranges))
+            ranges[noise.random(len(ranges)) < self._config.dropout] = np.nan
+        ranges[ranges > sheet.greatest] = np.inf
+        return ranges
+
+    def _sheet(self, sheet: RangeSheet) -> RangeSheet:
+        """The device's own, but for ranges that the world's configuration gives."""
+        config = self._config
+        least = sheet.least if config.min_range is None else config.min_range
+        return sheet._replace(least=least, greatest=config.max_range or sheet.greatest)
+
+    def _cast(self, mounted: Beams | None, level: Beams, times: NDArray[np.int64], reach: float) -> Array:
+        """True ranges, (n,), m, of beams in the frame of what carries the lidar; ``mounted`` None: ``LEVEL_BEAMS``."""
+        poses, beams = self._plant.poses(times), mounted
         if self.joints is not None:
-            beams = turned(LEVEL_BEAMS if beams is None else beams, *self.joints.angles(times))
-        ranges = self._sweep(poses, beams, times)
-        if (board := self.board_at(time_ns)) is not None:
-            ranges = np.minimum(ranges, self._held(board, poses[:, 0], LEVEL_BEAMS if beams is None else beams))
-        return self._measure(ranges, time_ns)
+            beams = turned(level if beams is None else beams, *self.joints.angles(times))
+        ranges = self._sweep(poses, beams, times, reach)
+        if (board := self.board_at(int(times[0]))) is not None:
+            ranges = np.minimum(ranges, self._held(board, poses[:, 0], level if beams is None else beams))
+        return ranges
+
+    def _sigma(self, ranges: Array, sheet: RangeSheet) -> Array:
+        """Standard deviations, (n,), m; 0 where there is no range."""
+        sigma: Array = np.maximum(sheet.error, sheet.relative_error * ranges) / self._config.accuracy_sigmas
+        sigma[np.isinf(sigma)] = 0.0
+        return sigma
 
     def _held(self, board: FlatPanel, pose: Array, beams: Beams) -> Array:
         """Ranges of a board before a robot that stands, m; inf = none."""
@@ -204,18 +249,15 @@ class SimulatedLidar:
         origin = np.array((x, y, height)) + body @ np.array((config.x, config.y, config.height))
         return panel_ranges(board, origin, np.stack(beams, axis=1) @ body.T)
 
-    def _measure(self, ranges: Array, time_ns: int) -> NDArray[np.int32]:
-        config = self._config
+    def _measure(self, ranges: Array, time_ns: int, sheet: RangeSheet) -> NDArray[np.int32]:
         lost = self._lost
         if self._seed is not None:
             noise = generator(self._seed, LIDAR, self._plant.slot(time_ns, SWEEP_NS // 2))
-            sigma = np.maximum(0.01, 0.01 * ranges) / config.accuracy_sigmas
-            sigma[np.isinf(sigma)] = 0.0
-            ranges = ranges + sigma * noise.standard_normal(STEPS)
-            lost = self._lost | (noise.random(STEPS) < config.dropout)
-        seen = ranges <= config.max_range
+            ranges = ranges + self._sigma(ranges, sheet) * noise.standard_normal(STEPS)
+            lost = self._lost | (noise.random(STEPS) < self._config.dropout)
+        seen = ranges <= sheet.greatest
         millimetres: NDArray[np.int32] = np.rint(np.where(seen, ranges, 0.0) * 1000).astype(np.int32)
-        millimetres[seen & (ranges < config.min_range)] = TOO_NEAR
+        millimetres[seen & (ranges < sheet.least)] = TOO_NEAR
         millimetres[~seen] = NO_RETURN
         millimetres[lost] = FAILED
         return millimetres
@@ -423,11 +465,16 @@ def turned(vector: tuple[Real, Real, Real], pitch: Real, roll: Real) -> tuple[Re
     return cos(pitch) * x + sin(pitch) * z, y, cos(pitch) * z - sin(pitch) * x
 
 
-def _mounted(config: LidarConfig) -> Beams | None:
-    """Beams of a lidar that is not mounted straight, in the frame of what carries it; None: of one that is."""
+def _mounted(config: LidarConfig, level: Beams) -> Beams | None:
+    """Beams of a lidar that is not mounted straight, in the frame of what carries it; None: of one that is.
+
+    Args:
+        config: its mount.
+        level: the beams in its own frame.
+    """
     if config.yaw == config.pitch == config.roll == 0.0:
         return None
-    x, y, z = turned(LEVEL_BEAMS, np.full(STEPS, config.pitch), np.full(STEPS, config.roll))
+    x, y, z = turned(level, np.full(len(level[0]), config.pitch), np.full(len(level[0]), config.roll))
     c, s = cos(config.yaw), sin(config.yaw)
     return c * x - s * y, s * x + c * y, z
 

@@ -12,7 +12,7 @@ from monstertruck_drivers.emulation import (
     Horn,
     ImuSource,
     JointSource,
-    RangeSource,
+    ScannedRoom,
     ServoPlant,
     SonarSource,
     WheelSource,
@@ -83,7 +83,7 @@ class World:
         self.scene.add_body(self)
         cast = self._space.cast
         self._lidar = SimulatedLidar(self._plant, sweep, config.lidar, noise_seed)
-        self.lidar: RangeSource = self._lidar
+        self.lidar: ScannedRoom = self._lidar
         pitch, roll = config.mount.pitch, config.mount.roll
         self._horns = Horn(pitch.zero, pitch.direction), Horn(roll.zero, roll.direction)
         self.view = make_view(config, self._plant, cast, self.scene, seed)

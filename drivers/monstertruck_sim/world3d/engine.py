@@ -165,7 +165,7 @@ class RigidSweep:
         self._plant, self._cast, self._ground, self._config = plant, cast, ground, config
         self._blocks = has_blocks(plant)
 
-    def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64]) -> Array:
+    def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64], reach: float) -> Array:
         """As ``Sweep``."""
         x, y, yaw, pitch, roll, z = poses
         config = self._config
@@ -174,13 +174,13 @@ class RigidSweep:
         ahead, aside, up = turned((still + config.x, still + config.y, still + config.height), pitch, roll)
         c, s = np.cos(yaw), np.sin(yaw)
         origins = x + c * ahead - s * aside, y + s * ahead + c * aside, z + up
-        ranges = over(self._cast, self._ground, config, origins, yaw, beams, times_ns)
-        return np.minimum(ranges, self._to_blocks(origins, yaw, beams)) if self._blocks else ranges
+        ranges = over(self._cast, self._ground, config, origins, yaw, beams, times_ns, reach)
+        return np.minimum(ranges, self._to_blocks(origins, yaw, beams, reach)) if self._blocks else ranges
 
-    def _to_blocks(self, origins: Beams, yaw: Array, beams: Beams) -> Array:
+    def _to_blocks(self, origins: Beams, yaw: Array, beams: Beams, reach: float) -> Array:
         c, s = np.cos(yaw), np.sin(yaw)
         ways = np.stack([c * beams[0] - s * beams[1], s * beams[0] + c * beams[1], beams[2]], axis=1)
-        return to_blocks(self._plant, np.stack(origins, axis=1), ways, self._config.max_range + 0.1)
+        return to_blocks(self._plant, np.stack(origins, axis=1), ways, reach + 0.1)
 
 
 class RigidEchoes:

@@ -17,7 +17,8 @@ from monstertruck_estimation.vision.lens import BoardPose, Lens, board_pose
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
-from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
+from monstertruck_schemas.sensor import LaserScan
+from monstertruckd.tools.calibrate.beams import bearings_of, stacked_ranges
 
 HOLD: Final = round(0.7 * SECOND)
 """Time for which the board is held still, ns."""
@@ -72,9 +73,7 @@ def of_scans(scans: Sequence[LaserScan]) -> tuple[Array, Array]:
     """Angles of the beams, rad, and medians of their ranges, m; empty where there are too few."""
     if len(scans) < LEAST_SCANS:
         return np.empty(0), np.empty(0)
-    ranges = np.array([np.where(s.codes == VALID_BEAM, s.ranges, np.inf) for s in scans])
-    angles = scans[0].start_angle + scans[0].angle_increment * np.arange(ranges.shape[1], dtype=np.float64)
-    return angles, np.median(ranges, axis=0)
+    return bearings_of(scans[0]), np.median(stacked_ranges(scans, np.inf), axis=0)
 
 
 @dataclass

@@ -20,6 +20,7 @@ import numpy as np
 from monstertruck_estimation.slam.motion import find_offset
 from monstertruck_estimation.slam.registration import Cloud, register
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, prepare
+from monstertruck_kinematics.beams import nearest_beams
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import Array, sinc
 from monstertruck_kinematics.fitting import FitResult, least_squares
@@ -31,6 +32,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruckd.config.calibration import Estimate, Result, WizardName
 from monstertruckd.config.wizards import LIDAR
+from monstertruckd.tools.calibrate.beams import stacked_ranges
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import AXLES, EYE
 from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep, Number
@@ -384,7 +386,7 @@ def resting_scan(scans: Sequence[LaserScan]) -> Scan:
     """
     if len(scans) < LEAST_SCANS:
         raise InputError(f"only {len(scans)} scans at rest: expected {LEAST_SCANS} at each end")
-    ranges = np.array([np.where(s.codes == VALID_BEAM, s.ranges, np.nan) for s in scans])
+    ranges = stacked_ranges(scans, np.nan)
     counts = np.isfinite(ranges).sum(axis=0)
     sums = np.where(np.isfinite(ranges), ranges, 0.0).sum(axis=0)
     spread = np.nanmax(np.where(counts > 0, ranges, 0.0), axis=0) - np.nanmin(np.where(counts > 0, ranges, 0.0), axis=0)
@@ -400,7 +402,7 @@ def beam_distance(scans: Sequence[LaserScan], angle: float) -> float:
     """
     found = []
     for scan in scans:
-        beam = round((angle - scan.start_angle) / scan.angle_increment)
+        beam = int(nearest_beams(np.array([angle]), scan.start_angle, scan.angle_increment)[0])
         near = slice(max(beam - 2, 0), beam + 3)
         found += scan.ranges[near][scan.codes[near] == VALID_BEAM].tolist()
     if not found:

@@ -22,9 +22,10 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import VALID_BEAM, Attitude, LaserScan, StabiliserFeedback
+from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
 from monstertruckd.config.calibration import Estimate, Result, WizardName
 from monstertruckd.config.wizards import STABILISER
+from monstertruckd.tools.calibrate.beams import bearings_of, stacked_ranges
 from monstertruckd.tools.calibrate.lidar import FLAT, HEIGHTS, beam_distance, beam_tilt
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steps import Collect, Confirm
@@ -96,8 +97,7 @@ class RestMeasurement:
         if len(read) < len(joints) / 2:
             raise InputError("a servo of the stabiliser does not answer")
         pitch, roll = np.mean(np.array(read), axis=0).tolist()
-        ranges = np.array([np.where(s.codes == VALID_BEAM, s.ranges, np.inf) for s in scans])
-        angles = scans[0].start_angle + scans[0].angle_increment * np.arange(ranges.shape[1], dtype=np.float64)
+        ranges, angles = stacked_ranges(scans, np.inf), bearings_of(scans[0])
         body = RollPitch(float(np.mean([a.pitch for a in tilts])), float(np.mean([a.roll for a in tilts])))
         return cls(body, RollPitch(pitch, roll), angles, np.median(ranges, axis=0))
 

@@ -136,7 +136,7 @@ def _scan(scan: LaserScan, offset: int) -> Any:
         range_min=scan.range_min,
         range_max=scan.range_max,
         ranges=scan.ranges.astype(np.float32),
-        intensities=np.empty(0, np.float32),
+        intensities=np.empty(0, np.float32) if scan.intensities is None else scan.intensities.astype(np.float32),
     )
 
 

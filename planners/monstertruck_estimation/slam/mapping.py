@@ -436,7 +436,7 @@ class MappingEstimator:
         alone = self.mapper.odometry is not OdometryUse.USED or odom is None
         swept = alone and inputs.time_increment > 0
         again = partial(prepare_input, replace(inputs, odom=None), self.mapper.config.longest) if swept else None
-        period = inputs.time_increment * math.tau / inputs.angle_increment if swept else 0.0
+        period = inputs.time_increment * math.tau / abs(inputs.angle_increment) if swept else 0.0
         step = self.mapper.step(scan, inputs.stamp, odom, again, period)
         if step is None:
             return None

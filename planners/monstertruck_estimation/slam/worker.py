@@ -37,7 +37,7 @@ class SlamWorker:
         self._estimator: Estimator | None = None
         self._witness: KissWitness | None = None
         self._longest = np.inf
-        self._geometry: tuple[float, ...] | None = None
+        self._first: ScanInput | None = None
         self._newest: int | None = None
         self._run = ""
         _warm_up()
@@ -113,12 +113,10 @@ class SlamWorker:
 
     def _refusal(self, scan: ScanInput) -> tuple[ScanLeftOut, str] | tuple[None, None]:
         """Why a scan cannot be used, without and with figures; None if it can."""
-        geometry = (len(scan.ranges), scan.start_angle, scan.angle_increment, *scan.mount)
-        if self._geometry is None:
-            self._geometry = geometry
-        elif geometry != self._geometry:
-            now, before = f"{geometry[0]:g} beams from {geometry[1]:.3f} rad", f"{self._geometry[0]:g}"
-            text = f"{now}, expected {before} beams from {self._geometry[1]:.3f} rad"
+        if self._first is None:
+            self._first = scan
+        elif not _same_field(scan, self._first):
+            text = f"{_field_text(scan)}, expected {_field_text(self._first)}"
             return ScanLeftOut.GEOMETRY, f"{ScanLeftOut.GEOMETRY}: {text}"
         if self._newest is not None and scan.stamp <= self._newest:
             return ScanLeftOut.ORDER, f"{ScanLeftOut.ORDER} ({(scan.stamp - self._newest) / 1e9:+.3f} s)"
@@ -133,6 +131,23 @@ class SlamWorker:
         except (OSError, InputError) as error:
             return None, str(error)
         return str(inputs.save), None
+
+
+def _same_field(scan: ScanInput, other: ScanInput) -> bool:
+    """Whether two scans of one mount begin and end within a beam of each other; their numbers of beams may differ."""
+    width = max(abs(scan.angle_increment), abs(other.angle_increment))
+    ends = zip(_ends(scan), _ends(other), strict=True)
+    return scan.mount == other.mount and all(abs(one - two) <= width for one, two in ends)
+
+
+def _ends(scan: ScanInput) -> tuple[float, float]:
+    """Bearings of the first and of the last beam, rad."""
+    return scan.start_angle, scan.start_angle + scan.angle_increment * (len(scan.ranges) - 1)
+
+
+def _field_text(scan: ScanInput) -> str:
+    first, last = _ends(scan)
+    return f"{len(scan.ranges)} beams from {first:.3f} to {last:.3f} rad"
 
 
 def matcher_of(kind: str) -> ScanMatcher | None:

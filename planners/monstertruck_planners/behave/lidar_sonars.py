@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from monstertruck_kinematics.beams import is_full_turn, nearest_beams
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import points_relative
 from monstertruck_runtime.clock import SECOND, Clock
@@ -71,12 +72,15 @@ def sonars_of(scan: LaserScan, mount: tuple[float, float, float], config: LidarS
         mount[0] + ranges * np.cos(mount[2] + bearings),
         mount[1] + ranges * np.sin(mount[2] + bearings),
     ])  # fmt: skip
-    apart = np.hypot(*np.diff(points, axis=0).T)
-    joined = valid[:-1] & valid[1:] & (apart <= np.maximum(JOINED, JOINED_SHARE * ranges[1:]))
+    around = np.resize(np.arange(len(ranges)), len(ranges) + bool(len(ranges)))  # to the first beam again
+    apart = np.hypot(*np.diff(points[around], axis=0).T)
+    joined = valid & valid[around[1:]] & (apart <= np.maximum(JOINED, JOINED_SHARE * ranges[around[1:]]))
+    if not is_full_turn(len(ranges), scan.angle_increment):
+        joined[-1:] = False
     known = valid | (scan.codes <= NO_ECHO)
     echoes = []
     for name, place in config.sonars.items():
-        found, beam = _cut(points, joined, place)
+        found, beam = _cut(points[around], joined, place)
         if beam is None:
             beam = _beam_towards(scan, mount, place, config.range_max)
         answered = beam is not None and bool(known[beam])
@@ -104,9 +108,9 @@ def _cut(points: Array, joined: NDArray[np.bool_], place: Mount) -> tuple[float,
 def _beam_towards(scan: LaserScan, mount: tuple[float, float, float], place: Mount, reach: float) -> int | None:
     """Number of the lidar's beam to the far end of a sonar's axis; None = the lidar does not look there."""
     x, y = place.x + reach * math.cos(place.yaw) - mount[0], place.y + reach * math.sin(place.yaw) - mount[1]
-    bearing = math.remainder(math.atan2(y, x) - mount[2], math.tau)
-    beam = round((bearing - scan.start_angle) / scan.angle_increment) if scan.angle_increment else -1
-    return beam if 0 <= beam < len(scan.ranges) else None
+    bearing = np.array([math.atan2(y, x) - mount[2]])
+    beam = int(nearest_beams(bearing, scan.start_angle, scan.angle_increment)[0])
+    return beam if beam < len(scan.ranges) else None
 
 
 class LidarSonars:

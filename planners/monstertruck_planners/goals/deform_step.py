@@ -15,6 +15,7 @@ from pydantic import Field
 from scipy.ndimage import binary_dilation
 
 from monstertruck_estimation.slam.grid import trace
+from monstertruck_kinematics.beams import nearest_beams
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_relative, poses_relative
 from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, scan_points_at
@@ -315,9 +316,7 @@ def blind_beams(scan: LaserScan) -> NDArray[np.intp]:
 
 def _beams(points: Array, scan: LaserScan) -> NDArray[np.intp]:
     """Beam towards each point, shape (n, 2), in the lidar's frame."""
-    bearings, step = np.arctan2(points[:, 1], points[:, 0]), scan.angle_increment
-    turn = np.remainder((bearings - scan.start_angle) * math.copysign(1.0, step), 2 * math.pi)
-    return np.asarray(np.rint(turn / abs(step)), np.intp)
+    return nearest_beams(np.arctan2(points[:, 1], points[:, 0]), scan.start_angle, scan.angle_increment)
 
 
 class DeformingWorker(DeformStep):

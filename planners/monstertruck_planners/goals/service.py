@@ -359,7 +359,7 @@ class GoalService:
         at, pose = min(self._trail, key=lambda kept: abs(kept[0] - grid.stamp))
         if abs(at - grid.stamp) > (1.0 / self._config.rate + ODOMETRY.fresh_for()) * SECOND:
             return None
-        return SeenGround(grid, pose, (scan.start_angle, scan.end_angle), scan.range_max)
+        return SeenGround(grid, pose, scan.field, scan.range_max)
 
     def _scan(self, odometry: Odometry, now: int) -> Array:
         """Returns of the newest scan in base as it is now; none if it is old or tilted."""

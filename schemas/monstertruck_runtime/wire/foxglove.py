@@ -153,6 +153,8 @@ def _write_scan(scan: LaserScan, proto: Any) -> None:
     proto.range_max = scan.range_max
     proto.ranges = scan.ranges.tobytes()
     proto.codes = scan.codes.tobytes()
+    if scan.intensities is not None:
+        proto.intensities = scan.intensities.astype(np.float64).tobytes()
     if scan.tilt is not None:
         proto.tilt = _packed(scan.tilt)
 
@@ -168,6 +170,7 @@ def _read_scan(proto: Any) -> _Fields:
         "range_max": proto.range_max,
         "ranges": _array(proto.ranges),
         "codes": np.frombuffer(proto.codes, np.uint8),
+        "intensities": _array(proto.intensities).astype(np.uint8) if proto.intensities else None,
         "tilt": _unpacked(proto.tilt, 1)[0] if proto.tilt else None,
     }
 

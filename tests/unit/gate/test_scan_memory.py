@@ -257,6 +257,43 @@ def test_scans_of_different_geometry_are_remembered_each_by_its_own():
     assert remembered.seen(there).tolist() == [True, True, False, True, True, False]
 
 
+@pytest.mark.parametrize("turn", [math.radians(240), math.tau - math.tau / 181])
+def test_scans_of_lidars_that_turn_the_other_way_are_remembered_as_well(turn):
+    there = np.column_stack((np.tile(np.linspace(-1.5, 1.5, 13), 13), np.repeat(np.linspace(-1.5, 1.5, 13), 13)))
+    found = []
+    for sense in (1, -1):
+        remembered = ScanMemory(FOOTPRINT, MOUNT, 2.0, 30.0)
+        ranges = 1.0 + 0.4 * np.sin(2 * np.linspace(-turn / 2, turn / 2, 181) * sense)
+        message = scan(SECOND).model_copy(
+            update={
+                "start_angle": -sense * turn / 2, "end_angle": sense * turn / 2, "ranges": ranges,
+                "codes": np.full(181, 255, np.uint8),
+            }
+        )  # fmt: skip
+        remembered.observe(message, points_of(message))
+        drive(remembered, 0.3)
+        later = message.model_copy(update={"stamp": 3 * SECOND, "ranges": ranges + 0.5})
+        remembered.observe(later, np.empty((0, 2)))
+        found.append((remembered.seen(there), remembered.points()))
+    (seen_one, points), (seen_other, others) = found
+    assert seen_one.tolist() == seen_other.tolist()
+    assert seen_one.any()
+    assert (len(points) == 0) is (turn > 6.0), "a full turn has no edge beyond which it does not look"
+    assert len(points) == pytest.approx(len(others), abs=2)
+    if len(points):
+        assert np.hypot(*(points[:, None] - others[None]).transpose(2, 0, 1)).min(axis=1).max() < 0.04
+
+
+def test_a_varying_number_of_beams_does_not_make_another_place():
+    here, fewer = wall(SECOND, 2.0), wall(SECOND, 2.0)
+    bearings = np.linspace(0, 681, 640).round().astype(int)
+    fewer = fewer.model_copy(update={"ranges": fewer.ranges[bearings], "codes": fewer.codes[bearings]})
+    nothing = here.model_copy(update={"ranges": np.empty(0), "codes": np.empty(0, np.uint8)})
+    assert not elsewhere(here, fewer)
+    assert not elsewhere(fewer, here)
+    assert not elsewhere(here, nothing), "a scan that says nothing"
+
+
 def test_of_an_outline_points_are_remembered_that_are_two_centimetres_apart():
     wall = np.column_stack((np.linspace(0.0, 1.0, 501), np.full(501, 0.5)))
     post = np.array([(0.5, 0.3)])

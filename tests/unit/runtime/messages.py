@@ -65,6 +65,7 @@ scans = st.integers(0, 20).flatmap(
         range_max=positive,
         ranges=doubles(n),
         codes=hnp.arrays(np.uint8, n),
+        intensities=st.none() | hnp.arrays(np.uint8, n) if n else st.none(),
         tilt=st.none() | st.floats(0, 2),
     )
 )

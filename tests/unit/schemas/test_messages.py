@@ -32,6 +32,13 @@ def scan(ranges: np.ndarray, **changes: object) -> LaserScan:
     return LaserScan(**HEADER, frame="lidar", **(values | changes))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("start", "end", "step"), [(-2.0, 2.0, 2.0), (2.0, -2.0, -2.0)])
+def test_a_scan_says_which_way_its_lidar_turns(start: float, end: float, step: float):
+    message = scan(np.ones(3), start_angle=start, end_angle=end)
+    assert message.angle_increment == step
+    assert message.field == (-2.0, 2.0)
+
+
 def odometry(**changes: object) -> Odometry:
     values: dict[str, object] = {
         "pose": Pose2D(x=1.0, y=2.0, yaw=0.5),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.slam.scans import Scan, ScanGeometry, downsample_indices, prepare
-from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, ranges
+from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, box, ranges
 
 FAN = ScanGeometry(-math.pi / 2, math.pi / 180, 0.1, 30.0)
 
@@ -60,6 +60,25 @@ def test_motion_during_the_scan_is_undone():
         return np.percentile(gap, 90)
 
     assert off(prepare(values, moving, twist)) < 0.5 * off(prepare(values, moving))
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+@pytest.mark.parametrize("rate", [1.0, -1.0])
+def test_a_turn_of_one_radian_a_second_displaces_no_point_of_a_full_revolution(sense, rate):
+    """At 3 m, of a lidar ahead of the centre that turns ten times a second either way."""
+    count, beam_time = 450, 0.1 / 450
+    start = -sense * math.pi
+    geometry = ScanGeometry(start, sense * math.tau / count, 0.02, 12.0, beam_time, (0.14, 0.0, 0.0))
+    turns = rate * beam_time * np.arange(count)
+    poses = np.column_stack((np.zeros(count), np.zeros(count), turns))
+    walls = box(-3.0, -3.0, 3.0, 3.0)
+
+    def off(twist):
+        points = prepare(ranges(walls, poses, geometry, count), geometry, twist).points
+        return np.abs(np.abs(points).max(axis=1) - 3.0).max()
+
+    assert off((0.0, 0.0, rate)) < 1e-6
+    assert off((0.0, 0.0, 0.0)) > 0.1
 
 
 def test_pruning_keeps_one_point_per_square_and_no_more_than_asked():

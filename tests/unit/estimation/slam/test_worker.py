@@ -175,6 +175,19 @@ def test_bad_scans_are_left_out_with_a_reason_and_nothing_jumps(kind: str):
     assert np.hypot(*(np.array(after.estimate.pose[:2]) - pose_at(21)[:2])) < 0.05
 
 
+def test_scans_with_a_few_beams_more_or_less_are_matched():
+    worker, rng = SlamWorker(), np.random.default_rng(3)
+    worker.step(WorkerInput(start=Start(SlamConfig(), tuple(pose_at(0).tolist()))))
+    for i in range(30):
+        good = scan_at(i, rng)
+        kept = np.linspace(0, len(good.ranges) - 1, len(good.ranges) - i % 5).round().astype(int)
+        increment = good.angle_increment * (len(good.ranges) - 1) / (len(kept) - 1)
+        output = worker.step(WorkerInput(scan=replace(good, ranges=good.ranges[kept], angle_increment=increment)))
+        assert output.refused is None
+    assert output.estimate is not None
+    assert np.hypot(*(np.array(output.estimate.pose[:2]) - pose_at(29)[:2])) < 0.05
+
+
 def test_an_offset_between_wheels_and_scans_is_found_and_none_invented():
     rng = np.random.default_rng(4)
     times = np.arange(0, 20, 0.1)

@@ -40,6 +40,25 @@ def test_they_measure_what_beams_from_their_places_would(yaw):
         assert echo.stamp >= 1000
 
 
+@pytest.mark.parametrize("sense", [1, -1])
+@pytest.mark.parametrize("seam", [0.0, math.pi, 1.0])
+def test_a_lidar_of_a_full_turn_measures_across_its_seam_and_either_way(seam, sense):
+    angles = seam + sense * np.arange(450) * math.tau / 450
+    ranges = np.array([beam(HALL, -0.17, 0.2, a) or math.inf for a in angles])
+    message = scan_at(0.0, 0.0, 0.0).model_copy(
+        update={
+            "start_angle": angles[0],
+            "end_angle": angles[-1],
+            "ranges": ranges,
+            "codes": np.full(450, VALID_BEAM, np.uint8),
+        }
+    )
+    config = LidarSonarsConfig()
+    for echo in sonars_of(message, (0.13, 0.0, 0.0), config):
+        place = config.sonars[echo.name]
+        assert echo.range == pytest.approx(beam(HALL, -0.3 + place.x, 0.2 + place.y, place.yaw), abs=0.003)
+
+
 @pytest.mark.parametrize(("code", "answered"), [(0, True), (7, False)])
 def test_beams_without_an_echo_are_free_and_beams_with_an_error_are_no_answer(code, answered):
     echoes = sonars_of(scan_at(0.0, 0.0, 0.0, codes=code), MOUNT, LidarSonarsConfig())

@@ -100,7 +100,7 @@ def test_the_ground_seen_moves_with_a_pose_that_jumps_and_is_not_placed_by_a_lat
     service._scan = lambda *_: np.empty((0, 2))
     pose, seen, scan = (SimpleNamespace(latest=None) for _ in range(3))
     service._in = SimpleNamespace(pose=pose, seen=seen, scan=scan)
-    scan.latest = SimpleNamespace(start_angle=-2.0, end_angle=2.0, range_max=4.0)
+    scan.latest = SimpleNamespace(field=(-2.0, 2.0), range_max=4.0)
 
     def at(tick: int, x: float) -> None:
         now = 10 * SECOND + tick * SECOND // 10

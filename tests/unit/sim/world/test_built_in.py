@@ -138,7 +138,7 @@ def test_bad_worlds_are_refused(config, match):
         (SimTruckConfig, {"length": 0.3}, "wheelbase"),
         (SimTruckConfig, {"rear_servo": ServoModelConfig(channel=1)}, "share channel 1"),
         (LidarConfig, {"first_step": 700, "last_step": 44}, "first_step 700"),
-        (LidarConfig, {"min_range": 6.0}, "min_range"),
+        (LidarConfig, {"min_range": 6.0, "max_range": 5.6}, "min_range"),
         (WorldConfig, {"gravity": 1.6}, "gravity"),
     ],
 )

@@ -5,6 +5,7 @@ from math import degrees, pi, radians
 import numpy as np
 import pytest
 
+from monstertruck_drivers.emulation import RangeSheet
 from monstertruck_schemas.base import Pose2D
 from monstertruck_sim.world.config import (
     BatteryModelConfig,
@@ -282,3 +283,27 @@ def test_current_and_analog_noise(field):
     assert np.std(currents) == pytest.approx(10, rel=0.2)
     assert np.std(volts) == pytest.approx(0.003, rel=0.2)
     assert driver.world.motors[0].reading(driver.now).current_ma == currents[-1]  # the same instant, the same draw
+
+
+def test_beams_of_any_scanner_meet_the_room_and_keep_to_its_data_sheet(field):
+    driver = field(walls=WALLS)
+    bearings = np.linspace(np.pi, -np.pi, 500)
+    times = driver.now + np.arange(500) * 200_000
+    reach = RangeSheet(0.02, 2.3, 0.03, 0.01)
+    ranges = driver.world.lidar.beams(bearings, times, reach)
+    c, s = np.cos(bearings), np.sin(bearings)
+    true = np.minimum((np.where(c > 0, 2, -2) - 0.14) / c, np.where(s > 0, 2, -2) / np.where(s == 0, 1e-12, s))
+    np.testing.assert_allclose(ranges, np.where(true <= 2.3, true, np.inf), atol=1e-6)
+
+
+def test_the_errors_of_beams_are_those_of_the_data_sheet():
+    config = WorldConfig(map="workshop", lidar=LidarConfig(dropout=0.1, max_range=8.0))
+    noisy, exact = World(config, 1), World(config.model_copy(update={"noise": False}), 1)
+    bearings, times = np.linspace(-np.pi, np.pi, 400), 10**9 + np.arange(400) * 10_000
+    sheet = RangeSheet(0.02, 30.0, 0.04, 0.0)
+    first, again, true = (world.lidar.beams(bearings, times, sheet) for world in (noisy, noisy, exact))
+    np.testing.assert_array_equal(first, again)
+    assert (true[np.isfinite(true)] <= 8.0).all()
+    off = (first - true)[np.isfinite(true) & np.isfinite(first)]
+    assert off.std() == pytest.approx(0.02, rel=0.2)
+    assert np.isnan(first).mean() == pytest.approx(0.1, abs=0.04)

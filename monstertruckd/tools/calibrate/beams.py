@@ -1,0 +1,35 @@
+"""Ranges of several scans, beam by beam."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from monstertruck_kinematics.beams import nearest_beams
+from monstertruck_kinematics.elementary import Array
+from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
+
+
+def bearings_of(scan: LaserScan) -> Array:
+    """Bearings of its beams, shape (n,), rad."""
+    return scan.start_angle + scan.angle_increment * np.arange(len(scan.ranges), dtype=np.float64)
+
+
+def stacked_ranges(scans: Sequence[LaserScan], missing: float) -> Array:
+    """Ranges along the beams of the first scan, m.
+
+    Args:
+        scans: at least one; their numbers of beams may differ.
+        missing: what stands for a beam without a range.
+
+    Returns:
+        Shape (number of scans, beams of the first one).
+    """
+    bearings = bearings_of(scans[0])
+    return np.array([_along(bearings, scan, missing) for scan in scans])
+
+
+def _along(bearings: Array, scan: LaserScan, missing: float) -> Array:
+    """Ranges of the beams nearest to the bearings (n,), m."""
+    measured = np.where(scan.codes == VALID_BEAM, scan.ranges, missing)
+    beams = nearest_beams(bearings, scan.start_angle, scan.angle_increment)
+    return np.append(measured, missing)[np.minimum(beams, len(measured))]

@@ -1,0 +1,31 @@
+"""Beams of a scanner by their directions: equally spaced, clockwise or counter-clockwise, up to a full turn."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.elementary import Array
+
+
+def nearest_beams(bearings: NDArray[np.floating], start: float | Array, step: float | Array) -> NDArray[np.intp]:
+    """Number of the beam nearest to each bearing; not less than the number of beams where none looks there.
+
+    Args:
+        bearings: shape (n,) or (m, n), rad.
+        start: bearing of the first beam, or of m scans' first beams (m, 1), rad.
+        step: angle from each beam to the next, negative clockwise, rad; as ``start``. 0: there is a single beam, the
+            nearest one to all bearings.
+
+    Returns:
+        As ``bearings``, never negative.
+    """
+    sense = np.where(np.less(step, 0.0), -1.0, 1.0)
+    width = np.where(np.equal(step, 0.0), math.tau, np.abs(step))
+    turned = np.remainder((bearings - start) * sense + width / 2, math.tau) - width / 2
+    return np.maximum(np.rint(turned / width), 0.0).astype(np.intp)
+
+
+def is_full_turn(count: int, step: float) -> bool:
+    """Whether the last of ``count`` beams, ``step`` rad apart, is the first one's neighbour."""
+    return count > 1 and (count + 0.5) * abs(step) > math.tau
