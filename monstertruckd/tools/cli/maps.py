@@ -4,6 +4,7 @@ import os
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -21,13 +22,14 @@ if TYPE_CHECKING:
     from monstertruck_estimation.slam.worker_io import SlamEstimate, WorkerOutput
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
-    from monstertruckd.tools.logs.scans import LogGeometry, ScanLog
+    from monstertruckd.tools.logs.scan_log import LogGeometry, ScanLog
 
 
 MOST_LOST: Final = 0.1
 """Share of the path that may be lost in a map built with success."""
 LABELS = {
     "log": "kind of log",
+    "sources": "read from",
     "keys": "key scans",
     "closures": "loops closed",
     "rejected": "matches rejected",
@@ -51,10 +53,26 @@ class FrontChoice(StrEnum):
     KISS = "kiss"
 
 
+class PoseFormat(StrEnum):
+    """Formats of trajectories."""
+
+    TUM = "tum"
+    KITTI = "kitti"
+
+
 app = command_group("Build, show, save and use occupancy maps.")
 
-Log = Annotated[Path, typer.Argument(help="MCAP, CARMEN text (.gz), npz or URG text (.dat).", show_default=False)]
+Log = Annotated[
+    Path,
+    typer.Argument(
+        help="MCAP, ROS 1 bag, folder of a ROS 2 bag, CARMEN text (.gz), npz or URG text (.dat).", show_default=False
+    ),
+]
 MapPlace = Annotated[Path, typer.Argument(help="Folder of a saved map, or a map_server YAML.", show_default=False)]
+Topics = Annotated[
+    list[str] | None,
+    typer.Option("--topic", help="Topic of the scans, or of odometry, where a log has several; may be repeated."),
+]
 StartAngle = Annotated[float | None, typer.Option(help="Angle of the first beam, degrees; for npz and CARMEN logs.")]
 AngleIncrement = Annotated[float | None, typer.Option(help="Angle between beams, degrees; the same.")]
 RangeMax = Annotated[float | None, typer.Option(min=0.1, help="Ranges from here on are no returns, m; the same.")]
@@ -64,16 +82,26 @@ LidarMount = Annotated[
 ]
 Trajectory = Annotated[
     Path | None,
-    typer.Option(help="Write poses at the middle of each sweep (TUM); `build` lists lost ones again in NAME.lost.txt."),
+    typer.Option(help="Write poses at the middle of each sweep; `build` lists lost ones again in NAME.lost.txt."),
 ]
+TrajectoryFormat = Annotated[PoseFormat, typer.Option(help="Format of the trajectory.")]
 Png = Annotated[Path | None, typer.Option("--png", help="Draw it.")]
 
 
-def _with_geometry(command: Callable[..., None]) -> Callable[..., None]:
-    """Let a command on a log have the options of its geometry, which it takes as ``geometry``."""
+@dataclass(frozen=True)
+class ReadOptions:
+    """Options for reading a log."""
+
+    geometry: "LogGeometry"
+    topics: tuple[str, ...]
+
+
+def _with_read_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options for reading a log to a command; it receives them as ``options``."""
 
     def run(
         *,
+        topic: Topics = None,
         start_angle: StartAngle = None,
         angle_increment: AngleIncrement = None,
         range_max: RangeMax = None,
@@ -82,7 +110,7 @@ def _with_geometry(command: Callable[..., None]) -> Callable[..., None]:
     ) -> None:
         import math
 
-        from monstertruckd.tools.logs.scans import LogGeometry
+        from monstertruckd.tools.logs.scan_log import LogGeometry
 
         geometry = LogGeometry(
             start_angle=None if start_angle is None else math.radians(start_angle),
@@ -90,13 +118,13 @@ def _with_geometry(command: Callable[..., None]) -> Callable[..., None]:
             range_max=range_max,
             mount=None if mount is None else (mount[0], mount[1], math.radians(mount[2])),
         )
-        command(geometry=geometry, **own)
+        command(options=ReadOptions(geometry, tuple(topic or ())), **own)
 
-    return with_parameters(run, command, run, without=("geometry",))
+    return with_parameters(run, command, run, without=("options",))
 
 
 @app.command("build")
-@_with_geometry
+@_with_read_options
 @needs_extra("slam")
 def build(
     log: Log,
@@ -104,9 +132,10 @@ def build(
     png: Png = None,
     front: Annotated[FrontChoice, typer.Option(help="Scan matcher.")] = FrontChoice.PLANAR,
     trajectory: Trajectory = None,
+    trajectory_format: TrajectoryFormat = PoseFormat.TUM,
     json_output: JsonOption = False,
     *,
-    geometry: "LogGeometry",
+    options: ReadOptions,
 ) -> None:
     """Build a map from a log's scans, and its odometry if it has any.
 
@@ -118,9 +147,9 @@ def build(
     from monstertruck_runtime.errors import InputError
     from monstertruck_schemas.reasons import Reason
     from monstertruckd.tools.logs.map_quality import PathQuality
-    from monstertruckd.tools.logs.trajectory import write_tum
+    from monstertruckd.tools.logs.trajectory import LINES, write_trajectory
 
-    scans = _read(log, geometry)
+    scans = _read(log, options)
     output.mkdir(parents=True, exist_ok=True)  # minutes before it is needed
     worker = SlamWorker()
     try:
@@ -146,7 +175,9 @@ def build(
     facts["poses"] = "joint registration" if done.joint else "graph"
     facts |= {"map": output, "width_m": columns * done.whole.resolution, "height_m": rows * done.whole.resolution}
     if trajectory is not None:
-        facts["trajectory"] = write_tum(trajectory, *done.trajectory, scans, quality.lost)
+        facts["trajectory"] = write_trajectory(
+            trajectory, *done.trajectory, scans, quality.lost, lines=LINES[trajectory_format]
+        )
     if png is not None:
         _draw(png, _load(output))
     _print(facts, json_output)
@@ -158,10 +189,18 @@ def build(
 
 @app.command("show")
 @needs_extra("slam")
-def show(place: MapPlace, png: Png = None, json_output: JsonOption = False) -> None:
+def show(
+    place: MapPlace,
+    png: Png = None,
+    g2o: Annotated[Path | None, typer.Option(help="Write the pose graph of the keyframes.")] = None,
+    json_output: JsonOption = False,
+) -> None:
     """Show the facts of a saved map."""
+    from monstertruck_estimation.slam.storage import g2o_text
+    from monstertruck_runtime.errors import InputError
     from monstertruck_runtime.map_files import FREE, OCCUPIED
     from monstertruck_runtime.map_folders import YAML, folder_of, opened
+    from monstertruck_runtime.small_files import replace_file
 
     saved = _load(place)
     folder = folder_of(place)
@@ -180,6 +219,11 @@ def show(place: MapPlace, png: Png = None, json_output: JsonOption = False) -> N
         "relations": 0 if saved.graph is None else len(saved.graph.edges["edge_loop"]),
         "loop_relations": 0 if saved.graph is None else int(saved.graph.edges["edge_loop"].sum()),
     }
+    if g2o is not None:
+        if saved.graph is None:
+            raise InputError(f"{place}: a grid without a pose graph: nothing to write to {g2o}")
+        replace_file(g2o, g2o_text(saved.graph))
+        facts["g2o"] = g2o
     if png is not None:
         _draw(png, saved)
     _print(facts, json_output)
@@ -264,23 +308,24 @@ def _made_by_load(found: Any) -> bool:
 
 
 @app.command("localise")
-@_with_geometry
+@_with_read_options
 @needs_extra("slam")
 def localise(
     log: Log,
     place: MapPlace,
     png: Png = None,
     trajectory: Trajectory = None,
+    trajectory_format: TrajectoryFormat = PoseFormat.TUM,
     json_output: JsonOption = False,
     *,
-    geometry: "LogGeometry",
+    options: ReadOptions,
 ) -> None:
     """Localise a log's scans in a saved map, from an unknown start."""
     from monstertruck_estimation.slam.config import SlamConfig
     from monstertruck_estimation.slam.worker import SlamWorker
-    from monstertruckd.tools.logs.trajectory import write_tum
+    from monstertruckd.tools.logs.trajectory import LINES, write_trajectory
 
-    saved, scans = _load(place), _read(log, geometry)
+    saved, scans = _load(place), _read(log, options)
     facts, estimates = _run(SlamWorker(), scans, SlamConfig(mode="localisation", map=place))
     known = [estimate for estimate in estimates if estimate.status.value in ("localised", "degenerate")]
     facts |= {"map": place, "localised": len(known)}
@@ -290,7 +335,7 @@ def localise(
         facts["last_pose"] = known[-1].pose
     if trajectory is not None:
         stamps, poses = [estimate.stamp for estimate in known], [estimate.pose for estimate in known]
-        facts["trajectory"] = write_tum(trajectory, stamps, poses, scans)
+        facts["trajectory"] = write_trajectory(trajectory, stamps, poses, scans, lines=LINES[trajectory_format])
     if png is not None:
         _draw(png, saved, [estimate.pose for estimate in known])
     _print(facts, json_output)
@@ -307,13 +352,14 @@ def _load(place: Path) -> "SavedMap":
     return saved
 
 
-def _read(path: Path, geometry: "LogGeometry") -> "ScanLog":
+def _read(path: Path, options: ReadOptions) -> "ScanLog":
     """Read a log; what is assumed of its geometry is remarked on."""
     import math
 
-    from monstertruckd.tools.logs.scans import read_scans
+    with needs_extra("logs"):
+        from monstertruckd.tools.logs.scans import read_scans
 
-    log = read_scans(path, geometry)
+        log = read_scans(path, options.geometry, options.topics)
     if log.assumed:
         scan = log.scans[0]
         first, step = math.degrees(scan.start_angle), math.degrees(scan.angle_increment)
@@ -358,6 +404,7 @@ def _run(worker: Any, log: "ScanLog", config: Any) -> tuple[dict[str, Any], list
     offsets = [estimate.offset for estimate in estimates if estimate.offset is not None]
     facts: dict[str, Any] = {
         "log": log.make,
+        **({"sources": log.sources} if log.sources else {}),
         "seconds": (log.scans[-1].stamp - log.scans[0].stamp) / 1e9,
         **counts,
         "rejected_by": verdicts(estimates),

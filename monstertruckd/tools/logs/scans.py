@@ -1,8 +1,8 @@
-"""Scans with odometry from logs of several formats: our MCAP, CARMEN text, arrays in npz, URG text."""
+"""Scans with odometry from logs of several formats: our MCAP, MCAP and bags by others, CARMEN, npz, URG text."""
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,137 +11,146 @@ import numpy as np
 from monstertruck_drivers.hokuyo_urg.recording import RecordedRanges
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2, between, interpolate
+from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.outside import arrays as arrays_of
-from monstertruck_runtime.outside import lines_of, reading
+from monstertruck_runtime.outside import reading
 from monstertruck_runtime.small_files import require_file
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.state import Odometry
+from monstertruck_schemas.topics import ODOMETRY, SCAN
 from monstertruckd.recorder.frames import MAGIC
 from monstertruckd.recorder.reader import LogReader, open_log
+from monstertruckd.tools.logs.bag_scans import scans_of
+from monstertruckd.tools.logs.bags import content_of, mcap_messages
+from monstertruckd.tools.logs.carmen import read_carmen
+from monstertruckd.tools.logs.scan_log import (
+    BEGIN,
+    LogGeometry,
+    OdometryLog,
+    ScanLog,
+    half_turn,
+    missing,
+    no_return,
+    vector,
+)
 
-BEGIN: Final = SECOND
-"""Stamp of the first scan of a log with times of another origin, ns."""
-LONGEST_RANGE: Final = 80.0
-"""Ranges from here on are no-returns of the lasers that CARMEN logs come from, m."""
-SHORTEST_RANGE: Final = 0.02
 LONGEST_LOG: Final = 1e9
 """A longer npz log has other units than seconds, s."""
-NO_RETURN_SHARE: Final = 0.001
-"""The greatest range of an npz log means no return if at least this share of its beams has it."""
 URG_STEP: Final = math.tau / 1024
 URG_ERRORS: Final = 0.02
 """Shorter readings of a URG are error codes, m."""
 URG_RANGE: Final = 5.6
 URG_AHEAD: Final = 341
 """Beam of a URG recording that looks straight ahead."""
+BAG: Final = b"#ROSBAG V"
+DATABASE: Final = b"SQLite format 3\0"
+METADATA: Final = "metadata.yaml"
+"""File that makes a folder a bag of ROS 2."""
+OWN_FIELD: Final = b"codes"
+"""Name of a field of our scans that those of others do not have."""
+STRANGERS: Final = {
+    b"version https://git-lfs": "a git-LFS pointer, not the file itself: fetch it with `git lfs pull`",
+    b"\x1f\x8b": "packed by gzip: unpack it first (CARMEN and URG text may stay packed as NAME.gz)",
+    b"BZh": "packed by bzip2: unpack it first",
+    b"\xfd7zXZ": "packed by xz: unpack it first",
+    b"\x28\xb5\x2f\xfd": "packed by zstd: unpack it first",
+    b"7z\xbc\xaf": "a 7z archive: unpack it first",
+}
+"""Formats that are refused by name, by their first bytes."""
+EXPECTED: Final = "MCAP, a ROS bag, CARMEN text, npz or URG text"
 
 
-@dataclass(frozen=True, slots=True)
-class LogGeometry:
-    """Geometry of the scans of a log that does not hold it (npz, CARMEN); None = as in the log, or assumed."""
-
-    start_angle: float | None = None
-    """Angle of the first beam, rad, counter-clockwise from ahead."""
-    angle_increment: float | None = None
-    """Angle between neighbouring beams, rad."""
-    range_min: float | None = None
-    """Shorter ranges are no returns, m."""
-    range_max: float | None = None
-    """Ranges from here on are no returns, m."""
-    time_increment: float | None = None
-    """Seconds between neighbouring beams."""
-    mount: Pose2 | None = None
-    """Planar pose of the sensor in base, m and rad."""
-
-    @property
-    def known(self) -> dict[str, Any]:
-        """Fields that are not None."""
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return {name: value for name, value in values.items() if value is not None}
-
-
-@dataclass(frozen=True, slots=True)
-class ScanLog:
-    """A log's scans, in order."""
-
-    make: str
-    scans: list[ScanInput]
-    begin: float = 0.0
-    """Time of the log's own clock that is stamp 0 here, s."""
-    assumed: tuple[str, ...] = field(default=())
-    """Parts of the geometry that neither the log nor the caller gave."""
-    fault: str | None = None
-    """What is wrong with the file, whose end is missing perhaps."""
-
-
-def read_scans(path: Path, geometry: LogGeometry | None = None) -> ScanLog:
+def read_scans(path: Path, geometry: LogGeometry | None = None, topics: tuple[str, ...] = ()) -> ScanLog:
     """Read any log with scans.
 
     Args:
-        path: the log.
-        geometry: of a log that does not hold it; it overrides what an npz log says.
+        path: the log; of ROS 2, its folder.
+        geometry: of a log that does not hold it; it overrides what an npz log or a bag says.
+        topics: of scans and odometry, for logs that have several; of a CARMEN log the word that its lines begin with.
 
     Raises:
         NotFoundError: no such file.
-        InputError: it is of no known format, damaged, has no scans, or brings the geometry that was given.
+        InputError: it is of no known format, damaged, has no scans, or brings the geometry or topics that were given.
     """
+    given = {} if geometry is None else geometry.known
+    if path.is_dir():
+        if not (path / METADATA).is_file():
+            raise InputError(f"{path}: a folder without {METADATA}: expected a ROS 2 bag, or one log")
+        return _checked(path, _bag(path, 2, given, topics), given, topics)
     try:
         require_file(path)
         with path.open("rb") as file:
-            head = file.read(16)
+            head = file.read(32)
     except FileNotFoundError:
         raise NotFoundError(f"{path}: no such log") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    given = {} if geometry is None else geometry.known
     with reading(path, "a log with scans"):
-        return _read(path, head, given)
+        return _checked(path, _read(path, head, given, topics), given, topics)
 
 
-def _read(path: Path, head: bytes, given: dict[str, Any]) -> ScanLog:
-    if head.startswith(MAGIC):
-        reader = open_log(path)
-        log = ScanLog("mcap", list(_mcap(reader)), fault=reader.fault)
-    elif head.startswith(b"PK"):
-        log = _arrays(path, given)
-    elif path.name.removesuffix(".gz").endswith(".dat"):
-        log = ScanLog("urg", list(_urg(path)), -BEGIN / SECOND)
-    else:
-        log = _carmen(path, given)
+def _checked(path: Path, log: ScanLog, given: dict[str, Any], topics: tuple[str, ...]) -> ScanLog:
     if not log.scans:
-        raise InputError(f"{path}: no scans: expected MCAP with sensor/scan, CARMEN text, npz or URG text")
+        raise InputError(f"{path}: no scans: expected {EXPECTED}")
     if given and log.make in ("mcap", "urg"):
         raise InputError(f"{path}: {next(iter(given))}: a log of this format ({log.make}) brings its geometry")
+    if topics and not log.sources:
+        raise InputError(f"{path}: {topics[0]}: a log of this format ({log.make}) has no topics to choose")
     return log
 
 
-def _mcap(reader: LogReader) -> Iterator[ScanInput]:
+def _read(path: Path, head: bytes, given: dict[str, Any], topics: tuple[str, ...]) -> ScanLog:
+    if head.startswith(MAGIC):
+        return _mcap(path, given, topics)
+    if head.startswith((BAG, DATABASE)):
+        return _bag(path, 1 if head.startswith(BAG) else 2, given, topics)
+    if head.startswith(b"PK"):
+        return _arrays(path, given)
+    for begin, text in STRANGERS.items():
+        if head.startswith(begin) and not (path.suffix == ".gz" and begin == b"\x1f\x8b"):
+            raise InputError(f"{path}: {text}")
+    if path.name.removesuffix(".gz").endswith(".dat"):
+        return ScanLog("urg", list(_urg(path)), -BEGIN / SECOND)
+    return read_carmen(path, given, topics)
+
+
+def _bag(path: Path, version: int, given: dict[str, Any], topics: tuple[str, ...]) -> ScanLog:
+    from monstertruckd.tools.logs.ros_bags import ros_messages  # noqa: PLC0415 - comes with an extra
+
+    content = content_of(path, ros_messages(path, version))
+    return scans_of(path, f"bag of ROS {version}", content, given, topics)
+
+
+def _mcap(path: Path, given: dict[str, Any], topics: tuple[str, ...]) -> ScanLog:
+    """A log of ours, or by others; ``topics`` are of the latter."""
+    reader = open_log(path)
+    if not topics and (scans := list(_own(reader))):
+        return ScanLog("mcap", scans, fault=reader.fault)
+    content = content_of(path, mcap_messages(reader.records()))
+    log = scans_of(path, "mcap by others", content, given, topics)
+    return replace(log, fault=reader.fault)
+
+
+def _own(reader: LogReader) -> Iterator[ScanInput]:
+    """Scans of a log of ours; none of others' logs."""
+    scans: list[LaserScan] = []
+    rows: list[tuple[int, float, float, float]] = []
+    for raw in mcap_messages(reader.records()):
+        if (raw.topic, raw.schema) == (SCAN.name, SCAN.schema_name) and OWN_FIELD in raw.definition:
+            scans.append(wire.decode(SCAN, raw.data))
+        elif (raw.topic, raw.schema) == (ODOMETRY.name, ODOMETRY.schema_name):
+            content = wire.decode(ODOMETRY, raw.data)
+            rows.append((content.stamp, content.pose.x, content.pose.y, content.pose.yaw))
+    if not scans:
+        return
     lidar = (reader.config().get("devices") or {}).get("lidar") or {}
     at = lidar.get("mount") or {}
     mount = (float(at.get("x", 0.0)), float(at.get("y", 0.0)), float(at.get("yaw", 0.0)))
-    scans: list[LaserScan] = []
-    rows: list[tuple[int, float, float, float]] = []
-    for message in reader:
-        if message.topic not in ("sensor/scan", "state/odometry"):
-            continue
-        content = message.decode()
-        if isinstance(content, LaserScan):
-            scans.append(content)
-        elif isinstance(content, Odometry):
-            rows.append((content.stamp, content.pose.x, content.pose.y, content.pose.yaw))
-    stamps = np.array([row[0] for row in rows], np.float64)
-    poses = np.array([row[1:] for row in rows]).reshape(-1, 3)
+    stamps = np.array([row[0] for row in rows], np.int64)
+    odometry = OdometryLog(stamps, np.array([row[1:] for row in rows]).reshape(-1, 3))
     for scan in scans:
-        end = scan.stamp + scan.time_increment * len(scan.ranges) * SECOND
-        inputs = ScanInput.of(scan, mount)
-        if len(stamps) and stamps[0] <= scan.stamp <= stamps[-1]:
-            first, last = interpolate(stamps, poses, np.array((scan.stamp, end)))
-            seconds = max((end - scan.stamp) / SECOND, 1e-3)
-            inputs = replace(inputs, odom=_vector(first), twist=_vector(between(first, last) / seconds))
-        yield inputs
+        yield odometry.attached(ScanInput.of(scan, mount))
 
 
 def _arrays(path: Path, given: dict[str, Any]) -> ScanLog:
@@ -162,18 +171,18 @@ def _arrays(path: Path, given: dict[str, Any]) -> ScanLog:
         raise InputError(f"{path}: ranges: expected metres, got no finite value above 0")
     shapes: dict[str, tuple[int, ...]] = {item.name: () for item in fields(LogGeometry)} | {"mount": (3,)}
     own = {name: _array(path, arrays, name, shape) for name, shape in shapes.items() if name in arrays}
-    known = {name: _vector(value) if name == "mount" else float(value) for name, value in own.items()} | given
+    known = {name: vector(value) if name == "mount" else float(value) for name, value in own.items()} | given
     _check(path, known)
     scans = [
-        _sick(
+        half_turn(
             BEGIN + round((time - float(times[0])) * SECOND),
             row,
-            None if odom is None or not np.isfinite(odom[i]).all() else _vector(odom[i]),
-            {"range_max": _no_return(ranges)} | known,
+            None if odom is None or not np.isfinite(odom[i]).all() else vector(odom[i]),
+            {"range_max": no_return(ranges)} | known,
         )
         for i, (time, row) in enumerate(zip(times.tolist(), ranges, strict=True))
     ]
-    return ScanLog("npz", scans, float(times[0]) - BEGIN / SECOND, _missing(known))
+    return ScanLog("npz", scans, float(times[0]) - BEGIN / SECOND, missing(known))
 
 
 def _array(path: Path, arrays: dict[str, Any], name: str, shape: tuple[int, ...]) -> Array:
@@ -195,51 +204,6 @@ def _check(path: Path, geometry: dict[str, Any]) -> None:
             raise InputError(f"{path}: {name}: expected {wanted}, got {value}")
 
 
-def _no_return(ranges: Array) -> float:
-    """The range from which on there was no return: a greatest one that recurs, or infinity."""
-    finite = ranges[np.isfinite(ranges)]
-    greatest = float(finite.max())
-    recurs = np.count_nonzero(finite == greatest) >= max(NO_RETURN_SHARE * finite.size, 3)
-    return min(greatest if recurs else math.inf, LONGEST_RANGE)
-
-
-def _missing(known: dict[str, Any]) -> tuple[str, ...]:
-    return tuple(item.name for item in fields(LogGeometry) if item.name not in known)
-
-
-def _carmen(path: Path, given: dict[str, Any]) -> ScanLog:
-    _check(path, given)
-    begin: float | None = None
-    scans: list[ScanInput] = []
-    for number, line in enumerate(lines_of(path, "a log with scans (MCAP, npz or text)"), start=1):
-        words = line.split()
-        if not words or words[0] != "FLASER":
-            continue
-        with reading(f"{path}:{number}", "FLASER n, n ranges, 6 numbers, time"):
-            count = int(words[1])
-            if not 0 <= count <= len(words):
-                raise ValueError(f"{count} ranges")
-            ranges = np.array(words[2 : 2 + count], np.float64)
-            rest = words[2 + count :]
-            odom = (float(rest[3]), float(rest[4]), float(rest[5]))
-            time = float(rest[6])
-            begin = time if begin is None else begin
-            stamp = BEGIN + round((time - begin) * SECOND)
-            scans.append(_sick(stamp, ranges, odom, {"range_max": LONGEST_RANGE} | given))
-    return ScanLog("carmen", scans, (begin or 0.0) - BEGIN / SECOND, _missing(given))
-
-
-def _sick(stamp: int, ranges: Array, odom: Pose2 | None, geometry: dict[str, Any]) -> ScanInput:
-    """A scan of this ``geometry``; by default half a turn ahead: n beams, or n + 1 with both ends."""
-    count = len(ranges)
-    assumed = {
-        "start_angle": -math.pi / 2,
-        "angle_increment": math.pi / max(count - count % 2, 1),
-        "range_min": SHORTEST_RANGE,
-    }
-    return ScanInput(stamp=stamp, ranges=ranges, odom=odom, **(assumed | geometry))
-
-
 def _urg(path: Path) -> Iterator[ScanInput]:
     recording = RecordedRanges.load(path)
     for time, row in zip(recording.times.tolist(), recording.ranges, strict=True):
@@ -253,8 +217,3 @@ def _urg(path: Path) -> Iterator[ScanInput]:
             time_increment=0.1 / 1024,
             mount=(0.145, 0.0, 0.0),
         )
-
-
-def _vector(values: Any) -> Pose2:
-    x, y, yaw = (float(value) for value in values)
-    return x, y, yaw

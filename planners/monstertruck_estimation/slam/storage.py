@@ -95,6 +95,22 @@ def saved_graph(known: KeyframeMap) -> SavedGraph:
     )
 
 
+def g2o_text(graph: SavedGraph) -> str:
+    """The graph as text of g2o: ``VERTEX_SE2`` by number of the keyframe, the first one fixed, and ``EDGE_SE2``."""
+    vertices = [f"VERTEX_SE2 {i} {x:.9g} {y:.9g} {yaw:.9g}" for i, (x, y, yaw) in enumerate(graph.poses.tolist())]
+    corner = np.triu_indices(3)
+    edges = [
+        f"EDGE_SE2 {origin} {target} " + " ".join(f"{value:.9g}" for value in (*measured, *information[corner]))
+        for (origin, target), measured, information in zip(
+            graph.edges["edge_ends"].tolist(),
+            graph.edges["edge_measured"].tolist(),
+            graph.edges["edge_information"],
+            strict=True,
+        )
+    ]
+    return "\n".join([*vertices, "FIX 0", *edges, ""])
+
+
 def trinary(patch: GridPatch) -> WorldMap:
     """Free, occupied, unknown."""
     return WorldMap(patch.cells, patch.resolution, patch.origin).trinary()

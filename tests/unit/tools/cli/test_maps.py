@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+from monstertruck_kinematics.se2 import between
 from monstertruck_runtime.map_files import WorldMap, save_map
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.load import load_truck
 from monstertruckd.tools.cli.main import app
 from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, box, ranges, rounds
+from tests.unit.tools.logs.bag_kit import ROS2, RosMessages, quaternion, stamp, write_ros2
 
+DATA = Path(__file__).parents[3] / "data"
 TRUTH = rounds(60, laps=0.5)
 
 
@@ -96,6 +99,57 @@ def test_lost_poses_are_marked_and_the_exit_code_says_so(log: Path, tmp_path: Pa
     assert len(every) == 150
     assert lost[:, 0] == pytest.approx(every[-len(lost) :, 0]), "from when it was carried on"
     assert CliRunner().invoke(app, ["map", "show", str(tmp_path / "map")]).exit_code == 0
+
+
+def test_a_bag_becomes_a_map_with_a_graph_for_g2o_and_poses_for_kitti(tmp_path: Path):
+    """A map of a log by another program: odometry and mount from the bag."""
+    ros = RosMessages(ROS2)
+    rng = np.random.default_rng(1)
+    rows = []
+    for k, (x, y, yaw) in enumerate(TRUTH.tolist()):
+        at = ros.transform(stamp(k), "odom", "base_link", (x, y), quaternion(yaw=yaw))
+        rows.append(("/tf", stamp(k), ros.make("tf2_msgs/msg/TFMessage", transforms=[at])))
+        scan = ros.scan(stamp(k), ranges(ROOM, TRUTH[k], noise=0.01, rng=rng))
+        scan.angle_min, scan.angle_increment, scan.range_max = LIDAR.start_angle, LIDAR.angle_increment, 5.6
+        scan.header.frame_id, scan.time_increment = "base_link", 0.0
+        rows.append(("/scan", stamp(k), scan))
+    bag, place, poses = write_ros2(tmp_path / "bag", rows), tmp_path / "map", tmp_path / "poses.txt"
+    done = CliRunner().invoke(
+        app,
+        ["map", "build", str(bag), "-o", str(place), "--topic", "/scan", "--trajectory", str(poses),
+         "--trajectory-format", "kitti", "--json"],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    facts = json.loads(done.stdout)
+    assert facts["sources"] == {"scans": "/scan", "odometry": "transforms of base_link"}
+    assert facts["lost_share"] == 0.0
+    assert facts["odometry"]["used"] > 0.9
+    matrices = np.loadtxt(poses).reshape(-1, 3, 4)
+    assert np.hypot(*(matrices[:, :2, 3] - TRUTH[:, :2]).T).max() < 0.05
+    graph = tmp_path / "graph.g2o"
+    assert CliRunner().invoke(app, ["map", "show", str(place), "--g2o", str(graph)]).exit_code == 0
+    lines = [line.split() for line in graph.read_text().splitlines()]
+    vertices = {int(words[1]): [*map(float, words[2:])] for words in lines if words[0] == "VERTEX_SE2"}
+    edges = [words for words in lines if words[0] == "EDGE_SE2"]
+    assert len(edges) >= len(vertices) - 1 > 3
+    for words in edges:
+        measured = between(np.array(vertices[int(words[1])]), np.array(vertices[int(words[2])]))
+        assert measured == pytest.approx([*map(float, words[3:6])], abs=0.02)
+        assert len(words) == 12
+        assert min(float(words[i]) for i in (6, 9, 11)) > 0, "diagonal of the information"
+
+
+def test_a_log_by_another_program_becomes_a_map(tmp_path: Path):
+    log = DATA / "foxglove_scans.mcap"
+    done = CliRunner().invoke(app, ["map", "build", str(log), "-o", str(tmp_path / "map"), "--json"])
+    assert done.exit_code == 0, done.output
+    assert "holds no range_min, range_max, mount" in done.stderr
+    assert json.loads(done.stdout)["scans"] == 50
+    plain = tmp_path / "plain.yaml"
+    save_map(WorldMap(np.zeros((10, 10), np.int8), 0.05), plain)
+    refused = CliRunner().invoke(app, ["map", "show", str(plain), "--g2o", str(tmp_path / "graph.g2o")])
+    assert refused.exit_code == 3
+    assert "a grid without a pose graph" in refused.stderr
 
 
 def test_a_log_whose_scans_all_have_one_stamp_is_lost_by_its_odometry(log: Path, tmp_path: Path):

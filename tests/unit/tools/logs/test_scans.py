@@ -8,7 +8,8 @@ import pytest
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
-from monstertruckd.tools.logs.scans import LogGeometry, read_scans
+from monstertruckd.tools.logs.scan_log import LogGeometry
+from monstertruckd.tools.logs.scans import read_scans
 
 URG = Path(__file__).resolve().parents[3] / "data" / "urg04lx_exp2.dat.gz"
 
@@ -32,6 +33,64 @@ def test_carmen_text(tmp_path: Path):
     assert (scan.ranges < scan.range_max).tolist() == [True, False, True]
 
 
+FLASER = "FLASER 3 1.5 81.9 2.5 9 9 9 {x} 0.2 0.3 {time} host {logged}\n"
+HEAD = "ROBOTLASER1 0 -1.2 2.4 1.2 20.0 0.01 0 3 1.5 20.0 2.5 2 7 8"
+ROBOTLASER = HEAD + " {laser} {x} 0.2 0.0 0.5 0.1 0.2 0.2 0.3 {time} host {logged}\n"
+
+
+def test_carmens_robotlaser_brings_geometry_and_mount(tmp_path: Path):
+    file = tmp_path / "a.log"
+    rows = [ROBOTLASER.format(laser=f"{k + 0.3:.3f} 0.2 0.0", x=k, time=9.0 + k, logged=k) for k in range(4)]
+    file.write_text("".join(rows))
+    log = read_scans(file)
+    assert [scan.odom for scan in log.scans] == [(float(k), 0.2, 0.0) for k in range(4)]
+    scan = log.scans[0]
+    assert scan.mount == pytest.approx((0.3, 0.0, 0.0))
+    assert len({one.mount for one in log.scans}) == 1, "or the scans would be of different geometries"
+    assert (scan.start_angle, scan.angle_increment, scan.range_max) == (-1.2, 1.2, 20.0)
+    assert (scan.ranges < scan.range_max).tolist() == [True, False, True]
+    assert log.assumed == ("range_min", "time_increment")
+    file.write_text("".join(rows) + FLASER.format(x=1.0, time=9.0, logged=1.0))
+    assert len(read_scans(file).scans) == 4
+    assert len(read_scans(file, topics=("FLASER",)).scans) == 1
+    with pytest.raises(InputError, match="no lines RLASER; lines with scans: ROBOTLASER1, FLASER"):
+        read_scans(file, topics=("RLASER",))
+    moved = [ROBOTLASER.format(laser=f"{2 * k} 0.2 0.0", x=k, time=9.0 + k, logged=k) for k in range(4)]
+    file.write_text("".join(moved))
+    assert "mount" in read_scans(file).assumed
+
+
+def seconds(log) -> list[float]:
+    return [(scan.stamp - log.scans[0].stamp) / SECOND for scan in log.scans]
+
+
+def test_carmen_with_coarse_stamps_takes_the_loggers_times(tmp_path: Path):
+    """A time of day printed with ten digits too few is the same in every line."""
+    file = tmp_path / "a.log"
+    file.write_text("".join(FLASER.format(x=k, time="1.08442e+09", logged=0.25 * k) for k in range(9)))
+    log = read_scans(file)
+    assert seconds(log) == pytest.approx([0.25 * k for k in range(9)])
+    assert log.sources == {"scans": "FLASER", "times": "logger"}
+    file.write_text("".join(FLASER.format(x=k, time=f"{0.2 * k:.6f}", logged=int(0.2 * k)) for k in range(9)))
+    assert seconds(read_scans(file)) == pytest.approx([0.2 * k for k in range(9)])
+
+
+def test_scans_of_one_second_are_spread_over_it(tmp_path: Path):
+    file = tmp_path / "a.log"
+    file.write_text("".join(FLASER.format(x=k, time=5 + k // 4, logged=5 + k // 4) for k in range(10)))
+    assert seconds(read_scans(file)) == pytest.approx([0.25 * k for k in range(10)])
+    file.write_text("".join(FLASER.format(x=k, time=5, logged=5) for k in range(10)))
+    with pytest.raises(InputError, match=r"a\.log: expected times that rise: all 10 scans have one time"):
+        read_scans(file)
+
+
+def test_single_repeated_stamps_stay(tmp_path: Path):
+    file = tmp_path / "a.log"
+    times = [0.0, 0.1, 0.25, 0.25, 0.31, 0.9]
+    file.write_text("".join(FLASER.format(x=0, time=t, logged=10 * k) for k, t in enumerate(times)))
+    assert seconds(read_scans(file)) == pytest.approx(times)
+
+
 def test_arrays(tmp_path: Path):
     file = tmp_path / "a.npz"
     np.savez(file, t=np.array([5.0, 5.5]), ranges=np.full((2, 180), 50.0, np.float32), odom=np.zeros((2, 3)))
@@ -46,6 +105,8 @@ def test_arrays(tmp_path: Path):
     ("name", "content", "said"),
     [
         ("a.log", b"FLASER 3 1 2\n", "a.log:1: expected FLASER"),
+        ("a.log", b"ROBOTLASER1 0 0 0 0 9 0 0 1 5 0 1 1 1 2 2 2 0 0 0 0 0 7 h 7\n", "a.log:1: expected ROBOTLASER1"),
+        ("a.log", b"FLASER 1 1 0 0 0 0 0 0 nan host 1\n", "a.log:1: expected FLASER .*: time nan"),
         ("a.log", b"nothing\n", "no scans"),
         ("a.npz", b"PK\x03\x04broken", "expected arrays"),
         ("a.dat", b"1 2 3\n", "expected 707 numbers"),

@@ -8,8 +8,8 @@ import pytest
 
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_runtime.clock import SECOND
-from monstertruckd.tools.logs.scans import ScanLog
-from monstertruckd.tools.logs.trajectory import mid_sweep, write_tum
+from monstertruckd.tools.logs.scan_log import ScanLog
+from monstertruckd.tools.logs.trajectory import LINES, mid_sweep, write_trajectory
 
 
 def test_poses_move_on_to_the_middle_of_the_sweep():
@@ -30,7 +30,7 @@ def test_a_file_has_the_logs_own_times(tmp_path: Path):
     ]
     poses = [(0.1 * k, 0.0, math.pi / 2) for k in range(3)]
     file = tmp_path / "poses.txt"
-    said = write_tum(file, [scan.stamp for scan in scans], poses, ScanLog("npz", scans, begin=999.0))
+    said = write_trajectory(file, [scan.stamp for scan in scans], poses, ScanLog("npz", scans, begin=999.0))
     rows = np.loadtxt(file)
     assert rows.shape == (3, 8)
     assert rows[:, 0] == pytest.approx((1000.05, 1000.15, 1000.25))
@@ -41,5 +41,17 @@ def test_a_file_has_the_logs_own_times(tmp_path: Path):
 
 def test_nothing_localised_is_an_empty_file(tmp_path: Path):
     scans = [ScanInput(SECOND, np.ones(3), -1.0, 0.02, 0.02, 5.6)]
-    write_tum(tmp_path / "a.txt", [], [], ScanLog("npz", scans))
+    write_trajectory(tmp_path / "a.txt", [], [], ScanLog("npz", scans))
     assert (tmp_path / "a.txt").read_text() == ""
+
+
+def test_kitti_has_matrices_and_lost_poses_keep_their_times(tmp_path: Path):
+    scans = [ScanInput(SECOND + k * SECOND, np.ones(9), -1.0, 0.02, 0.02, 5.6) for k in range(3)]
+    poses = [(0.1 * k, 2.0, 0.5) for k in range(3)]
+    stamps, lost = [scan.stamp for scan in scans], np.array((False, True, False))
+    write_trajectory(tmp_path / "a.txt", stamps, poses, ScanLog("npz", scans), lost, lines=LINES["kitti"])
+    rows = np.loadtxt(tmp_path / "a.txt").reshape(3, 3, 4)
+    assert rows[2] == pytest.approx(
+        np.array(((math.cos(0.5), -math.sin(0.5), 0, 0.2), (math.sin(0.5), math.cos(0.5), 0, 2.0), (0, 0, 1, 0)))
+    )
+    assert np.loadtxt(tmp_path / "a.lost.txt")[:3] == pytest.approx((2.0, 0.1, 2.0))

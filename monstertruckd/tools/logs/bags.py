@@ -1,0 +1,280 @@
+"""Scans, odometry and frames out of bags and MCAP files by others: messages of ROS and Foxglove."""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Final
+
+import numpy as np
+from mcap.records import Channel, McapRecord, Schema
+from mcap.records import Message as McapMessage
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.outside import reading
+
+SCANS: Final = "foxglove.LaserScan or sensor_msgs/LaserScan"
+"""Messages that are read as scans."""
+
+
+@dataclass(frozen=True, slots=True)
+class MessageTimes:
+    """MessageTimes of one message, ns."""
+
+    stamp: int
+    """In its header."""
+    logged: int
+    """Of its recording."""
+
+
+@dataclass(frozen=True, slots=True)
+class BagScan:
+    """One scan as its message has it."""
+
+    times: MessageTimes
+    frame: str
+    pose: Array
+    """Shape (4, 4): origin of the beams in ``frame``."""
+    start_angle: float
+    angle_increment: float
+    time_increment: float
+    ranges: Array
+    """Shape (n,), m."""
+    limits: tuple[float, float] | None
+    """Least and greatest range, m; None = not in the message."""
+
+
+@dataclass(frozen=True, slots=True)
+class BagPose:
+    """Pose of frame ``child`` in ``parent``: odometry, or a transform."""
+
+    times: MessageTimes
+    parent: str
+    child: str
+    pose: Array
+    """Shape (4, 4)."""
+
+
+@dataclass(slots=True)
+class BagContent:
+    """What a bag holds for mapping, by topic."""
+
+    scans: dict[str, list[BagScan]] = field(default_factory=dict)
+    odometry: dict[str, list[BagPose]] = field(default_factory=dict)
+    transforms: list[BagPose] = field(default_factory=list)
+    others: dict[str, str] = field(default_factory=dict)
+    """Schema of the topics that are not read."""
+
+    @property
+    def topics(self) -> list[str]:
+        """Names of all topics but transforms."""
+        return sorted({*self.scans, *self.odometry, *self.others})
+
+
+@dataclass(frozen=True, slots=True)
+class RawMessage:
+    """One message, not decoded yet."""
+
+    topic: str
+    schema: str
+    encoding: str
+    """``ros1``, ``cdr``, ``protobuf`` or ``json``."""
+    logged: int
+    data: bytes
+    definition: bytes = b""
+    """Of the schema, where the log holds one."""
+
+
+def homogeneous(translation: Any, rotation: Any) -> Array:
+    """Matrix (4, 4) of a vector and a quaternion with components x, y, z, w.
+
+    Raises:
+        ValueError: the quaternion is zero, or something is not finite.
+    """
+    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    if not (length > 0 and math.isfinite(length + translation.x + translation.y + translation.z)):
+        raise ValueError(f"rotation {x:g} {y:g} {z:g} {w:g}: expected a unit quaternion, and a finite translation")
+    x, y, z, w = x / length, y / length, z / length, w / length
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), translation.x),
+            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), translation.y),
+            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), translation.z),
+            (0.0, 0.0, 0.0, 1.0),
+        )
+    )
+
+
+def mcap_messages(records: Iterator[McapRecord]) -> Iterator[RawMessage]:
+    """Yield the messages among MCAP records."""
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    for record in records:
+        if isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+        elif isinstance(record, McapMessage):
+            channel = channels[record.channel_id]
+            schema = schemas.get(channel.schema_id)
+            name, definition = ("", b"") if schema is None else (schema.name, schema.data)
+            yield RawMessage(channel.topic, name, channel.message_encoding, record.log_time, record.data, definition)
+
+
+def content_of(path: Path, messages: Iterator[RawMessage]) -> BagContent:
+    """Decode scans, odometry and transforms.
+
+    Args:
+        path: the log, for refusals.
+        messages: of the log, in any order.
+
+    Raises:
+        InputError: a message of these is damaged; names the topic.
+    """
+    content = BagContent()
+    for raw in messages:
+        schema = raw.schema if "/msg/" in raw.schema else raw.schema.replace("/", "/msg/")
+        read = READERS.get(schema)
+        if read is None or raw.encoding not in _PARSERS:
+            known = f"{raw.schema or 'no schema'} ({raw.encoding or 'no encoding'})"
+            content.others.setdefault(raw.topic, known)
+            continue
+        with reading(f"{path}: {raw.topic}", schema):
+            read(content, raw, _PARSERS[raw.encoding](schema, raw.data))
+    return content
+
+
+def _protobuf(schema: str, data: bytes) -> Any:
+    name = schema.removeprefix("foxglove.")
+    return getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name).FromString(data)
+
+
+def _json(_: str, data: bytes) -> Any:
+    return json.loads(data, object_hook=lambda values: SimpleNamespace(**values))
+
+
+def _ros(encoding: str) -> Callable[[str, bytes], Any]:
+    def parse(schema: str, data: bytes) -> Any:
+        from monstertruckd.tools.logs.ros_bags import parsed  # noqa: PLC0415 - comes with an extra
+
+        return parsed(encoding, schema, data)
+
+    return parse
+
+
+_PARSERS: Final[dict[str, Callable[[str, bytes], Any]]] = {
+    "cdr": _ros("cdr"),
+    "ros1": _ros("ros1"),
+    "protobuf": _protobuf,
+    "json": _json,
+}
+
+
+def _ros_time(stamp: Any) -> int:
+    return int(stamp.sec) * SECOND + int(stamp.nanosec)
+
+
+def _foxglove_time(stamp: Any) -> int:
+    """Of a protobuf timestamp, or of the same as JSON."""
+    if hasattr(stamp, "seconds"):
+        return int(stamp.seconds) * SECOND + int(stamp.nanos)
+    return int(stamp.sec) * SECOND + int(stamp.nsec)
+
+
+def _frame(name: str) -> str:
+    """Name of a frame; those of tf began with a slash."""
+    return name.removeprefix("/")
+
+
+def _ros_scan(content: BagContent, raw: RawMessage, message: Any) -> None:
+    scan = BagScan(
+        MessageTimes(_ros_time(message.header.stamp), raw.logged),
+        _frame(message.header.frame_id),
+        np.eye(4),
+        float(message.angle_min),
+        float(message.angle_increment),
+        float(message.time_increment),
+        np.asarray(message.ranges, np.float64),
+        (float(message.range_min), float(message.range_max)),
+    )
+    content.scans.setdefault(raw.topic, []).append(_checked(scan))
+
+
+def _foxglove_scan(content: BagContent, raw: RawMessage, message: Any) -> None:
+    ranges = np.array(message.ranges, np.float64)
+    scan = BagScan(
+        MessageTimes(_foxglove_time(message.timestamp), raw.logged),
+        _frame(message.frame_id),
+        homogeneous(message.pose.position, message.pose.orientation),
+        float(message.start_angle),
+        (float(message.end_angle) - float(message.start_angle)) / max(len(ranges) - 1, 1),
+        0.0,
+        ranges,
+        None,
+    )
+    content.scans.setdefault(raw.topic, []).append(_checked(scan))
+
+
+def _checked(scan: BagScan) -> BagScan:
+    """The same scan.
+
+    Raises:
+        ValueError: its angles, times or limits are no numbers, or its beams have one angle.
+    """
+    numbers = scan.start_angle, scan.angle_increment, scan.time_increment, *(scan.limits or ())[:1]
+    if not all(map(math.isfinite, numbers)) or scan.angle_increment == 0:
+        raise ValueError(f"first beam at {scan.start_angle:g} rad, {scan.angle_increment:g} rad between beams")
+    return scan
+
+
+def _ros_odometry(content: BagContent, raw: RawMessage, message: Any) -> None:
+    header, pose = message.header, message.pose.pose
+    times = MessageTimes(_ros_time(header.stamp), raw.logged)
+    at = BagPose(
+        times, _frame(header.frame_id), _frame(message.child_frame_id), homogeneous(pose.position, pose.orientation)
+    )
+    content.odometry.setdefault(raw.topic, []).append(at)
+
+
+def _foxglove_odometry(content: BagContent, raw: RawMessage, message: Any) -> None:
+    times, pose = MessageTimes(_foxglove_time(message.timestamp), raw.logged), message.pose
+    at = BagPose(
+        times, _frame(message.frame_id), _frame(message.body_frame_id), homogeneous(pose.position, pose.orientation)
+    )
+    content.odometry.setdefault(raw.topic, []).append(at)
+
+
+def _ros_transforms(content: BagContent, raw: RawMessage, message: Any) -> None:
+    for one in message.transforms:
+        matrix = homogeneous(one.transform.translation, one.transform.rotation)
+        times = MessageTimes(_ros_time(one.header.stamp), raw.logged)
+        content.transforms.append(BagPose(times, _frame(one.header.frame_id), _frame(one.child_frame_id), matrix))
+
+
+def _foxglove_transform(content: BagContent, raw: RawMessage, message: Any) -> None:
+    times = MessageTimes(_foxglove_time(message.timestamp), raw.logged)
+    matrix = homogeneous(message.translation, message.rotation)
+    content.transforms.append(BagPose(times, _frame(message.parent_frame_id), _frame(message.child_frame_id), matrix))
+
+
+def _foxglove_transforms(content: BagContent, raw: RawMessage, message: Any) -> None:
+    for one in message.transforms:
+        _foxglove_transform(content, raw, one)
+
+
+READERS: Final[dict[str, Callable[[BagContent, RawMessage, Any], None]]] = {
+    "sensor_msgs/msg/LaserScan": _ros_scan,
+    "nav_msgs/msg/Odometry": _ros_odometry,
+    "tf2_msgs/msg/TFMessage": _ros_transforms,
+    "tf/msg/tfMessage": _ros_transforms,
+    "foxglove.LaserScan": _foxglove_scan,
+    "foxglove.Odometry": _foxglove_odometry,
+    "foxglove.FrameTransform": _foxglove_transform,
+    "foxglove.FrameTransforms": _foxglove_transforms,
+}
+"""What is done with a message, by its schema."""

@@ -1,0 +1,153 @@
+"""Scans of a log, with what the reader of any format needs to make them: geometry, clocks, odometry at a scan."""
+
+import math
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_estimation.slam.worker_io import ScanInput
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, between, interpolate
+from monstertruck_runtime.clock import SECOND
+
+BEGIN: Final = SECOND
+"""Stamp of the first scan of a log with times of another origin, ns."""
+SHORTEST_RANGE: Final = 0.02
+"""Shorter ranges are no returns where the log does not say from where on, m."""
+LONGEST_RANGE: Final = 80.0
+"""Ranges from here on are no-returns of the lasers that CARMEN logs come from, m."""
+NO_RETURN_SHARE: Final = 0.001
+"""The greatest range of a log means no return if at least this share of its beams has it."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogGeometry:
+    """Geometry of the scans of a log that does not hold it; None = as in the log, or assumed."""
+
+    start_angle: float | None = None
+    """Angle of the first beam, rad, counter-clockwise from ahead."""
+    angle_increment: float | None = None
+    """Angle between neighbouring beams, rad."""
+    range_min: float | None = None
+    """Shorter ranges are no returns, m."""
+    range_max: float | None = None
+    """Ranges from here on are no returns, m."""
+    time_increment: float | None = None
+    """Seconds between neighbouring beams."""
+    mount: Pose2 | None = None
+    """Planar pose of the sensor in base, m and rad."""
+
+    @property
+    def known(self) -> dict[str, Any]:
+        """Fields that are not None."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class ScanLog:
+    """A log's scans, in order."""
+
+    make: str
+    scans: list[ScanInput]
+    begin: float = 0.0
+    """Time of the log's own clock that is stamp 0 here, s."""
+    assumed: tuple[str, ...] = field(default=())
+    """Parts of the geometry that neither the log nor the caller gave."""
+    fault: str | None = None
+    """What is wrong with the file, whose end is missing perhaps."""
+    sources: dict[str, str] = field(default_factory=dict)
+    """Where in the log scans, odometry and mount come from, where there was a choice."""
+
+
+def vector(values: Any) -> Pose2:
+    """A pose as three floats."""
+    x, y, yaw = (float(value) for value in values)
+    return x, y, yaw
+
+
+def missing(known: dict[str, Any]) -> tuple[str, ...]:
+    """Fields of ``LogGeometry`` that are not ``known``."""
+    return tuple(item.name for item in fields(LogGeometry) if item.name not in known)
+
+
+def no_return(ranges: Array) -> float:
+    """The range from which on there was no return: a greatest one that recurs, or infinity.
+
+    Args:
+        ranges: of any shape, at least one of them finite, m.
+    """
+    finite = ranges[np.isfinite(ranges)]
+    greatest = float(finite.max())
+    recurs = np.count_nonzero(finite == greatest) >= max(NO_RETURN_SHARE * finite.size, 3)
+    return min(greatest if recurs else math.inf, LONGEST_RANGE)
+
+
+def half_turn(stamp: int, ranges: Array, odom: Pose2 | None, geometry: dict[str, Any]) -> ScanInput:
+    """A scan of this ``geometry``; by default half a turn ahead: n beams, or n + 1 with both ends."""
+    count = len(ranges)
+    assumed = {
+        "start_angle": -math.pi / 2,
+        "angle_increment": math.pi / max(count - count % 2, 1),
+        "range_min": SHORTEST_RANGE,
+    }
+    return ScanInput(stamp=stamp, ranges=ranges, odom=odom, **(assumed | geometry))
+
+
+def steady_clock(*clocks: NDArray[np.int64]) -> tuple[int, NDArray[np.int64]]:
+    """Choose the clock that tells a log's scans apart.
+
+    That is the first one whose smallest step is shorter than the mean time between scans. Failing that, the one with
+    the most different times, and scans of one time are spread evenly up to the next.
+
+    Args:
+        clocks: times of the scans by each clock, shape (n,), ns.
+
+    Returns:
+        Number of the clock, and times by it.
+
+    Raises:
+        ValueError: there are several scans, and all have one time by every clock.
+    """
+    for number, times in enumerate(clocks):
+        if not _coarse(times):
+            return number, times
+    number = max(range(len(clocks)), key=lambda i: len(np.unique(clocks[i])))
+    times = clocks[number]
+    starts = np.flatnonzero(np.diff(times, prepend=times[0] - 1))
+    if len(starts) < 2:
+        raise ValueError(f"all {len(times)} scans have one time")
+    last = times[starts[-1]] + (times[starts[-1]] - times[0]) * (len(times) - starts[-1]) // starts[-1]
+    return number, np.interp(
+        np.arange(len(times)), [*starts, len(times)], [*(times[starts] - times[0]), last - times[0]]
+    ).astype(np.int64) + times[0]
+
+
+def _coarse(times: NDArray[np.int64]) -> bool:
+    steps = np.diff(times)
+    rising = steps[steps > 0]
+    if len(rising) == len(steps):
+        return False
+    return not len(rising) or bool(rising.min() >= (times.max() - times.min()) / len(steps))
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryLog:
+    """Odometry of a log, to be looked up at its scans."""
+
+    stamps: NDArray[np.int64]
+    """Shape (n,), ns, rising."""
+    poses: Array
+    """Shape (n, 3), base in odom."""
+
+    def attached(self, scan: ScanInput) -> ScanInput:
+        """The scan with pose and velocity of base by odometry; without, where odometry does not reach."""
+        if not len(self.stamps) or not self.stamps[0] <= scan.stamp <= self.stamps[-1]:
+            return scan
+        duration = scan.time_increment * len(scan.ranges)
+        times = (np.array((scan.stamp, scan.stamp + duration * SECOND)) - self.stamps[0]).astype(np.float64)
+        first, last = interpolate((self.stamps - self.stamps[0]).astype(np.float64), self.poses, times)
+        twist = between(first, last) / max(duration, 1e-3)
+        return replace(scan, odom=vector(first), twist=vector(twist))
