@@ -25,6 +25,7 @@ import serial_asyncio
 
 from monstertruck_drivers.link import BAUD, Link, Port
 from monstertruck_runtime.errors import DeviceLostError, DeviceWedgedError, PortBusyError
+from monstertruck_runtime.open_files import holders
 
 PATIENCE: Final = 2.0
 """Seconds after which a port that the kernel is still opening or closing is reported as wedged."""
@@ -76,18 +77,23 @@ class SerialPort:
         if not self._path.exists():
             raise DeviceLostError(f"{self.name}: not plugged in")
         node = _node(self._path)
+        tty = await node.open(self.name, partial(self._open, node))
+        return _SerialProtocol(self.name, tty).link
+
+    def _open(self, node: "_PortNode") -> "_Tty":
+        """Open here, in a thread; raises as ``open``."""
         try:
-            tty = await node.open(self.name, partial(self._make, node=node))
+            return self._make(node=node)
         except serial.SerialException as error:
             raise self._open_error(error) from error
         except (OSError, termios.error) as error:
             raise DeviceLostError(f"{self.name}: {error.args[-1]}") from error
-        return _SerialProtocol(self.name, tty).link
 
     def _open_error(self, error: serial.SerialException) -> Exception:
         busy = error.errno in (errno.EBUSY, errno.EWOULDBLOCK, errno.EAGAIN) or "exclusively lock" in str(error)
         if busy:
-            return PortBusyError(f"{self.name}: held by another process")
+            by = ", ".join(holders({os.path.realpath(self._path)}))
+            return PortBusyError(f"{self.name}: held by {by or 'another process'}")
         cause = error.__context__
         number = cause.args[0] if error.errno is None and isinstance(cause, termios.error) else error.errno
         if number is None:

@@ -2,22 +2,26 @@
 
 import pwd
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from monstertruck_runtime.endpoints import EVERYWHERE, LOCAL_HOSTS, UNIX, host_of, port_of, protocol_of
+from monstertruck_runtime.endpoints import (
+    EVERYWHERE,
+    LOCAL_HOSTS,
+    UNIX,
+    announced,
+    host_of,
+    port_of,
+    protocol_of,
+)
+from monstertruck_runtime.open_files import PROC, holders
 from monstertruck_runtime.robots import robots_at
 
 LISTENING: Final = "0A"
 """State of a listening socket in ``/proc/net/tcp`` (Linux, include/net/tcp_states.h)."""
-SOCKET: Final = "socket:["
-"""Beginning of a link in ``/proc/PID/fd`` that leads to a socket; its number and a bracket follow."""
-LONGEST: Final = 160
-"""Characters of a command line that are shown."""
 
 
-def holder_of(endpoints: Iterable[str], proc: Path = Path("/proc")) -> str:
+def holder_of(endpoints: Iterable[str], proc: Path = PROC) -> str:
     """Describe who listens at one of ``endpoints``: robots by name, process by number and command line.
 
     Returns:
@@ -30,19 +34,18 @@ def holder_of(endpoints: Iterable[str], proc: Path = Path("/proc")) -> str:
 
 
 def _robots(endpoints: list[str]) -> Iterator[str]:
+    """Robots that answer, and those that announce the port and answer only those who have a certificate."""
     names: dict[str, None] = {}
     for endpoint in endpoints:
         local = protocol_of(endpoint) == "tcp" and host_of(endpoint) in (*LOCAL_HOSTS, *EVERYWHERE)
         if endpoint.startswith(UNIX) or local:
             names |= dict.fromkeys(robots_at(f"tcp/127.0.0.1:{port_of(endpoint)}" if local else endpoint))
+        names |= dict.fromkeys(one.robot for one in announced() if one.port == port_of(endpoint))
     yield from (f"robot {name!r}" for name in names)
 
 
 def _processes(endpoints: list[str], proc: Path) -> Iterator[str]:
-    inodes = {inode for endpoint in endpoints for inode in _inodes(endpoint, proc)}
-    for folder in sorted(proc.glob("[0-9]*"), key=lambda folder: int(folder.name)):
-        if inodes & _sockets(folder):
-            yield f"process {folder.name} ({_command_line(folder)})"
+    return holders({f"socket:[{inode}]" for endpoint in endpoints for inode in _inodes(endpoint, proc)}, proc)
 
 
 def _owners(endpoints: list[str], proc: Path) -> Iterator[str]:
@@ -81,23 +84,3 @@ def _rows(table: Path) -> list[list[str]]:
         return [line.split() for line in table.read_text().splitlines()[1:]]
     except OSError:
         return []
-
-
-def _command_line(folder: Path) -> str:
-    try:
-        words = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
-    except OSError:
-        return "ended"
-    return " ".join(words).strip()[:LONGEST]
-
-
-def _sockets(folder: Path) -> set[str]:
-    """Sockets of a process; none of one that belongs to another user, or has ended."""
-    found: set[str] = set()
-    with suppress(OSError):
-        for link in (folder / "fd").iterdir():
-            with suppress(OSError):  # closed meanwhile
-                target = str(link.readlink())
-                if target.startswith(SOCKET):
-                    found.add(target.removeprefix(SOCKET).removesuffix("]"))
-    return found

@@ -94,7 +94,7 @@ class ZenohBridge:
         self._clock = clock
         self._rpc = rpc
         self._sessions: list[tuple[Listener, zenoh.Session]] = []
-        self._announced: list[socket.socket] = []
+        self._announced: socket.socket | None = None
         rpc.register("topics", self._topics, AccessRole.OBSERVER, recorded=False)
 
     async def open(self) -> None:
@@ -176,7 +176,7 @@ class ZenohBridge:
                 if listener.connect and self._runs_elsewhere(listener):
                     msg = f"another daemon already runs robot {self._robot!r} behind {', '.join(listener.connect)}"
                     raise BusyError(msg)
-                self._announced += announce(listener.listen)
+            self._announced = announce(self._robot, self._config.listen)
         except BaseException:
             self._close()
             raise
@@ -185,8 +185,9 @@ class ZenohBridge:
         while self._sessions:
             _, session = self._sessions.pop()
             session.close()  # type: ignore[no-untyped-call]
-        while self._announced:
-            self._announced.pop().close()
+        if self._announced is not None:
+            self._announced.close()
+            self._announced = None
 
     def _open_listener(self, listener: Listener) -> zenoh.Session:
         where = ", ".join(listener.listen)

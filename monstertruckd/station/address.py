@@ -6,11 +6,16 @@ from typing import Self
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, is_endpoint, nearest
+from monstertruck_runtime.endpoints import is_endpoint, nearest, public
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.robots import only_robot
 from monstertruck_runtime.stations import own_source, tls_for
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+
+def _option(robot: str, endpoint: str) -> str:
+    return f"--robot {robot}@{public(endpoint)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,17 +27,27 @@ class RobotAddress:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read ``NAME@ENDPOINT``; without an endpoint it is a daemon on this machine.
+        """Read ``NAME@ENDPOINT``; without an endpoint it is the robot of this name on this machine.
 
         Raises:
-            InputError: the name cannot be part of a key, or the endpoint is none.
+            InputError: the name cannot be part of a key, the endpoint is none, or several robots of this machine have
+                the name; lists them.
         """
         name, at, endpoint = text.partition("@")
         if not _NAME.fullmatch(name):
             raise InputError(f"robot {text!r}: expected NAME@ENDPOINT, the name of letters, digits, _ and -")
         if at and not is_endpoint(endpoint):
             raise InputError(f"robot {text!r}: expected an endpoint such as tcp/192.168.1.7:7447 behind the @")
-        return cls(name, nearest(endpoint or DEFAULT_ENDPOINT))
+        return cls(name, nearest(endpoint) if at else only_robot(name, _option))
+
+    @classmethod
+    def default(cls) -> Self:
+        """The robot of a station that names none.
+
+        Raises:
+            InputError: several robots of this machine could be meant, or none answers at the default port; lists them.
+        """
+        return cls("truck", only_robot(None, _option))
 
     def session(self, program: str, clock: Clock, timeout: float) -> TruckClient:
         """A session with the robot for a program of the station; ``timeout`` as of ``TruckClient``, s."""

@@ -429,7 +429,7 @@ async def _watched(
                     await driver.arm()
             except RequestRefusedError as error:
                 raise RequestRefusedError(error.refusal, f"arm refused: {error}") from None
-        return await ending
+        return await asyncio.shield(ending)  # one reader of the reports to the end: a second one would miss some
     except TruckError as error:
         if not isinstance(error, RequestRefusedError) or error.refusal is not Reason.SHUTDOWN:
             with suppress(TruckError):  # that it failed says more than that it cannot be taken back either
@@ -442,10 +442,11 @@ async def _watched(
             if refused.refusal is not Reason.NOT_FOUND:  # it has just ended by itself
                 raise
         if to_its_end and isinstance(error, asyncio.CancelledError):
-            return await while_it_runs(driver, end(), needs)
+            return await ending
         raise
     finally:
         ending.cancel()
+        await asyncio.gather(ending, return_exceptions=True)
 
 
 @asynccontextmanager

@@ -5,7 +5,7 @@ import socket
 import stat
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 SERVICE_FOLDER: Final = Path("/run/monstertruckd")
 """Where the service keeps its sockets."""
@@ -16,7 +16,7 @@ _ADDRESSED: Final = ("tcp", "tls", "udp", "quic", "ws")
 """Protocols whose addresses are a host and a port."""
 _OTHERS: Final = ("unixsock-stream", "unixpipe", "vsock", "serial")
 ANNOUNCED: Final = "monstertruckd/"
-"""Prefix of the abstract Unix socket that shows a daemon to all users of this computer; its port follows."""
+"""Prefix of the abstract Unix socket that shows a daemon to all users; its port, protocol and robot follow."""
 EVERYWHERE: Final = ("0.0.0.0", "::")  # noqa: S104
 """Addresses at which a program listens on all interfaces."""
 ANSWERS_WITHIN: Final = 0.2
@@ -87,53 +87,75 @@ def nearest(endpoint: str, environment: Mapping[str, str] = os.environ) -> str:
     return endpoint
 
 
+class Announced(NamedTuple):
+    """A daemon as it shows itself to every user of this computer."""
+
+    port: int
+    protocol: str
+    """``tls`` where it requires a certificate."""
+    robot: str
+
+    @property
+    def endpoint(self) -> str:
+        """Where it is reached from this computer."""
+        return endpoint_of(self.protocol, LOCAL_HOSTS[0], self.port)
+
+
 def local_endpoints(environment: Mapping[str, str] = os.environ) -> list[str]:
     """Endpoints of the daemons that answer on this machine, by port, the default port first.
 
     Unix sockets are those of this user and of the service; a daemon of another user is reached by its port.
     """
     folders = runtime_folder(environment), SERVICE_FOLDER
-    ports = {path.stem for folder in folders for path in folder.glob("*.sock")} | announced_ports()
+    known = {one.port: one.endpoint for one in announced()}
+    sockets = {int(path.stem) for folder in folders for path in folder.glob("*.sock") if path.stem.isdecimal()}
     usual = port_of(DEFAULT_ENDPOINT) or 0
-    others = sorted({int(port) for port in ports if port.isdecimal()} - {usual})
-    found = [(port, nearest(endpoint_of("tcp", LOCAL_HOSTS[0], port), environment)) for port in (usual, *others)]
-    return [endpoint for port, endpoint in found if endpoint.startswith(UNIX) or _listens(LOCAL_HOSTS[0], port)]
+    found = {}
+    for port in (usual, *sorted((sockets | known.keys()) - {usual})):
+        plain = endpoint_of("tcp", LOCAL_HOSTS[0], port)
+        socket_or_plain = nearest(plain, environment)
+        found[port] = known.get(port, plain) if socket_or_plain == plain else socket_or_plain
+    return [end for port, end in found.items() if end.startswith(UNIX) or _listens(LOCAL_HOSTS[0], port)]
 
 
-def announce(listen: Iterable[str]) -> list[socket.socket]:
-    """Let every user of this computer see a daemon's ports, without reading its folders, until the sockets are closed.
+def announce(robot: str, listen: Iterable[str]) -> socket.socket | None:
+    """Let every user of this computer see a daemon, without reading its folders, until the socket is closed.
 
     Args:
-        listen: endpoints of the daemon. Those that need a certificate, or are for other computers, are left out.
+        robot: its name.
+        listen: endpoints of the daemon; the first that is reached from this computer is shown.
 
     Returns:
-        Sockets that hold the names; the kernel drops those of a process that ends. A name that another program holds
-        is left to it.
+        Socket that holds the name; the kernel drops that of a process that ends. None if the endpoints are for other
+        computers, or another program holds the name.
     """
-    ports = {
-        port_of(endpoint)
-        for endpoint in listen
-        if protocol_of(endpoint) == "tcp" and host_of(endpoint) in (*LOCAL_HOSTS, *EVERYWHERE)
-    }
-    held = []
-    for port in ports:
-        name = socket.socket(socket.AF_UNIX)
-        try:
-            name.bind(f"\0{ANNOUNCED}{port}")
-        except OSError:
-            name.close()
-        else:
-            held.append(name)
-    return held
+    hosts = (*LOCAL_HOSTS, *EVERYWHERE)
+    for endpoint in listen:
+        protocol, port = protocol_of(endpoint), port_of(endpoint)
+        if protocol in ("tcp", "tls") and host_of(endpoint) in hosts and port is not None:
+            name = socket.socket(socket.AF_UNIX)
+            try:
+                name.bind(f"\0{ANNOUNCED}{port}/{protocol}/{robot}")
+            except OSError:
+                name.close()
+                return None
+            return name
+    return None
 
 
-def announced_ports(table: Path = Path("/proc/net/unix")) -> set[str]:
-    """Ports of the daemons that announce them, of every user."""
+def announced(table: Path = Path("/proc/net/unix")) -> list[Announced]:
+    """Daemons of every user that announce themselves."""
     try:
-        names = (line.rpartition(" ")[2] for line in table.read_text(errors="replace").splitlines())
+        names = [line.rpartition(" @")[2] for line in table.read_text(errors="replace").splitlines()]
     except OSError:
-        return set()
-    return {name.removeprefix(f"@{ANNOUNCED}") for name in names if name.startswith(f"@{ANNOUNCED}")}
+        return []
+    found = []
+    for name in names:
+        port, _, rest = name.removeprefix(ANNOUNCED).partition("/")
+        protocol, _, robot = rest.partition("/")
+        if name.startswith(ANNOUNCED) and port.isdecimal() and protocol in ("tcp", "tls") and robot:
+            found.append(Announced(int(port), protocol, robot))
+    return found
 
 
 def public(endpoint: str) -> str:

@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable
 from typing import Final
 
-from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, local_endpoints, nearest, public
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, announced, local_endpoints, nearest, public
 from monstertruck_runtime.errors import InputError
 
 LOOK: Final = 0.5
@@ -28,8 +28,17 @@ def robots_at(endpoint: str, timeout: float = LOOK) -> list[str]:
 
 
 def robots_here() -> list[tuple[str, str]]:
-    """Robots of this computer's daemons with their endpoints, the default port first; asking takes up to a second."""
-    return [(robot, endpoint) for endpoint in local_endpoints() for robot in robots_at(endpoint)]
+    """Robots of this computer's daemons with their endpoints, the default port first; asking takes up to a second.
+
+    All are asked at once; those that require a certificate are named by what they announce.
+    """
+    from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415 - most commands need no thread
+
+    endpoints = local_endpoints()
+    certified = {one.endpoint: [one.robot] for one in announced() if one.protocol == "tls"}
+    with ThreadPoolExecutor(max(1, len(endpoints))) as pool:
+        names = pool.map(lambda endpoint: certified.get(endpoint) or robots_at(endpoint), endpoints)
+        return [(robot, endpoint) for endpoint, found in zip(endpoints, names, strict=True) for robot in found]
 
 
 def only_robot(name: str | None, choice: Callable[[str, str], str]) -> str:

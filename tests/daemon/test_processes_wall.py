@@ -230,7 +230,9 @@ async def test_a_second_daemon_is_refused_clearly(tmp_path: Path):
             second = await asyncio.to_thread(_run, truck.config)
             assert second.returncode == Reason.BUSY.exit_code
             assert truck.endpoint.removeprefix("tcp/") in second.stderr
-            assert "in use by" in second.stderr
+            assert truck.daemon is not None
+            holder = rf"process {truck.daemon.pid} \(.* run --config {re.escape(str(truck.config))}\)"
+            assert re.search(rf"in use by robot 'truck', {holder}", second.stderr), second.stderr
             assert "Traceback" not in second.stderr
             # Another robot name and endpoint, but the same ports: refused before anything is touched.
             other = tmp_path / "other.yaml"
@@ -238,11 +240,12 @@ async def test_a_second_daemon_is_refused_clearly(tmp_path: Path):
             other.write_text(text.replace(str(tmp_path / "logs"), str(tmp_path / "logs2")) + "robot: intruder\n")
             third = await asyncio.to_thread(_run, other)
             assert third.returncode == Reason.DEVICE_BUSY.exit_code
-            assert re.search(r"^(drive|steering): .*: held by another process$", third.stderr, re.MULTILINE)
+            held = re.search(rf"^(drive|steering): .*: held by .*{holder}", third.stderr, re.MULTILINE)
+            assert held, third.stderr
             assert "Traceback" not in third.stderr
             health = await client.get_retained(topics.HEALTH)
             assert health is not None
-            assert all(row.restarts == 0 for row in health.services), health
+            assert [row for row in health.services if row.restarts] == []
 
 
 async def test_one_terminal_holds_truck_and_daemon_and_the_daemon_ends_first(tmp_path: Path):

@@ -22,7 +22,12 @@ if TYPE_CHECKING:
 def station(
     robots: Annotated[
         list[str] | None,
-        typer.Option("--robot", "-r", metavar="NAME@ENDPOINT", help="Robot to show; may be repeated. Default: truck."),
+        typer.Option(
+            "--robot",
+            "-r",
+            metavar="NAME@ENDPOINT",
+            help="Robot to show; may be repeated. Default: that of this computer.",
+        ),
     ] = None,
     routers: Annotated[
         list[str] | None,
@@ -78,7 +83,9 @@ def station(
     for router in routers or ():
         if not is_endpoint(router):
             raise InputError(f"--router {router!r}: expected tcp/HOST:PORT or tls/HOST:PORT")
-    addresses = [RobotAddress.parse(text) for text in robots or ([] if routers else ["truck"])]
+    addresses = [RobotAddress.parse(text) for text in robots or ()]
+    if not robots and not routers:
+        addresses = [RobotAddress.default()]
     known = None if users is None else station_users.StationUsers(users)
     place = Place(host, port, _tls(certificate, key), known, tuple(name or ()))
     if (foxglove or foxglove_drive or rerun) and not addresses:

@@ -1,13 +1,14 @@
 """Places: sessions that hold all those of stations keep neither pilots nor the robot's own command line out."""
 
 import asyncio
+import threading
 from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime import endpoints
+from monstertruck_runtime import endpoints, robots
 from monstertruck_runtime.client import TruckClient
-from monstertruck_runtime.endpoints import announce, announced_ports, local_endpoints, nearest, port_of
+from monstertruck_runtime.endpoints import Announced, announce, announced, local_endpoints, nearest, port_of
 from monstertruck_runtime.errors import NotFoundError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.robots import robots_at
@@ -71,7 +72,7 @@ async def test_a_socket_left_over_is_taken_again():
 
 async def test_two_daemons_on_one_computer_are_both_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    monkeypatch.setattr(endpoints, "announced_ports", set)  # those of other tests
+    monkeypatch.setattr(endpoints, "announced", list)  # those of other tests
     async with running_robot() as first, running_robot(robot="second") as second:
         monkeypatch.setattr(endpoints, "DEFAULT_ENDPOINT", first.endpoint)
         found = local_endpoints()
@@ -91,21 +92,42 @@ async def test_daemons_of_other_users_are_found_by_what_they_announce(monkeypatc
         monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "ours"))
         assert foreign.endpoint in local_endpoints()
         assert await asyncio.to_thread(robots_at, foreign.endpoint) == ["second"]
-        (again,) = announce([foreign.endpoint, free_endpoint()])
-        again.close()
+        assert announce("second", [foreign.endpoint]) is None, "it holds its name"
     assert foreign.endpoint not in local_endpoints()
 
 
 def test_only_what_can_be_asked_from_this_computer_is_announced():
     free = port_of(free_endpoint())
-    before = announced_ports()
-    assert announce([f"tls/127.0.0.1:{free}", f"tcp/192.0.2.7:{free}", f"unixsock-stream//run/{free}.sock"]) == []
+    assert announce("a", [f"tcp/192.0.2.7:{free}", f"unixsock-stream//run/{free}.sock"]) is None
     for host in ("0.0.0.0", "[::]", "localhost"):
-        (held,) = announce([f"tcp/{host}:{free}"])
-        with held:
-            assert announced_ports() >= {str(free)}
-    assert str(free) not in before | announced_ports()
+        for protocol in ("tcp", "tls"):
+            with announce("rover-1_b", [f"udp/{host}:1", f"{protocol}/{host}:{free}", "tcp/localhost:1"]):
+                (shown,) = [one for one in announced() if one.port == free]
+                assert shown == (free, protocol, "rover-1_b")
+                assert shown.endpoint == f"{protocol}/127.0.0.1:{free}"
+    assert free not in {one.port for one in announced()}
+
+
+@pytest.mark.parametrize("name", ["7447", "x/tcp/truck", "7447/tcp/", "7447/udp/truck", "7447/tcp"])
+def test_names_that_are_no_daemons_are_passed_over(tmp_path: Path, name: str):
+    table = tmp_path / "unix"
+    rows = (f"0: 00000002 00000000 00010000 0001 01 42 @monstertruckd/{each}" for each in (name, "7448/tls/rover"))
+    table.write_text("\n".join(("Num RefCount Protocol Flags Type St Inode Path", *rows, "")))
+    assert announced(table) == [Announced(7448, "tls", "rover")]
 
 
 def test_a_computer_without_the_kernels_table_shows_none(tmp_path: Path):
-    assert announced_ports(tmp_path / "unix") == set()
+    assert announced(tmp_path / "unix") == []
+
+
+def test_all_robots_of_this_computer_are_asked_at_once(monkeypatch: pytest.MonkeyPatch):
+    """A program at such a port that does not answer costs its timeout once, however many there are."""
+    monkeypatch.setattr(robots, "local_endpoints", lambda: ["tcp/a:1", "tcp/b:2", "tcp/c:3"])
+    together = threading.Barrier(3, timeout=5)
+
+    def asked(endpoint: str) -> list[str]:
+        together.wait()
+        return [endpoint[4]]
+
+    monkeypatch.setattr(robots, "robots_at", asked)
+    assert robots.robots_here() == [("a", "tcp/a:1"), ("b", "tcp/b:2"), ("c", "tcp/c:3")]

@@ -8,13 +8,16 @@ from typing import Any
 
 import pytest
 
+from monstertruck_runtime import robots
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.early_estop import send_estop
+from monstertruck_runtime.endpoints import local_endpoints
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError, NotPermittedError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_runtime.stations import TLS_VARIABLE, ClientTls, station_tls
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import GATE, REQ_CONTROL, REQ_DRIVE, Writer
+from monstertruckd.bus.port_holder import holder_of
 from monstertruckd.bus.zenoh_config import TlsConfig
 from tests.bus_kit import free_endpoint, gate_state, running_robot
 
@@ -158,3 +161,21 @@ def test_a_certificate_that_is_missing_or_open_to_others_is_refused(tmp_path: Pa
         station_tls(where)
     (config / "station.key").chmod(0o600)
     assert station_tls(where).key == config / "station.key"
+
+
+async def test_it_is_found_and_named_by_those_who_have_no_certificate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Another user, who may read neither its certificates nor the folder of its Unix socket."""
+    await asyncio.to_thread(certificates, tmp_path)
+    server = TlsConfig(
+        ca=tmp_path / "ca.pem", certificate=tmp_path / "truck.pem", key=tmp_path / "truck.key", pilots=("ann",)
+    )
+    monkeypatch.setattr(robots, "local_endpoints", local_endpoints)
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "theirs"))
+    certified = free_endpoint("tls")
+    async with running_robot(certified, robot="guarded", tls=server), running_robot(robot="second") as plain:
+        monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "ours"))
+        monkeypatch.setenv(TLS_VARIABLE, str(tmp_path / "none"))
+        there = await asyncio.to_thread(robots.robots_here)
+        assert {("guarded", certified), ("second", plain.endpoint)} <= {*there}
+        assert "robot 'guarded'" in await asyncio.to_thread(holder_of, [certified])
+    assert "guarded" not in dict(await asyncio.to_thread(robots.robots_here))

@@ -179,7 +179,14 @@ async def test_reopening_in_the_same_turn_waits(line: Line):
 
 async def test_a_port_in_use_stays_refused(line: Line):
     async with await SerialPort(line.path).open():
-        with pytest.raises(PortBusyError):
+        with pytest.raises(PortBusyError, match=rf": held by process {os.getpid()} \(.*python.*\)$"):
+            await SerialPort(line.path).open()
+
+
+async def test_a_port_of_another_user_is_refused_too(line: Line, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(ports, "holders", lambda _: iter(()))  # only root sees what others have open
+    async with await SerialPort(line.path).open():
+        with pytest.raises(PortBusyError, match=r": held by another process$"):
             await SerialPort(line.path).open()
 
 

@@ -1,9 +1,11 @@
 """``explore``: durations, lines of progress, the end, and what stops it."""
 
 import asyncio
+from unittest.mock import AsyncMock
 
 import pytest
 
+from monstertruck_runtime.drives import TaskEnd, run_task
 from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
 from monstertruck_schemas.base import Pose2D
@@ -11,6 +13,7 @@ from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.plan import ExplorationPhase, ExplorationState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder
+from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import EVENT, EXPLORE, GATE
 from monstertruckd.tools.cli.explore import seconds_of
@@ -136,6 +139,39 @@ def test_stopped_by_its_user_it_says_where_the_map_is():
     assert [order for order, *_ in robot.orders] == [ExploreOrder.START, ExploreOrder.STOP]
     assert (end.reason, end.text) == (Reason.CANCELLED, "stopped by ann; map in runs/explored")
     assert "saving" in lines[-2], "while it waits"
+
+
+def test_one_that_is_stopped_while_it_arms_the_robot_is_waited_for_too():
+    robot = Robot(state(3, ExplorationPhase.LOOKING))
+    robot.gate.put(GateState(stamp=1, received=1, seq=0, mode=GateMode.DISARMED, nonce="n", speed_limit=0.0))
+    shown: list[ExplorationPhase] = []
+
+    async def stop() -> None:
+        await robot.explore(ExploreOrder.STOP, own=True)
+
+    async def interrupted() -> TaskEnd[ExplorationState]:
+        robot.arm, robot.disarm = asyncio.Event().wait, AsyncMock()
+        task = asyncio.create_task(
+            run_task(
+                robot, EXPLORE, ServiceName.EXPLORER, lambda: robot.explore(ExploreOrder.START), stop,
+                lambda report: shown.append(report.phase), arm=True, waits=True, to_its_end=True,
+            )
+        )  # fmt: skip
+        await asyncio.sleep(0.01)
+        robot.states = tuple(
+            state(3, phase, outcome, text="stopped by ann")
+            for phase, outcome in (
+                (ExplorationPhase.SAVING, Reason.DRIVING),
+                (ExplorationPhase.IDLE, Reason.CANCELLED),
+            )
+        )
+        task.cancel()
+        async with asyncio.timeout(5):
+            return await task
+
+    end = asyncio.run(interrupted())
+    assert (end.reason, end.text) == (Reason.CANCELLED, "stopped by ann")
+    assert shown == [ExplorationPhase.LOOKING, ExplorationPhase.SAVING, ExplorationPhase.IDLE]
 
 
 def test_the_tags_that_are_found_are_counted_at_once():

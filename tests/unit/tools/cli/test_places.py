@@ -13,6 +13,7 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, public, robot_on_ho
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.truck import Truck
 from monstertruck_schemas.reasons import Reason
+from monstertruckd.station.address import RobotAddress
 from monstertruckd.tools.cli import options, orders
 from monstertruckd.tools.cli.main import app
 
@@ -140,6 +141,25 @@ def test_a_script_reaches_the_robot_that_it_names(reached: list, monkeypatch: py
         with pytest.raises(NotFoundError, match="reached"):
             asyncio.run(made.__aenter__())
     assert opened == [SOCKETS["second"], "tcp/127.0.0.1:7450", "tcp/b:1"]
+
+
+# Stations
+
+
+def test_a_station_that_could_mean_two_robots_is_refused_with_the_list(reached: list):
+    done = CliRunner().invoke(app, ["station"])
+    assert done.exit_code == Reason.BAD_INPUT.exit_code
+    assert " ".join(done.output.split()) == (
+        "2 robots answer on this computer; choose one: --robot truck@tcp/127.0.0.1:7447, "
+        "--robot second@tcp/127.0.0.1:7448"
+    )
+
+
+def test_a_station_shows_the_robot_that_it_names(reached: list, monkeypatch: pytest.MonkeyPatch):
+    assert RobotAddress.parse("second") == RobotAddress("second", SOCKETS["second"])
+    assert RobotAddress.parse("nobody") == RobotAddress("nobody", SOCKETS["truck"])
+    monkeypatch.setattr(robots, "local_endpoints", lambda: [SOCKETS["truck"]])
+    assert RobotAddress.default() == RobotAddress("truck", SOCKETS["truck"])
 
 
 def test_an_emergency_stop_is_never_refused_and_names_who_was_not_stopped(

@@ -4,10 +4,12 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 
 from monstertruck_drivers.cable import MemoryPort
+from monstertruck_drivers.config import PortConfig
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceError, DeviceWedgedError, PortBusyError
 from monstertruck_runtime.threads import inline
@@ -139,3 +141,13 @@ def test_a_port_that_another_program_holds_or_that_is_wedged(error: DeviceError,
     assert found.seen == str(error)
     assert found.fix is not None
     assert found.fix.startswith(fix)
+
+
+async def test_a_port_is_probed_with_the_control_lines_of_its_settings():
+    """An RPLIDAR's motor stops while DTR is raised."""
+    serial, node = Mock(), Path("/dev/ttyUSB0")
+    context = Mock(computer=Mock(machine=Mock(serial=serial)))
+    kind = Mock(opens="serial", probe_function=lambda: AsyncMock())
+    device = Mock(port=PortConfig(path=node, baud=9600, dtr=False, rts=False))
+    await module._probe(context, "lidar", device, kind, node)
+    serial.assert_called_once_with(node, 9600, dtr=False, rts=False)

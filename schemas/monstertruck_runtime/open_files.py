@@ -1,0 +1,43 @@
+"""Processes of this computer that have a file, device or socket open, by the kernel's tables."""
+
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+PROC: Final = Path("/proc")
+LONGEST: Final = 160
+"""Characters of a command line that are shown."""
+
+
+def holders(targets: Collection[str], proc: Path = PROC) -> Iterator[str]:
+    """Describe the processes that have one of ``targets`` open, by number and command line. Blocks for milliseconds.
+
+    Args:
+        targets: as links in ``/proc/PID/fd`` name them: ``/dev/ttyUSB0``, ``socket:[4711]``.
+        proc: the kernel's tables.
+
+    Yields:
+        For example ``process 4711 (monstertruckd run --config demo.yaml)``. Processes of other users are found only by
+        root.
+    """
+    wanted = frozenset(targets)
+    for folder in sorted(proc.glob("[0-9]*"), key=lambda folder: int(folder.name)):
+        if not wanted.isdisjoint(_open_files(folder)):
+            yield f"process {folder.name} ({_command_line(folder)})"
+
+
+def _open_files(folder: Path) -> Iterator[str]:
+    """What a process has open; nothing of one that belongs to another user, or has ended."""
+    with suppress(OSError):
+        for link in (folder / "fd").iterdir():
+            with suppress(OSError):  # closed meanwhile
+                yield str(link.readlink())
+
+
+def _command_line(folder: Path) -> str:
+    try:
+        words = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
+    except OSError:
+        return "ended"
+    return " ".join(words).strip()[:LONGEST]

@@ -1,0 +1,49 @@
+"""Ports of devices, as configured."""
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from monstertruck_drivers.cable import MemoryPort
+from monstertruck_drivers.config import PortConfig
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
+from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruckd.assembly import devices
+from monstertruckd.assembly.devices import Cabling
+from monstertruckd.bus.local import Bus
+from tests.unit.drivers.usb.rig import emulated_truck
+
+
+@pytest.mark.parametrize(
+    "place", [{"path": Path("/dev/ttyUSB0")}, {"hub": "1-1", "port": 1}], ids=["by path", "by hub and port"]
+)
+@pytest.mark.parametrize(("dtr", "rts"), [(False, True), (True, False)])
+def test_the_control_lines_of_a_port_are_those_of_its_settings(
+    place: dict[str, Any], dtr: bool, rts: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """An RPLIDAR's motor stops while DTR is raised."""
+    made: list[tuple[bool, bool]] = []
+
+    def serial(path: Path, baud: int, *, dtr: bool = True, rts: bool = True, low_latency: bool = False) -> Port:
+        made.append((dtr, rts))
+        cable = MemoryPort(str(path))
+        cable.plug()
+        return cable
+
+    monkeypatch.setattr(devices, "SerialPort", serial)
+    kind = UsbPortConfig if "hub" in place else PortConfig
+    lidar = SimpleNamespace(port=kind(**place, dtr=dtr, rts=rts))
+    config: Any = SimpleNamespace(devices=SimpleNamespace(present=lambda: {"lidar": lidar}), usb=UsbConfig())
+
+    async def opened(clock: VirtualClock) -> None:
+        usb, _ = emulated_truck(tmp_path)
+        machine = dataclasses.replace(usb.machine(clock), serial=serial)
+        computer: Any = SimpleNamespace(machine=machine, watch=lambda: usb.watcher)
+        (await Cabling(config, computer, Bus(clock), {}).port("lidar").open()).close()
+
+    run_virtual(opened)
+    assert made == [(dtr, rts)]
