@@ -1,13 +1,16 @@
-"""Stop every drive after any death of the daemon: quick stop, then power stage off.
+"""Stop every drive after any death of the daemon.
 
-    python3 neutral.py /dev/truck/drive[=NODE[@BAUD]] ...
+    python3 neutral.py /dev/truck/drive[=NODE[@BAUD]] /dev/truck/actuators=KIND:WORDS@BAUD ...
 
-One argument for each driven shaft, all stopped at once. NODE and BAUD must equal ``driver.node`` and ``port.baud`` of
-the configuration's drive; left out they are those of the controller as delivered. Needs nothing but Python's
-standard library and the codec installed with it. Exit code 0 once every controller has accepted both commands, 1 if
-one did not within five seconds, for whatever reason.
+One argument for each controller, all stopped at once. Without a KIND it is an EPOS: quick stop, then power stage off;
+NODE and BAUD must equal ``driver.node`` and ``port.baud`` of the configuration's drive; left out they are those of the
+controller as delivered. Of a VESC WORDS are ``AMPERES:ERPM:ID,...``: it is braked by that current until all motors are
+slower than ERPM; an empty ID is the controller that is connected. Of the steppers there are none: quick stop, then
+coils off. Needs nothing but Python's standard library and the codecs installed with it. Exit code 0 once every
+controller has stopped, 1 if one did not within five seconds, for whatever reason.
 """
 
+import contextlib
 import os
 import select
 import sys
@@ -15,12 +18,16 @@ import termios
 import threading
 import time
 import tty
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 HERE = Path(__file__).resolve()
 sys.path += [str(HERE.parents[1] / "drivers"), str(HERE.parents[2])]  # a checkout's, an installation's
 
 from monstertruck_drivers.epos.protocol import BAUD, Frame, FrameError, decode_body, stop_frames
+from monstertruck_drivers.steppers import protocol as steppers
+from monstertruck_drivers.vesc import protocol as vesc
 
 TIMEOUT = 5.0
 FRAME_TIMEOUT = 0.55
@@ -34,38 +41,52 @@ ANSWER = 0x00
 """Opcode of every answer."""
 
 
+AGAIN = 0.02
+"""Seconds between two looks at motors that still turn."""
+
+
 class NotStoppedError(Exception):
     """The controller stayed silent, answered something else, or refused."""
 
 
 def main(arguments: list[str]) -> int:
     """Entry point; returns the exit code."""
-    drives = [drive(argument) for argument in arguments]
+    jobs = [job(argument) for argument in arguments]
     stopped: list[str] = []
     # Daemons: the kernel may hold a port whose device takes no bytes for half a minute.
-    threads = [threading.Thread(target=insist, args=(*one, stopped), daemon=True) for one in drives]
+    threads = [threading.Thread(target=insist, args=(*one, stopped), daemon=True) for one in jobs]
     end = time.monotonic() + TIMEOUT + ATTEMPT
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(max(0.0, end - time.monotonic()))
-    return 0 if drives and len(stopped) == len(drives) else 1
+    return 0 if jobs and len(stopped) == len(jobs) else 1
+
+
+def job(argument: str) -> tuple[str, Callable[[], None]]:
+    """Port that an argument names, and what stops the controller there."""
+    port, _, rest = argument.partition("=")
+    kind, colon, rest = rest.partition(":")
+    if not colon:
+        return port, partial(stop, *drive(argument))
+    words, _, baud = rest.partition("@")
+    return port, partial({"vesc": stop_vesc, "steppers": stop_steppers}[kind], port, words, int(baud))
 
 
 def drive(argument: str) -> tuple[str, int, int]:
-    """Port, node and baud rate that an argument names."""
+    """Port, node and baud rate of an EPOS that an argument names."""
     port, _, rest = argument.partition("=")
     node, _, baud = rest.partition("@")
     return port, int(node or 1), int(baud or BAUD)
 
 
-def insist(port: str, node: int, baud: int, stopped: list[str]) -> None:
+def insist(port: str, work: Callable[[], None], stopped: list[str]) -> None:
     """Try until the controller has stopped or the time-out; adds the port to ``stopped``."""
     give_up = time.monotonic() + TIMEOUT
     while time.monotonic() < give_up:
         try:
-            stop(port, node, baud)
-        except (OSError, termios.error, FrameError, NotStoppedError) as error:
+            work()
+        except (OSError, termios.error, FrameError, steppers.LineError, NotStoppedError) as error:
             print(f"neutral: {port}: {error}", file=sys.stderr)
             time.sleep(FRAME_TIMEOUT)
         else:
@@ -74,13 +95,12 @@ def insist(port: str, node: int, baud: int, stopped: list[str]) -> None:
             return
 
 
-def stop(port: str, node: int, baud: int) -> None:
-    """Open the port and make both writes.
+@contextlib.contextmanager
+def opened(port: str, baud: int) -> Iterator[int]:
+    """Open a port, raw and empty.
 
     Raises:
         OSError: the port cannot be used.
-        NotStoppedError: the controller did not accept a command.
-        FrameError: an answer was damaged.
     """
     # An adapter that was plugged in again waits for a carrier, which no controller gives, before it opens.
     line = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -92,12 +112,87 @@ def stop(port: str, node: int, baud: int) -> None:
         termios.tcsetattr(line, termios.TCSANOW, settings)
         os.set_blocking(line, True)
         termios.tcflush(line, termios.TCIOFLUSH)
+        yield line
+    finally:
+        os.close(line)
+
+
+def stop(port: str, node: int, baud: int) -> None:
+    """Open the port of an EPOS and make both writes.
+
+    Raises:
+        OSError: the port cannot be used.
+        NotStoppedError: the controller did not accept a command.
+        FrameError: an answer was damaged.
+    """
+    with opened(port, baud) as line:
         brake, switch_off = stop_frames(node)
         exchange(line, brake)
         time.sleep(BRAKING)  # a motor without power only coasts
         exchange(line, switch_off)
-    finally:
-        os.close(line)
+
+
+def stop_vesc(port: str, words: str, baud: int) -> None:
+    """Brake every motor until all are slow; the current stays on, and so does the brake of the controllers' watchdog.
+
+    Raises:
+        OSError: the port cannot be used.
+        NotStoppedError: a controller is silent, or its motor still turns.
+    """
+    amperes, rest, ids = words.split(":")
+    motors = [int(one) if one else None for one in ids.split(",")]
+    end = time.monotonic() + BRAKING
+    with opened(port, baud) as line:
+        while True:
+            for motor in motors:
+                os.write(line, vesc.frame(vesc.forwarded(motor, vesc.set_brake(float(amperes)))))
+            fastest = max(abs(speed_of(line, motor)) for motor in motors)
+            if fastest <= float(rest):
+                return
+            if time.monotonic() > end:
+                raise NotStoppedError(f"a motor still turns at {fastest} electrical rpm")
+            time.sleep(AGAIN)
+
+
+def speed_of(line: int, motor: int | None) -> int:
+    """Electrical speed of a VESC's motor, rpm."""
+    os.write(line, vesc.frame(vesc.forwarded(motor, vesc.request(vesc.PacketId.GET_VALUES))))
+    deframer = vesc.Deframer()
+    while True:
+        for payload in deframer.feed(some(line)):
+            try:
+                values = vesc.MotorValues.of(payload)
+            except vesc.PacketError:
+                continue
+            if motor in (None, values.controller_id):
+                return values.erpm
+
+
+def stop_steppers(port: str, words: str, baud: int) -> None:
+    """Quick stop until all motors stand, then coils off.
+
+    Raises:
+        OSError: the port cannot be used.
+        NotStoppedError: the controller is silent, or a motor still turns.
+    """
+    del words
+    end = time.monotonic() + BRAKING
+    with opened(port, baud) as line:
+        while any(rates := step_rates(line, "Q")):
+            if time.monotonic() > end:
+                raise NotStoppedError(f"motors still turn at {rates} steps/s")
+            time.sleep(AGAIN)
+        step_rates(line, "D")
+
+
+def step_rates(line: int, verb: str) -> list[float]:
+    """Send a request to the steppers; returns the rates of its answer, steps/s."""
+    os.write(line, bytes(steppers.Line(verb, 0)))
+    splitter = steppers.Splitter()
+    while True:
+        for answer in splitter.feed(some(line)):
+            if answer.verb == "s":
+                return [rate / 1000 for rate in steppers.Status.of(answer, len(answer.words[3:]) // 2).rates]
 
 
 def exchange(line: int, frame: Frame) -> None:
@@ -133,6 +228,16 @@ def receive(line: int, count: int) -> bytes:
         if not part:  # hung up: such a port is always readable, and never gives a byte
             raise NotStoppedError("the port is gone")
         data += part
+    return data
+
+
+def some(line: int) -> bytes:
+    """Read what comes next."""
+    if not select.select([line], [], [], 0.25)[0]:
+        raise NotStoppedError("no answer")
+    data = os.read(line, 4096)
+    if not data:
+        raise NotStoppedError("the port is gone")
     return data
 
 

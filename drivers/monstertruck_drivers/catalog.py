@@ -16,6 +16,7 @@ from monstertruck_drivers.emulation import EmulatorFactory
 from monstertruck_drivers.epos.protocol import BAUD as EPOS_BAUD
 from monstertruck_drivers.os4000.protocol import FACTORY_BAUD as OS4000_BAUD
 from monstertruck_drivers.steppers.protocol import BAUD as STEPPERS_BAUD
+from monstertruck_drivers.vesc.protocol import BAUD as VESC_BAUD
 from monstertruck_drivers.wt61.protocol import BAUD as WT61_BAUD
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.plugins import Catalog, Plugin, load
@@ -106,6 +107,15 @@ WHEELS: Final = RoleSpec(
     start=4,
     shafts=tuple(range(len(SHAFTS))),
 )
+ACTUATORS: Final = RoleSpec(
+    name=DeviceRole.ACTUATORS.value,
+    duty=Duty.ACTUATOR,
+    doc="One controller of all driven shafts that may steer and measure the battery as well, instead of one for each",
+    writes={**_by_shaft("out", DRIVES), "steering": topics.STEERING, "battery": topics.BATTERY},
+    reads={**_by_shaft("commands", CMD_DRIVES), "steering_commands": topics.CMD_STEERING, "drive": topics.DRIVE},
+    start=4,
+    shafts=tuple(range(len(SHAFTS))),
+)
 STEERING: Final = RoleSpec(
     name=DeviceRole.STEERING.value,
     duty=Duty.ACTUATOR,
@@ -185,6 +195,7 @@ OUR_ROLES: Final = (
     DRIVE_3,
     DRIVE_4,
     WHEELS,
+    ACTUATORS,
     STEERING,
     COMPASS,
     STABILISER,
@@ -243,7 +254,7 @@ class DeviceKind(Plugin):
         return cast("Probe", load(self.probe))
 
 
-RESERVED: Final = frozenset({*map(str, ServiceName), "at_present", "present", "shafts"})
+RESERVED: Final = frozenset({*map(str, ServiceName), "at_present", "controller", "present", "shafts", "steers"})
 """Names that no role of another distribution may have: of the services that are no device, and of what a section of the
 configuration has besides its roles (a test compares)."""
 
@@ -332,6 +343,17 @@ DEVICES: Final = DeviceCatalog(
         probe="monstertruck_drivers.steppers.probe:probe",
         baud=STEPPERS_BAUD,
         usb=UsbIdentity("1a86:7523", "USB Serial", "ttyUSB"),
+    ),
+    DeviceKind(
+        name="vesc",
+        doc="VESC motor controllers, with servo output and battery reading",
+        roles=(ACTUATORS,),
+        settings="monstertruck_drivers.vesc.config:VescConfig",
+        implementation="monstertruck_drivers.vesc.driver:VescDriver",
+        emulator="monstertruck_drivers.vesc.emulator:emulated",
+        probe="monstertruck_drivers.vesc.probe:probe",
+        baud=VESC_BAUD,
+        usb=UsbIdentity("0483:5740", "ChibiOS/RT Virtual COM Port", "ttyACM"),
     ),
     DeviceKind(
         name="maestro",

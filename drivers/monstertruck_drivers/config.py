@@ -14,6 +14,7 @@ from pydantic import Discriminator, Field, Tag, create_model, model_validator
 from monstertruck_drivers.catalog import DEVICES, DeviceKind, Duty, RoleSpec
 from monstertruck_drivers.computer import Sysfs
 from monstertruck_drivers.link import BAUD
+from monstertruck_drivers.shafts import SteeringOutputs, steering_outputs
 from monstertruck_drivers.usb.config import Baud, UsbPortConfig
 from monstertruck_drivers.usb.tree import place
 from monstertruck_runtime.service import RestartPolicy
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from monstertruck_drivers.maestro.config import MaestroConfig
     from monstertruck_drivers.srf08.config import Srf08Config
     from monstertruck_drivers.steppers.config import StepperConfig
+    from monstertruck_drivers.vesc.config import VescConfig
 
 C = TypeVar("C", bound=Schema)
 
@@ -103,6 +105,26 @@ class _Devices(Schema):
     def shafts(self) -> dict[str, Device[Any]]:
         """The controllers of the driven shafts, by shaft; one may be there for several."""
         return {SHAFTS[i]: device for role, device in self.present().items() for i in _served(role, device)}
+
+    def controller(self) -> str | None:
+        """Role of the device that controls the first driven shaft; None if there is none."""
+        return next((role for role, device in self.present().items() if 0 in _served(role, device)), None)
+
+    def steers(self) -> tuple[str, SteeringOutputs] | None:
+        """Role of the device that steers, with what its servos do; None if nothing steers."""
+        return next(self._steering(), None)
+
+    def _steering(self) -> Iterator[tuple[str, SteeringOutputs]]:
+        for role, device in self.present().items():
+            if (outputs := steering_outputs(device.driver)) is not None:
+                yield role, outputs
+
+    @model_validator(mode="after")
+    def _one_steers(self) -> Self:
+        roles = [role for role, _ in self._steering()]
+        if len(roles) > 1:
+            raise ValueError(f"{roles[0]} and {roles[1]} both steer; one of them must leave its servos out")
+        return self
 
     @model_validator(mode="after")
     def _one_port_each(self) -> Self:
@@ -184,6 +206,7 @@ if TYPE_CHECKING:
         imu: Device[Schema] | None = None
         encoders: Device[Schema] | None = None
         wheels: Device[StepperConfig] | None = None
+        actuators: Device[VescConfig] | None = None
 
     class Monitors(_Monitors):
         """By name only what the robot's own code asks for."""

@@ -27,6 +27,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
+from monstertruckd.config.device_safety import packs
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate.samples import STALE_TOPICS
 
@@ -153,17 +154,14 @@ def sensor_services(config: TruckConfig) -> dict[str, Reason]:
     return {
         role: STALE_TOPICS[topic]
         for role in config.devices.present()
-        for topic in DEVICES.roles[role].writes.values()
+        for topic in reversed([*DEVICES.roles[role].writes.values()])  # of several, its own topic's
         if topic in STALE_TOPICS
     }
 
 
 def measures_battery(config: TruckConfig) -> bool:
     """Whether anything is configured to measure the battery."""
-    steering = config.devices.steering
-    return config.monitors.battery is not None or (
-        steering is not None and getattr(steering.driver, "battery", None) is not None
-    )
+    return config.monitors.battery is not None or any(packs(config.devices, config.monitors))
 
 
 def of_duty(drivers: Mapping[str, Service], *duties: Duty) -> dict[str, Service]:

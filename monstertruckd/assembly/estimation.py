@@ -170,7 +170,7 @@ def _build_consistency(
         inertial=None if axes is None else Inertial(GyroConfig(), axes),
         out=bus.publisher(topics.CONSISTENCY, Writer.ESTIMATION),
         events=bus.event_sink(),
-        wheels=DeviceRole.DRIVE if devices.wheels is None else DeviceRole.WHEELS,
+        wheels=devices.controller() or DeviceRole.DRIVE,
     )
 
 

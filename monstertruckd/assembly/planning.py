@@ -160,10 +160,10 @@ def _build_tracker(
 
 def with_response(tracker: TrackerConfig, devices: Devices) -> TrackerConfig:
     """The tracker's settings; dead time and lag are those of the servos unless it has its own."""
-    servos = devices.steering
-    if servos is None or tracker.dead_time is not None or tracker.lag is not None:
+    steering = devices.steers()
+    if steering is None or tracker.dead_time is not None or tracker.lag is not None:
         return tracker
-    return tracker.model_copy(update={"dead_time": servos.driver.dead_time, "lag": servos.driver.lag})
+    return tracker.model_copy(update={"dead_time": steering[1].dead_time, "lag": steering[1].lag})
 
 
 START_TIMEOUT: Final = 180.0

@@ -5,15 +5,16 @@ As in ``monstertruckd.gate.config`` for the gate's own.
 
 import math
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Final
 
 from monstertruck_drivers.battery.config import PackConfig
-from monstertruck_drivers.config import Device, Devices, Monitors
+from monstertruck_drivers.config import Devices, Monitors
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.steppers.config import StepperConfig
+from monstertruck_drivers.vesc.config import VescConfig
 from monstertruck_schemas.base import Schema
 from monstertruckd.gate.config import BodyLimits, weaker
 
@@ -28,6 +29,14 @@ WEAKER_ABOVE: Final[dict[type[Schema], tuple[str, ...]]] = {
         "fault_resets",
     ),
     StepperConfig: ("max_rate", "answer_timeout", "command_timeout", "quick_stop_after", "watchdog"),
+    VescConfig: (
+        "max_motor_rpm",
+        "min_motor_rpm",
+        "standstill_rpm",
+        "answer_timeout",
+        "command_timeout",
+        "watchdog",
+    ),
     MaestroConfig: ("answer_timeout", "command_timeout"),
     HokuyoConfig: ("skip",),
     Os4000Config: ("delay", "field_tolerance", "gravity_tolerance"),
@@ -53,6 +62,7 @@ WEAKER_BELOW: Final[dict[type[Schema], tuple[str, ...]]] = {
         "fault_reset_pause",
     ),
     StepperConfig: ("acceleration", "quick_deceleration", "rate"),
+    VescConfig: ("deceleration_rpm_s", "quick_stop_deceleration_rpm_s", "brake_current", "rate", "battery_rate"),
     MaestroConfig: ("poll_rate", "battery_rate"),
     HokuyoConfig: (),
     Os4000Config: (),
@@ -63,6 +73,7 @@ WEAKER_BELOW: Final[dict[type[Schema], tuple[str, ...]]] = {
 UNATTENDED: Final[dict[type[Schema], tuple[str, ...]]] = {
     EposConfig: ("command_timeout", "quick_stop_after", "status_period"),
     StepperConfig: ("command_timeout", "quick_stop_after", "watchdog"),
+    VescConfig: ("command_timeout", "watchdog"),
     MaestroConfig: ("command_timeout",),
 }
 """Times in which the truck drives on whatever happens."""
@@ -124,7 +135,7 @@ def weakened_devices(devices: Devices, monitors: Monitors) -> Iterator[str]:
         if isinstance(driver, MaestroConfig):
             if driver.deadman_feed == "always":
                 yield f"{place}.deadman_feed always: the deadman line guards against a dead process only"
-            if driver.battery is None and monitors.battery is None:
+            if not any(packs(devices, monitors)):
                 yield f"{place}.battery null: an empty battery is not noticed"
     for place, pack in packs(devices, monitors):
         yield from _weaker(place, pack, _usual_pack(pack))
@@ -144,12 +155,12 @@ def _usual_pack(pack: PackConfig) -> PackConfig:
 
 def packs(devices: Devices, monitors: Monitors) -> Iterator[tuple[str, PackConfig]]:
     """Whatever measures the battery, with its place in the configuration."""
-    steering: Device[Any] | None = devices.steering
-    battery = None if steering is None else getattr(steering.driver, "battery", None)
-    if isinstance(battery, PackConfig):
-        yield "devices.steering.driver.battery", battery
     if isinstance(monitors.battery, PackConfig):
         yield "monitors.battery", monitors.battery
+    for role, device in devices.present().items():
+        battery = getattr(device.driver, "battery", None)
+        if isinstance(battery, PackConfig):
+            yield f"devices.{role}.driver.battery", battery
 
 
 def _beyond_cells(place: str, pack: PackConfig) -> Iterator[str]:

@@ -9,8 +9,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from monstertruck_drivers.config import Devices, Monitors
-from monstertruck_drivers.maestro.config import MaestroConfig
-from monstertruck_drivers.shafts import MotorLimits, motor_limits
+from monstertruck_drivers.shafts import MotorLimits, SteeringOutputs, motor_limits
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_estimation.catalog import AnyOdometry
 from monstertruck_estimation.consistency.config import ConsistencyConfig
@@ -37,7 +36,7 @@ from monstertruck_schemas.base import Name, Schema
 from monstertruck_schemas.body import Metres, TruckBody
 from monstertruck_schemas.roles import SHAFTS, DeviceRole
 from monstertruckd.bus.zenoh_config import PeerConfig, ZenohConfig
-from monstertruckd.config.device_safety import beyond_devices, unattended_times, weakened_devices
+from monstertruckd.config.device_safety import beyond_devices, packs, unattended_times, weakened_devices
 from monstertruckd.gate.catalog import AnyCheck
 from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, impossible_settings, weakened, weaker
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
@@ -188,13 +187,12 @@ class TruckConfig(Schema):
         Raises:
             KinematicsError: dimensions no robot can have.
         """
-        geometry, steering = self.geometry, self.devices.steering
+        geometry, steering = self.geometry, self.devices.steers()
         dimensions = Dimensions(
             DriveTrain(geometry.drive_ratio, geometry.wheel_radius), geometry.wheelbase, geometry.track
         )
-        if steering is not None and isinstance(steering.driver, MaestroConfig):
-            ranges = steering.driver.front.reach, steering.driver.rear.reach
-            dimensions = replace(dimensions, servo_ranges=ranges)
+        if steering is not None:
+            dimensions = replace(dimensions, servo_ranges=steering[1].axles)
         chassis: Chassis = build_chassis(self.body, dimensions)
         return chassis
 
@@ -249,7 +247,9 @@ class TruckConfig(Schema):
         """What the body needs to drive and steer, if some of it is not there."""
         chassis = self.chassis()
         needed = (*SHAFTS[: len(chassis.shafts)], *((DeviceRole.STEERING,) if chassis.steered else ()))
-        if set(needed) <= self.devices.present().keys() | self.devices.shafts().keys():
+        steering = self.devices.steers()
+        there = {DeviceRole.STEERING} if steering is not None else set()
+        if set(needed) <= there | self.devices.present().keys() | self.devices.shafts().keys():
             return None
         return f"the devices {', '.join(needed[:-1])} and {needed[-1]}"
 
@@ -277,11 +277,9 @@ class TruckConfig(Schema):
             raise ValueError("slam needs the device lidar")
         if self.slam is not None and self.slam.mode == "localisation" and self.slam.map is None:
             raise ValueError("slam.mode localisation needs slam.map, the folder of a saved map")
-        steering = self.devices.steering
-        if self.monitors.battery is not None and steering is not None and steering.driver.battery is not None:
-            raise ValueError(
-                "monitors.battery and devices.steering.driver.battery both measure the battery; set the other one null"
-            )
+        measuring = [place for place, _ in packs(self.devices, self.monitors)]
+        if len(measuring) > 1:
+            raise ValueError(f"{' and '.join(measuring)} both measure the battery; set the other one null")
         return self
 
     def _check_actuators(self) -> None:
@@ -294,9 +292,8 @@ class TruckConfig(Schema):
             raise ValueError(f"devices.encoders: expected of body tricycle, body is {self.body.kind}")
         if isinstance(self.odometry, RearWheelConfig) and self.devices.encoders is None:
             raise ValueError("odometry.kind encoders needs the device encoders")
-        steering = self.devices.steering
-        if steering is not None:
-            self._check_servos(steering.driver, chassis)
+        if (steering := self.devices.steers()) is not None:
+            self._check_servos(*steering, chassis)
         if self.tracker is not None:
             if lack := self.missing_actuators():
                 raise ValueError(f"a tracker needs {lack}")
@@ -308,20 +305,19 @@ class TruckConfig(Schema):
             if (limits := motor_limits(device.driver)) is not None:
                 self._check_braking(role, limits)
 
-    def _check_servos(self, driver: MaestroConfig, chassis: Chassis) -> None:
-        wanted = len(chassis.straight)
-        if len(driver.servos) != wanted:
+    def _check_servos(self, role: str, outputs: SteeringOutputs, chassis: Chassis) -> None:
+        wanted, reaches = len(chassis.straight), outputs.reaches
+        if len(reaches) != wanted:
             has = f"has {wanted} servos" if chassis.steered else "steers nothing"
             raise ValueError(
-                f"body {self.body.kind} {has}: expected front_right and rear_right of devices.steering"
-                f" {'given' if wanted > len(driver.servos) else 'null'}"
+                f"body {self.body.kind} {has}: expected front_right and rear_right of devices.{role}"
+                f" {'given' if wanted > len(reaches) else 'null'}"
             )
-        if (
-            wanted > len(AXLES)
-            and (reach := min(abs(end) for servo in driver.servos for end in servo.reach)) < WHEEL_REACH - 1e-3
-        ):
+        if (0.0, 0.0) in reaches and chassis.freedom != "front":
+            raise ValueError(f"body {self.body.kind} steers more than its front axle: devices.{role} has one servo")
+        if wanted > len(AXLES) and (reach := min(abs(end) for ends in reaches for end in ends)) < WHEEL_REACH - 1e-3:
             raise ValueError(
-                f"devices.steering: pulses reach {math.degrees(reach):.0f} degrees to one side: expected "
+                f"devices.{role}: pulses reach {math.degrees(reach):.0f} degrees to one side: expected "
                 f"{math.degrees(WHEEL_REACH):.0f} of wheels that are steered one by one"
             )
 

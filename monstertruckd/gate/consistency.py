@@ -112,6 +112,7 @@ class ConsistencyCheck(Check):
             DeviceRole.COMPASS.value: config.attitude,
             DeviceRole.DRIVE.value: config.drive,
             DeviceRole.WHEELS.value: config.drive,
+            DeviceRole.ACTUATORS.value: config.drive,
             DeviceRole.BATTERY.value: config.battery,
         }
         return sensor in limits and limits[sensor].critical

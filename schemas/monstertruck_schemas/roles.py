@@ -16,6 +16,7 @@ class DeviceRole(StrEnum):
     DRIVE_3 = "drive_3"
     DRIVE_4 = "drive_4"
     WHEELS = "wheels"
+    ACTUATORS = "actuators"
     STEERING = "steering"
     COMPASS = "compass"
     STABILISER = "stabiliser"
@@ -29,7 +30,8 @@ class DeviceRole(StrEnum):
 
 
 SHAFTS: Final = (DeviceRole.DRIVE, DeviceRole.DRIVE_2, DeviceRole.DRIVE_3, DeviceRole.DRIVE_4)
-"""Driven shafts in the order of the body's; each has a controller of this role, or ``WHEELS`` controls them all."""
+"""Driven shafts in the order of the body's; each has a controller of this role, or ``WHEELS`` or
+``ACTUATORS`` controls them all."""
 
 
 class ServiceName(StrEnum):

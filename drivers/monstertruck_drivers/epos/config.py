@@ -61,3 +61,8 @@ class EposConfig(Schema):
         return MotorLimits(
             self.max_motor_rpm * rpm, self.deceleration_rpm_s * rpm, self.quick_stop_deceleration_rpm_s * rpm
         )
+
+    @property
+    def stop_words(self) -> str:
+        """Node id, for the stop script."""
+        return str(self.node)

@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 
 from monstertruck_drivers.battery.config import PackConfig
 from monstertruck_drivers.maestro.protocol import ADC_MAX, CHANNELS
+from monstertruck_drivers.shafts import SteeringOutputs
 from monstertruck_schemas.base import Schema
 
 Channel = Annotated[int, Field(ge=0, lt=CHANNELS)]
@@ -123,6 +124,11 @@ class MaestroConfig(Schema):
         if self.front_right is None or self.rear_right is None:
             return self.front, self.rear
         return self.front, self.front_right, self.rear, self.rear_right
+
+    @property
+    def steering_outputs(self) -> SteeringOutputs:
+        """What its servos do."""
+        return SteeringOutputs(tuple(servo.reach for servo in self.servos), self.dead_time, self.lag)
 
     @model_validator(mode="after")
     def _channels_differ(self) -> Self:

@@ -60,6 +60,11 @@ class StepperConfig(Schema):
             self.max_rate * self.turn, self.acceleration * self.turn, self.quick_deceleration * self.turn
         )
 
+    @property
+    def stop_words(self) -> str:
+        """Nothing: the stop script needs the port alone."""
+        return ""
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if len(self.inverted) < self.motors:

@@ -69,7 +69,7 @@ ROOM: Final = np.linspace(0.0, 0.5, 26)
 """Ways ahead of which the ground is looked at, m."""
 REVERSES_BELOW: Final = 0.05
 """True speed, m/s, from which on a motor may not be asked to turn the other way."""
-MOTORS: Final = (*SHAFTS, DeviceRole.WHEELS)
+MOTORS: Final = (*SHAFTS, DeviceRole.WHEELS, DeviceRole.ACTUATORS)
 """Roles of motor controllers."""
 WIRES: Final = (*MOTORS, DeviceRole.STEERING, DeviceRole.LIDAR, DeviceRole.COMPASS)
 EPOS: Final = "epos"
@@ -251,7 +251,7 @@ def _motor_wires(
             wires.append(
                 _EposWire(taps[role], shaft, rpm) if known else _ObeyedOrders(taps[role], world, [shaft], rpm, clock)
             )
-        elif role == DeviceRole.WHEELS:
+        elif role in (DeviceRole.WHEELS, DeviceRole.ACTUATORS):
             shafts = range(len(truck.chassis().shafts))
             known = device.driver.kind == "steppers"
             wires.append(

@@ -5,10 +5,10 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
-from monstertruck_drivers.config import AnyPort
-from monstertruck_drivers.epos.config import EposConfig
+from monstertruck_drivers.config import AnyPort, Device
+from monstertruck_drivers.shafts import stop_words
 from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
 from monstertruck_drivers.usb.tree import is_topology, place, port_directory
 from monstertruck_runtime.errors import InputError, NotFoundError
@@ -116,12 +116,18 @@ def node_of(role: str, port: AnyPort) -> Path:
 
 def _stop(config: TruckConfig, program: Program) -> str:
     drives = [
-        f"{_plain(node_of(role, device.port), without='=')}={device.driver.node}@{device.port.baud}"
-        for role, device in config.devices.shafts().items()
-        if isinstance(device.driver, EposConfig)  # a controller of steppers stops by its own watchdog
+        f"{_plain(node_of(role, device.port), without='=')}={_stop_words(device, words)}@{device.port.baud}"
+        for role, device in config.devices.present().items()
+        if (words := stop_words(device.driver)) is not None
     ]
     # Without site: the script must run even when the environment's packages do not load.
     return f"ExecStopPost={_plain(program.python)} -I -S {_plain(program.neutral)} {' '.join(drives)}" if drives else ""
+
+
+def _stop_words(device: Device[Any], words: str) -> str:
+    """Return the words for the stop script, which takes an EPOS for granted."""
+    kind = device.kind.name
+    return words if kind == "epos" else f"{kind}:{words}"
 
 
 def temporary(program: Program) -> str | None:

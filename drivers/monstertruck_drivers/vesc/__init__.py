@@ -1,0 +1,1 @@
+"""VESC motor controller."""

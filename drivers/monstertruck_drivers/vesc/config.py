@@ -1,0 +1,141 @@
+"""What a configuration file may say about VESCs: the motors on one port, the servo output, the battery."""
+
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from monstertruck_drivers.battery.config import PackConfig
+from monstertruck_drivers.shafts import MotorLimits, SteeringOutputs
+from monstertruck_schemas.base import Schema
+
+MOTORS = 4
+Seconds = Annotated[float, Field(gt=0)]
+Position = Annotated[float, Field(ge=0, le=1)]
+RAD_S_PER_RPM = 2 * math.pi / 60
+
+
+class VescMotorConfig(Schema):
+    """One controller: the one that is connected, or one behind it on its CAN bus."""
+
+    can_id: Annotated[int, Field(ge=0, le=254)] | None = None
+    """Its CAN id; null = the connected one"""
+    inverted: bool = False
+    """Driving forward takes negative speeds"""
+
+
+class VescServoConfig(Schema):
+    """Servo output: ``position = centre + direction * per_radian * servo angle``, 0 to 1 of its range of pulses."""
+
+    centre: Position = 0.5
+    """Position that steers straight ahead"""
+    per_radian: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """Change of the position for each radian of servo angle"""
+    direction: Literal[-1, 1] = -1
+    """+1 where a greater position steers left, -1 where it steers right"""
+    min: Position = 0.15
+    max: Position = 0.85
+    dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
+    """From a steering command to the first movement of the wheels, s; null = not measured"""
+    lag: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Time constant with which the wheels then turn, s; null = not measured"""
+
+    @model_validator(mode="after")
+    def _centre_within_limits(self) -> Self:
+        if not self.min < self.centre < self.max:
+            raise ValueError(f"min {self.min} < centre {self.centre} < max {self.max} does not hold")
+        return self
+
+    def position(self, angle: float) -> float:
+        """Position for a servo angle, rad, left positive, held within the limits."""
+        return min(max(self.centre + self.direction * self.per_radian * angle, self.min), self.max)
+
+    def angle(self, position: float) -> float:
+        """Servo angle, rad, left positive, of a position."""
+        return (position - self.centre) * self.direction / self.per_radian
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Servo angles, rad, to the right (negative) and to the left."""
+        right, left = sorted(map(self.angle, (self.min, self.max)))
+        return right, left
+
+
+class VescConfig(Schema):
+    """VESC motor controllers on one port; motor i turns the body's shaft i.
+
+    The defaults fit a 1:10 car with a sensored motor: with a gear of 10 and wheels of 5 cm, 6000 rpm are 3.1 m/s and
+    12000 rpm/s are 6.3 m/s^2.
+    """
+
+    kind: Literal["vesc"] = "vesc"
+    motors: Annotated[tuple[VescMotorConfig, ...], Field(strict=False, min_length=1, max_length=MOTORS)] = (
+        VescMotorConfig(),
+    )
+    pole_pairs: Annotated[int, Field(ge=1, le=50)] = 2
+    """Electrical turns in one turn of the motor"""
+    max_motor_rpm: Annotated[int, Field(gt=0, le=100_000)] = 6000
+    """Requests are limited to this"""
+    min_motor_rpm: Annotated[float, Field(ge=0, le=10_000)] = 0.0
+    """Slower set-points brake instead: below its `s_pid_min_erpm` the controller gives no torque; that setting divided
+    by pole_pairs"""
+    deceleration_rpm_s: Annotated[float, Field(gt=0)] = 12_000.0
+    """Deceleration by a lower set-point, as measured, rpm/s; set by the controller's own ramp and current limits"""
+    quick_stop_deceleration_rpm_s: Annotated[float, Field(gt=0)] = 15_000.0
+    """Deceleration by brake_current, as measured, rpm/s"""
+    brake_current: Annotated[float, Field(gt=0, le=200)] = 20.0
+    """Current of the quick stop and of the controller's watchdog, A"""
+    standstill_rpm: Annotated[float, Field(gt=0, le=10_000)] = 60.0
+    """Slower than this counts as at rest"""
+    servo: VescServoConfig | None = None
+    """Servo output, which steers the front axle; null = another device steers, or nothing does"""
+    battery: PackConfig | None = None
+    """Pack that supplies the first controller, by its own reading; null = not measured here"""
+    battery_rate: Annotated[float, Field(gt=0, le=50)] = 10.0
+    """Battery readings per second"""
+    rate: Annotated[float, Field(ge=10, le=100)] = 40.0
+    """Exchanges per second with every controller; at 115200 baud one takes 9 ms"""
+    answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.03
+    """Seconds in which an answer must come"""
+    command_timeout: Seconds = 0.25
+    """Age of the newest command at which the motors brake"""
+    watchdog: Annotated[float, Field(ge=0.05, le=1.0)] = 0.1
+    """Seconds without a set-point after which the controller itself brakes; written to it at every start"""
+
+    @property
+    def shafts(self) -> int:
+        """How many driven shafts it serves."""
+        return len(self.motors)
+
+    @property
+    def motor_limits(self) -> MotorLimits:
+        """What a motor does."""
+        return MotorLimits(
+            self.max_motor_rpm * RAD_S_PER_RPM,
+            self.deceleration_rpm_s * RAD_S_PER_RPM,
+            self.quick_stop_deceleration_rpm_s * RAD_S_PER_RPM,
+        )
+
+    @property
+    def steering_outputs(self) -> SteeringOutputs | None:
+        """Servo of the front axle; the rear one is fixed."""
+        if self.servo is None:
+            return None
+        return SteeringOutputs((self.servo.reach, (0.0, 0.0)), self.servo.dead_time, self.servo.lag)
+
+    @property
+    def stop_words(self) -> str:
+        """Brake current, A, electrical speed of standstill, rpm, and CAN ids, for the stop script."""
+        ids = ",".join("" if motor.can_id is None else str(motor.can_id) for motor in self.motors)
+        return f"{self.brake_current:g}:{self.standstill_rpm * self.pole_pairs:g}:{ids}"
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        ids = [motor.can_id for motor in self.motors]
+        if len(set(ids)) < len(ids):
+            raise ValueError(f"motors: every can_id may be there once, got {ids}")
+        if self.watchdog <= 2.0 / self.rate:
+            raise ValueError(f"watchdog {self.watchdog:g} s: expected more than two exchanges, {2.0 / self.rate:g} s")
+        if self.min_motor_rpm >= self.max_motor_rpm:
+            raise ValueError(f"min_motor_rpm {self.min_motor_rpm:g}: expected less than {self.max_motor_rpm}")
+        return self

@@ -1,0 +1,306 @@
+"""Driver of VESCs on one port: ``cmd/drive*`` and ``cmd/steering`` in; feedback of motors, servo and battery out.
+
+One exchange a cycle with every controller: its set-point goes out, its values come back. A quick stop is a brake
+current, sent again in every cycle; a disabled motor coasts. All motors have one state together: the most careful of
+their commands counts, and the oldest.
+
+Every set-point feeds the controller's watchdog, which is set at the start of a session and brakes when the host is
+silent. The first packets of a session brake, and so do the last ones until the motors rest; then they coast.
+"""
+
+import contextlib
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from monstertruck_drivers.battery.monitor import BatteryMonitor
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.transaction import Misses
+from monstertruck_drivers.vesc.config import RAD_S_PER_RPM, VescConfig
+from monstertruck_drivers.vesc.protocol import (
+    TICKS_PER_ELECTRICAL_TURN,
+    MotorValues,
+    WatchdogSetting,
+    fault_text,
+    set_brake,
+    set_current,
+    set_rpm,
+    set_servo,
+    step,
+)
+from monstertruck_drivers.vesc.session import ATTEMPTS, VescSession
+from monstertruck_runtime.clock import POLLING, SECOND, Clock, Schedule
+from monstertruck_runtime.errors import DeviceError, DeviceLostError, DeviceRestartedError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_schemas.cmd import DriveAction, DriveCommand, SteeringCommand
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import Battery, DriveFeedback, DriveMode, SteeringFeedback
+
+SAFE_DEADLINE: Final = 0.4
+"""Seconds a session may take at its end to stop the motors."""
+FULL_TURN: Final = 6.283185307179586
+
+
+class VescSetpoint(NamedTuple):
+    """What the motors shall do."""
+
+    mode: DriveMode
+    """DISABLED, QUICK_STOP or ENABLED."""
+    rpm: tuple[float, ...] = ()
+    """Of ENABLED: motor speeds, forward positive."""
+
+
+def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: VescConfig) -> VescSetpoint:
+    """Return what the newest commands of all shafts mean together; stale ones brake.
+
+    Args:
+        commands: newest one of every shaft, if any.
+        now: time, ns.
+        config: limits and time-outs.
+    """
+    known = [command for command in commands if command is not None]
+    if len(known) < len(commands) or any(command.action is DriveAction.DISABLE for command in known):
+        return VescSetpoint(DriveMode.DISABLED)
+    stale = any(now - command.stamp > config.command_timeout * SECOND for command in known)
+    if stale or any(command.action is DriveAction.QUICK_STOP for command in known):
+        return VescSetpoint(DriveMode.QUICK_STOP)
+    limit = config.max_motor_rpm
+    wanted = (command.motor_velocity / RAD_S_PER_RPM for command in known)
+    return VescSetpoint(DriveMode.ENABLED, tuple(min(max(rpm, -limit), limit) for rpm in wanted))
+
+
+def payload_of(setpoint: VescSetpoint, i: int, config: VescConfig) -> bytes:
+    """Return the payload for motor ``i``."""
+    if setpoint.mode is DriveMode.DISABLED:
+        return set_current(0.0)
+    rpm = setpoint.rpm[i] if setpoint.rpm else 0.0
+    if rpm == 0.0 or abs(rpm) < config.min_motor_rpm:
+        return set_brake(config.brake_current)
+    return set_rpm(round(rpm * config.pole_pairs) * (-1 if config.motors[i].inverted else 1))
+
+
+class VescDriver:
+    """Service of all motors on one port, with the servo output and the battery's voltage.
+
+    Args:
+        config: see ``VescConfig``.
+        port: where the first controller hangs.
+        clock: time.
+        commands: ``cmd/drive`` of the first shaft; those of the others follow.
+        commands_2: of the second.
+        commands_3: of the third.
+        commands_4: of the fourth.
+        steering_commands: ``cmd/steering``.
+        drive: feedback of the first motor, whose current explains the battery's sag.
+        out: ``sensor/drive`` of the first shaft, ``stamp`` in the middle of the exchange.
+        out_2: of the second.
+        out_3: of the third.
+        out_4: of the fourth.
+        steering: position that was sent to the servo, as an angle; None when another device steers.
+        battery: pack voltage; None when the battery is measured elsewhere.
+        events: identity, restarts, faults.
+        name: of the service.
+    """
+
+    def __init__(
+        self,
+        config: VescConfig,
+        port: Port,
+        clock: Clock,
+        *,
+        commands: Subscription[DriveCommand],
+        commands_2: Subscription[DriveCommand],
+        commands_3: Subscription[DriveCommand],
+        commands_4: Subscription[DriveCommand],
+        steering_commands: Subscription[SteeringCommand],
+        drive: Subscription[DriveFeedback],
+        out: Publisher[DriveFeedback],
+        out_2: Publisher[DriveFeedback],
+        out_3: Publisher[DriveFeedback],
+        out_4: Publisher[DriveFeedback],
+        steering: Publisher[SteeringFeedback] | None,
+        battery: Publisher[Battery] | None,
+        events: EventSink,
+        name: str = "actuators",
+    ) -> None:
+        self.name = name
+        self._config = config
+        self._port = port
+        self._clock = clock
+        self._commands = (commands, commands_2, commands_3, commands_4)[: config.shafts]
+        self._outs = (out, out_2, out_3, out_4)[: config.shafts]
+        self._steering_commands = steering_commands
+        self._steering = None if config.servo is None else steering
+        self._events = events
+        self._battery: BatteryMonitor | None = None
+        if battery is not None and config.battery is not None:
+            self._battery = BatteryMonitor(config.battery, battery, events, name, drive)
+        self._battery_due = 0
+        self._ticks = [0] * config.shafts
+        """Counted over sessions and restarts of the controllers."""
+        self._last: list[MotorValues | None] = [None] * config.shafts
+        self._faults = [0] * config.shafts
+        """Faults that were reported and are still there."""
+        self._sent = DriveMode.DISABLED
+        self._position: float | None = None
+        """Newest one sent to the servo."""
+
+    async def run(self, ready: Ready) -> None:
+        """One session, from the brake of motors that may still turn to the stop at its end.
+
+        Raises:
+            DeviceLostError: nothing plugged in; the link went down.
+            DeviceRestartedError: a controller restarted: its watchdog has its own setting again.
+            DeviceMismatchError: no controller at a CAN id, old firmware, or a watchdog that cannot be set.
+            WrongDeviceError: something else answers.
+            PortBusyError: another process holds the port.
+            DeviceTimeoutError, ProtocolError: no usable answers.
+        """
+        async with await self._port.open() as link:
+            session = VescSession(link, self._clock, self._config.answer_timeout)
+            try:
+                await self._start(session)
+                await self._serve(session, ready)
+            finally:
+                if not link.is_lost:
+                    await self._make_safe(session)
+
+    async def _start(self, session: VescSession) -> None:
+        config = self._config
+        self._position = None
+        self._send_all(session, VescSetpoint(DriveMode.QUICK_STOP))
+        watchdog = WatchdogSetting(round(1000 * config.watchdog), config.brake_current)
+        for i, motor in enumerate(config.motors):
+            identity = await session.identify(motor.can_id)
+            await session.set_watchdog(motor.can_id, watchdog)
+            values = await session.values(motor.can_id, ATTEMPTS)
+            last = self._last[i]
+            if last is None or step(last.tachometer_abs, values.tachometer_abs) < 0:
+                self._last[i] = values  # it has restarted, and counts from 0
+            where = "" if motor.can_id is None else f" at CAN id {motor.can_id}"
+            text = f"{identity.hardware}{where}, firmware {identity.major}.{identity.minor:02}"
+            self._events(Reason.DEVICE_READY, Severity.INFO, self.name, text)
+
+    async def _serve(self, session: VescSession, ready: Ready) -> None:
+        schedule = Schedule(self._clock, self._config.rate, POLLING)
+        misses, reported = Misses(), False
+        due = 0
+        while True:
+            if self._clock.now() >= due:
+                due = schedule.step()
+            await self._until(session, due)
+            self._send_all(session, self._setpoint())
+            with misses:
+                for i in range(self._config.shafts):
+                    await self._read(session, i)
+            if not misses.count and not reported:
+                reported = True
+                ready()
+
+    def _setpoint(self) -> VescSetpoint:
+        return setpoint_of([commands.latest for commands in self._commands], self._clock.now(), self._config)
+
+    def _is_urgent(self) -> bool:
+        """Whether a stop is still to be sent to the motors."""
+        wanted = self._setpoint().mode
+        return wanted is not DriveMode.ENABLED and wanted is not self._sent
+
+    async def _until(self, session: VescSession, due: int) -> None:
+        """Wait for the next cycle, or for a command that stops running motors; the last shaft's is the newest."""
+        while (left := due - self._clock.now()) > 0:
+            last = self._commands[-1]
+            if await last.next_within(left / SECOND, lambda _: not self._is_urgent()) is None or self._is_urgent():
+                return
+
+    def _send_all(self, session: VescSession, setpoint: VescSetpoint) -> None:
+        """Set-points of all motors and of the servo, in one go."""
+        self._sent = setpoint.mode
+        for i, motor in enumerate(self._config.motors):
+            session.send(motor.can_id, payload_of(setpoint, i, self._config))
+        servo, command = self._config.servo, self._steering_commands.latest
+        if servo is None or self._steering is None or command is None:
+            return
+        if self._clock.now() - command.stamp <= self._config.command_timeout * SECOND:
+            self._position = round(servo.position(command.front_servo), 3)
+        if self._position is not None:
+            session.send(None, set_servo(self._position))
+
+    async def _read(self, session: VescSession, i: int) -> None:
+        values = await session.values(self._config.motors[i].can_id)
+        received = self._clock.now()
+        stamp = (session.asked + received) // 2
+        self._count(i, values)
+        self._report_fault(i, values.fault)
+        self._publish(i, values, stamp, received)
+        if i == 0:
+            self._publish_steering(stamp, received)
+            if self._battery is not None and received >= self._battery_due:
+                self._battery_due = received + round(SECOND / self._config.battery_rate)
+                self._battery.take(stamp, received, values.volts, at_limit=False)
+
+    def _count(self, i: int, values: MotorValues) -> None:
+        """Add up the motor's steps.
+
+        Raises:
+            DeviceRestartedError: the controller counts from 0 again.
+        """
+        last = self._last[i]
+        self._last[i] = values
+        if last is None:
+            return
+        if step(last.tachometer_abs, values.tachometer_abs) < 0:
+            text = f"{self._port.name}: the controller of motor {i + 1} restarted"
+            self._events(Reason.DEVICE_RESTARTED, Severity.WARNING, self.name, text)
+            raise DeviceRestartedError(text)
+        self._ticks[i] += step(last.tachometer, values.tachometer)
+
+    def _report_fault(self, i: int, fault: int) -> None:
+        if fault == self._faults[i]:
+            return
+        self._faults[i] = fault
+        if fault:
+            text = f"motor {i + 1}: fault {fault_text(fault)}"
+            self._events(Reason.DRIVE_FAULT, Severity.ERROR, self.name, text, code=fault)
+        else:
+            self._events(Reason.DEVICE_READY, Severity.INFO, self.name, f"motor {i + 1}: the fault is gone")
+
+    def _publish(self, i: int, values: MotorValues, stamp: int, received: int) -> None:
+        config, out = self._config, self._outs[i]
+        sign = -1 if config.motors[i].inverted else 1
+        turn = FULL_TURN / (TICKS_PER_ELECTRICAL_TURN * config.pole_pairs)
+        out.put(
+            DriveFeedback(
+                stamp=stamp,
+                received=received,
+                seq=out.next_seq(),
+                position=sign * self._ticks[i] * turn,
+                velocity=sign * values.erpm / config.pole_pairs * RAD_S_PER_RPM,
+                current=sign * values.motor_current,
+                mode=DriveMode.FAULT if values.fault else self._sent,
+                fault_code=values.fault or None,
+                supply_voltage=values.volts,
+            )
+        )
+
+    def _publish_steering(self, stamp: int, received: int) -> None:
+        servo, out = self._config.servo, self._steering
+        if servo is None or out is None or self._position is None:
+            return
+        angle = servo.angle(self._position)
+        out.put(SteeringFeedback(stamp=stamp, received=received, seq=out.next_seq(), front=angle, rear=0.0))
+
+    async def _make_safe(self, session: VescSession) -> None:
+        """Brake until the motors rest, then let them coast; after the deadline the watchdog goes on braking."""
+        config = self._config
+        rest = config.standstill_rpm * config.pole_pairs
+        with contextlib.suppress(DeviceLostError):
+            self._send_all(session, VescSetpoint(DriveMode.QUICK_STOP))
+        with contextlib.suppress(DeviceError, TimeoutError):
+            async with self._clock.deadline(SAFE_DEADLINE):
+                while True:
+                    self._send_all(session, VescSetpoint(DriveMode.QUICK_STOP))
+                    speeds = [abs((await session.values(motor.can_id, ATTEMPTS)).erpm) for motor in config.motors]
+                    if max(speeds) <= rest:
+                        break
+                    await self._clock.sleep(1.0 / config.rate)
+                self._send_all(session, VescSetpoint(DriveMode.DISABLED))

@@ -1,0 +1,393 @@
+"""The device side of VESCs: the connected controller and those behind it on its CAN bus.
+
+Habits of the real thing: it says nothing unasked, and nothing to a damaged packet or an unknown one; set-points are not
+answered; a set-point that stops coming ends in the watchdog's brake current, which is 0 as delivered, so the motor
+coasts for as long as it likes; the speed controller gives no torque below its least speed; a fault takes the motor for
+half a second; the answer of a controller behind CAN comes without a word of where it is from; temporary settings and
+counters are gone after a power-up; the servo output keeps its newest position.
+"""
+
+import asyncio
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.disobedience import USAGE, DisobedientMotor
+from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ReceivedBytes, ServoPlant
+from monstertruck_drivers.epos.firmware import FreeMotor
+from monstertruck_drivers.signals import SignalKind, Signals
+from monstertruck_drivers.vesc.config import VescConfig
+from monstertruck_drivers.vesc.protocol import (
+    BAUD,
+    SERVO_SCALE,
+    TICKS_PER_ELECTRICAL_TURN,
+    Deframer,
+    FirmwareIdentity,
+    MotorValues,
+    PacketId,
+    WatchdogSetting,
+    frame,
+    wrapped,
+)
+from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+FACTORY: Final = WatchdogSetting(1000, 0.0)
+"""Watchdog as delivered."""
+SETTINGS_SIZE: Final = 480
+"""Bytes of the settings' answer."""
+SIGNATURE: Final = bytes.fromhex("7d21b4f8")
+"""Begins the settings; any number does, the host returns it."""
+BOOT: Final = 500 * MILLISECOND
+"""From power-up to the first answer."""
+THINKING: Final = 0.0005
+"""Seconds from the end of a request to its answer."""
+CAN_DELAY: Final = 0.003
+"""Seconds that an answer of some 80 bytes takes in frames of 8 bytes at 500 kbit/s, both ways."""
+RESTART_OF_APPS: Final = 0.05
+"""Seconds for which a change of settings keeps the answer back."""
+FAULT_STOP: Final = 500 * MILLISECOND
+"""For which the controller takes no set-point after a fault."""
+SERVO_PULSES: Final = (1000.0, 2000.0)
+"""Pulses of the positions 0 and 1, us."""
+WATCH_PERIOD: Final = 10 * MILLISECOND
+"""In which the watchdog looks."""
+NO_LOAD_PER_VOLT: Final = 400.0
+"""Rpm of the motor for each volt, at full duty."""
+HARDWARE: Final = "60"
+VERSION: Final = (6, 5)
+
+
+class EmulatedController:
+    """One controller with its motor.
+
+    Args:
+        now: clock.
+        plant: what the motor turns.
+        settings: of the driver: pole pairs, braking.
+        can_id: of its own.
+        signals: of the whole device.
+        place: of the motor, from 1 on, for the signals' names.
+    """
+
+    def __init__(
+        self, clock: Clock, plant: MotorPlant, settings: VescConfig, can_id: int, signals: Signals, place: int
+    ) -> None:
+        self.can_id = can_id
+        self.runaway: DisobedientMotor | None = None
+        self.fault = 0
+        self._clock = clock
+        self._plant = plant
+        self._config = settings
+        self._signals = signals
+        self._place = place
+        self._tail = bytes(SETTINGS_SIZE - len(SIGNATURE) - 9)
+        self.restart()
+
+    def restart(self) -> None:
+        """Power-up: coasting, counters at 0, watchdog as delivered."""
+        now = self._clock.now()
+        self.watchdog = FACTORY
+        self.timed_out = False
+        self._fed = now
+        self._blocked_until = 0
+        self._origin = self._turns(now)
+        self._travel, self._seen = 0.0, self._origin
+        self._turn(None)
+
+    def feed(self) -> None:
+        """Take note of a set-point."""
+        self._fed, self.timed_out = self._clock.now(), False
+
+    def watch(self) -> None:
+        """Brake if set-points have stopped; see ``timeout.c``."""
+        limit = self.watchdog.milliseconds
+        if limit and self._clock.now() - self._fed > limit * MILLISECOND:
+            self.timed_out = True
+            self.brake(self.watchdog.brake_current)
+
+    def fail(self, code: int) -> None:
+        """Take a fault: the motor coasts, and obeys nothing for a while; 0 ends one that stays."""
+        self.fault = code
+        self._blocked_until = self._clock.now() + FAULT_STOP
+        self._turn(None)
+
+    def run(self, erpm: float) -> None:
+        """Hold an electrical speed; a speed below the least gives no torque."""
+        rpm = erpm / self._config.pole_pairs
+        slow = abs(rpm) < self._config.min_motor_rpm
+        self._turn(None if slow else rpm, self._config.deceleration_rpm_s)
+
+    def brake(self, amperes: float) -> None:
+        """Brake with a current."""
+        share = amperes / self._config.brake_current
+        deceleration = share * self._config.quick_stop_deceleration_rpm_s
+        self._turn(0.0 if amperes > 0 else None, deceleration or 1.0)
+
+    def drive(self, amperes: float) -> None:
+        """Drive with a current; 0 lets it coast."""
+        share = abs(amperes) / self._config.brake_current
+        free = NO_LOAD_PER_VOLT * self._plant.reading(self._clock.now()).supply_v
+        target = None if amperes == 0.0 else (free if amperes > 0 else -free)
+        self._turn(target, share * self._config.quick_stop_deceleration_rpm_s or 1.0)
+
+    def duty(self, share: float) -> None:
+        """Run at a share of the speed that the supply allows."""
+        free = NO_LOAD_PER_VOLT * self._plant.reading(self._clock.now()).supply_v
+        self._turn(share * free, self._config.deceleration_rpm_s)
+
+    def obey_again(self) -> None:
+        """Apply a disobedience that began or ended to the present target."""
+        self._turn(*self._asked)
+
+    def settings(self) -> bytes:
+        """Answer to ``GET_APPCONF``."""
+        watchdog = self.watchdog.applied(bytes(15))[6:14]
+        return bytes((PacketId.GET_APPCONF,)) + SIGNATURE + bytes((self.can_id,)) + watchdog + self._tail
+
+    def apply(self, payload: bytes) -> bool:
+        """Take temporary settings; False if their signature is another firmware's."""
+        if payload[1:5] != SIGNATURE or len(payload) < SETTINGS_SIZE:
+            return False
+        self.watchdog = WatchdogSetting.of(bytes((PacketId.GET_APPCONF,)) + payload[1:])
+        return True
+
+    def values(self) -> MotorValues:
+        """Present values as they are sent."""
+        now, report, n = self._clock.now(), self._signals.report, self._place
+        reading, turns = self._plant.reading(now), self._turns(now)
+        self._travel += abs(turns - self._seen)
+        self._seen = turns
+        ticks = TICKS_PER_ELECTRICAL_TURN * self._config.pole_pairs
+        erpm = round(reading.rpm * self._config.pole_pairs)
+        free = NO_LOAD_PER_VOLT * max(reading.supply_v, 1.0)
+        return MotorValues(
+            motor_current=_limited(report(f"current_{n}", reading.current_ma / 1000), 1e6),
+            duty=max(-1.0, min(1.0, reading.rpm / free)),
+            erpm=round(_limited(report(f"erpm_{n}", erpm), 1e9)),
+            volts=_limited(report(f"volts_{n}", reading.supply_v), 3000.0),
+            tachometer=wrapped(report(f"tachometer_{n}", int((turns - self._origin) * ticks // 1))),
+            tachometer_abs=wrapped(int(self._travel * ticks)),
+            fault=self.fault,
+            controller_id=self.can_id,
+            timed_out=self.timed_out,
+        )
+
+    def _turns(self, now: int) -> float:
+        return self._plant.reading(now).turns
+
+    def _turn(self, rpm: float | None, acceleration: float = 1.0) -> None:
+        """Ask the motor for a speed; None lets it coast."""
+        self._asked = rpm, acceleration
+        now = self._clock.now()
+        if self.fault or now < self._blocked_until:
+            rpm = None
+        if self.runaway is not None:
+            rpm = self.runaway.target(rpm, self._plant.reading(now).rpm)
+        self._plant.command(now, rpm, acceleration)
+
+
+class VescEmulator:
+    """All controllers on one port.
+
+    Faults (``inject``): ``silent on|off`` (gives no answers), ``late SECONDS [COUNT]`` (answers), ``noise COUNT`` (so
+    many answers have a wrong byte), ``reset`` (all restart), ``fault CODE [MOTOR]`` (0 ends it), ``no_store on|off``
+    (firmware that knows no temporary settings), ``firmware MAJOR MINOR``, ``runaway`` (all disobey, see
+    ``DisobedientMotor``).
+
+    Args:
+        clock: time.
+        plants: what the motors turn; free motors take the missing places.
+        servos: steering servos, of which the output moves the one on channel 0; None = nothing is connected.
+        settings: which controllers there are.
+        own_id: CAN id of the connected one.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        plants: tuple[MotorPlant, ...] = (),
+        servos: ServoPlant | None = None,
+        settings: VescConfig | None = None,
+        *,
+        own_id: int = 100,
+    ) -> None:
+        self.name = "vesc"
+        self.received = ReceivedBytes()
+        """Newest bytes from the host."""
+        config = settings or VescConfig()
+        count = config.shafts
+        reported, ordered = ("erpm", "tachometer", "current", "volts"), ("run", "stop")
+        kinds = {f"{what}_{n}": SignalKind.NUMBER for n in range(1, count + 1) for what in reported}
+        kinds |= {f"{what}_{n}": SignalKind.ORDER for n in range(1, count + 1) for what in ordered}
+        kinds["servo"] = SignalKind.ORDER
+        self.signals = Signals(clock.now, kinds, np.random.default_rng(0))
+        self.position: float | None = None
+        """Of the servo output; None = no pulses yet."""
+        self._clock = clock
+        self._servos = servos
+        self._silent, self._no_store = False, False
+        self._late: list[float] = []
+        self._noise = 0
+        self._version = VERSION
+        self._awake_at = 0
+        self._deframer = Deframer()
+        places = [*plants, *(FreeMotor() for _ in range(count - len(plants)))][:count]
+        self.controllers = [
+            EmulatedController(clock, plant, config, own_id if motor.can_id is None else motor.can_id, self.signals, n)
+            for n, (plant, motor) in enumerate(zip(places, config.motors, strict=True), 1)
+        ]
+        self._by_id = {controller.can_id: controller for controller in self.controllers}
+        self._own = self._by_id.get(own_id)
+        if servos is not None:
+            servos.attach(self)
+
+    def pulse_us(self, channel: int, time_ns: int) -> float | None:
+        """Pulse at the servo output, which is channel 0, us; see ``PulseSource``."""
+        del time_ns
+        if channel != 0 or self.position is None:
+            return None
+        low, high = SERVO_PULSES
+        return low + self.position * (high - low)
+
+    def power_cycle(self) -> None:
+        """Supply off and on: all controllers restart."""
+        if self._servos is not None:
+            self._servos.advance(self._clock.now())
+        self._awake_at = self._clock.now() + BOOT
+        self.position = None
+        self._deframer.restart()
+        for controller in self.controllers:
+            controller.restart()
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault, see the class.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        try:
+            match fault, values:
+                case "silent", (("on" | "off") as word,):
+                    self._silent = word == "on"
+                case "no_store", (("on" | "off") as word,):
+                    self._no_store = word == "on"
+                case "late", (seconds, *count):
+                    self._late = [float(seconds)] * int(*count or ("1",))
+                case "noise", (count,):
+                    self._noise = int(count)
+                case "fault", (code, *motor):
+                    self.controllers[int(*motor or ("1",)) - 1].fail(int(code))
+                case "firmware", (major, minor):
+                    self._version = int(major), int(minor)
+                case "reset", ():
+                    self.power_cycle()
+                case "runaway", words:
+                    runaway = DisobedientMotor.parse(*words)
+                    for controller in self.controllers:
+                        controller.runaway = runaway
+                        controller.obey_again()
+                case _:
+                    raise ValueError(fault)
+        except (ValueError, IndexError, TypeError) as error:
+            raise InputError(
+                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: silent on|off, late SECONDS "
+                "[COUNT], noise COUNT, reset, fault CODE [MOTOR], no_store on|off, firmware MAJOR MINOR, runaway "
+                f"{USAGE}"
+            ) from error
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Serve until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._watch())
+            while True:
+                data = await end.read()
+                self.received.extend(data)
+                if self._clock.now() < self._awake_at:
+                    continue
+                for payload in self._deframer.feed(data):
+                    self._take(end, payload)
+
+    async def _watch(self) -> None:
+        while True:
+            await self._clock.sleep(WATCH_PERIOD / SECOND)
+            for controller in self.controllers:
+                controller.watch()
+
+    def _take(self, end: DeviceEnd, payload: bytes) -> None:
+        controller, delay = self._own, THINKING
+        if payload[0] == PacketId.FORWARD_CAN and len(payload) > 2:
+            controller, delay = self._by_id.get(payload[1]), CAN_DELAY
+            payload = payload[2:]
+        if payload[0] == PacketId.SET_SERVO_POS and len(payload) == 3:
+            self._set_servo(int.from_bytes(payload[1:], "big", signed=True) / SERVO_SCALE)
+        elif controller is not None and (answer := self._obey(controller, payload)) is not None:
+            late = RESTART_OF_APPS if payload[0] == PacketId.SET_APPCONF_NO_STORE else 0.0
+            self._send(end, answer, delay + late)
+
+    def _set_servo(self, position: float) -> None:
+        def move(position: float) -> None:
+            if self._servos is not None:
+                self._servos.advance(self._clock.now())
+            self.position = max(0.0, min(1.0, position))
+
+        self.signals.order("servo", position, move)
+
+    def _obey(self, controller: EmulatedController, payload: bytes) -> bytes | None:
+        """Carry out a payload; returns its answer, if it has one."""
+        match payload[0]:
+            case PacketId.FW_VERSION:
+                serial = bytes((controller.can_id,)) * 12
+                return FirmwareIdentity(*self._version, HARDWARE, serial).payload()
+            case PacketId.GET_VALUES:
+                return controller.values().payload()
+            case PacketId.GET_APPCONF:
+                return controller.settings()
+            case PacketId.SET_APPCONF_NO_STORE:
+                taken = not self._no_store and controller.apply(payload)
+                return bytes((PacketId.SET_APPCONF_NO_STORE,)) if taken else None
+            case PacketId.ALIVE:
+                controller.feed()
+            case number if len(payload) == 5:
+                self._set(controller, number, int.from_bytes(payload[1:], "big", signed=True))
+        return None
+
+    def _set(self, controller: EmulatedController, number: int, value: int) -> None:
+        """Take a set-point."""
+        place = self.controllers.index(controller) + 1
+        order = partial(self.signals.order, f"run_{place}")
+        match number:
+            case PacketId.SET_RPM:
+                order(float(value), controller.run)
+            case PacketId.SET_DUTY:
+                controller.duty(value / 100_000)
+            case PacketId.SET_CURRENT:
+                controller.drive(value / 1000)
+            case PacketId.SET_CURRENT_BRAKE:
+                self.signals.order(f"stop_{place}", value / 1000, controller.brake)
+            case _:
+                return
+        controller.feed()
+
+    def _send(self, end: DeviceEnd, answer: bytes, delay: float) -> None:
+        if self._silent:
+            return
+        data = frame(answer)
+        if self._noise > 0:
+            self._noise -= 1
+            data = data[:-4] + bytes((data[-4] ^ 0x10,)) + data[-3:]
+        end.write(data, self._late.pop() if self._late else delay)
+
+
+def _limited(value: float, limit: float) -> float:
+    return max(-limit, min(limit, value))
+
+
+def emulated(setup: EmulatorSetup) -> VescEmulator:
+    """The controllers of a simulated robot; the servo output moves the servo on channel 0."""
+    settings: VescConfig = setup.settings or VescConfig()
+    setup.port.device.baud = BAUD
+    servos = None if settings.servo is None else setup.physics.servos
+    return VescEmulator(setup.clock, setup.physics.motors[: settings.shafts], servos, settings)

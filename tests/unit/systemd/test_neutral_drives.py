@@ -1,0 +1,74 @@
+"""The stop script at emulated controllers other than the EPOS, over ptys."""
+
+import asyncio
+import contextlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from monstertruck_drivers.cable import PtyPort
+from monstertruck_drivers.epos.firmware import FreeMotor
+from monstertruck_drivers.steppers.emulator import StepperEmulator
+from monstertruck_drivers.vesc.config import VescConfig, VescMotorConfig
+from monstertruck_drivers.vesc.emulator import VescEmulator
+from monstertruck_runtime.clock import WallClock
+
+pytestmark = pytest.mark.wall
+
+SCRIPT = Path(__file__).resolve().parents[3] / "systemd" / "neutral.py"
+TWO = VescConfig(motors=(VescMotorConfig(), VescMotorConfig(can_id=7)))
+
+
+@contextlib.asynccontextmanager
+async def plugged_in(emulator, path):
+    port = PtyPort(path)
+    running = asyncio.create_task(emulator.run(port.device))
+    await asyncio.sleep(0)
+    port.plug()
+    try:
+        yield port
+    finally:
+        port.unplug()
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+
+
+async def neutral(*arguments):
+    command = [sys.executable, "-I", "-S", str(SCRIPT), *arguments]
+    return await asyncio.to_thread(subprocess.run, command, capture_output=True, text=True, timeout=20, check=False)
+
+
+async def test_all_motors_of_a_vesc_and_of_the_steppers_are_stopped(tmp_path):
+    clock, rotors = WallClock(), [FreeMotor() for _ in range(3)]
+    vesc, steppers = VescEmulator(clock, (rotors[0], rotors[1]), None, TWO), StepperEmulator(clock, [rotors[2]])
+    for controller in vesc.controllers:
+        controller.feed()
+        controller.run(4000.0)
+    rotors[2].command(clock.now(), 20.0, 1e4)
+    async with plugged_in(vesc, tmp_path / "vesc"), plugged_in(steppers, tmp_path / "steppers"):
+        done = await neutral(
+            f"{tmp_path / 'vesc'}=vesc:{TWO.stop_words}@115200", f"{tmp_path / 'steppers'}=steppers:@115200"
+        )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("stopped") == 2
+    assert [round(rotor.reading(clock.now()).rpm, 1) for rotor in rotors] == [0.0, 0.0, 0.0]
+
+
+async def test_a_motor_that_disobeys_and_a_silent_controller_are_reported(tmp_path):
+    clock = WallClock()
+    vesc, silent = VescEmulator(clock, settings=TWO), VescEmulator(clock)
+    vesc.controllers[1].feed()
+    vesc.controllers[1].run(4000.0)
+    vesc.inject("runaway", "run", "900")
+    silent.inject("silent", "on")
+    async with plugged_in(vesc, tmp_path / "vesc"), plugged_in(silent, tmp_path / "silent"):
+        done = await neutral(
+            f"{tmp_path / 'vesc'}=vesc:{TWO.stop_words}@115200",
+            f"{tmp_path / 'silent'}=vesc:{VescConfig().stop_words}@115200",
+        )
+    assert done.returncode == 1
+    assert "a motor still turns at 1800 electrical rpm" in done.stderr
+    assert "no answer" in done.stderr
