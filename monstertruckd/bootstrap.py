@@ -51,8 +51,6 @@ four get more of the cores than two."""
 TWO = ("-n", "2")
 """Tests on the wall clock at a time: each runs a truck and a daemon, which must not be late."""
 FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
-TESTS_FAILED = 1
-"""Exit code of pytest; others mean that it did not run them."""
 KERNELS: tuple[Path, str, str] = (VENV / "bin" / "python", "-m", "monstertruckd.tools.install.kernels")
 """Compiles what goals and maps need: after the first lap in the background, for nobody should wait for it before."""
 BYTECODE = ("-m", "compileall", "-q", "-j", "2", "monstertruckd", "drivers", "planners", "schemas", "tests")
@@ -207,7 +205,7 @@ def steps(*programs: tuple[Path, list[str]]) -> int:
     """Run one check after the other; returns the exit code of the first that fails, or 0."""
     for program, arguments in programs:
         code = step(program, arguments)
-        if program.name == "pytest" and code == TESTS_FAILED:
+        if program.name == "pytest" and code == 1:  # exit code of pytest; others mean that it did not run them
             code = step(program, [*arguments, *FAILED_ALONE])
         if code:
             return code

@@ -35,8 +35,6 @@ SERIAL: Final = ("drive", "steering", "lidar", "compass", "stabiliser", *MORE_DR
 """Roles of devices on a serial line."""
 VITAL: Final = ("drive", "steering", "lidar", "compass", *MORE_DRIVES, "wheels", "sonar")
 """The robot stops when one of these sends nothing; the sonars where they guard it, without a lidar."""
-HOT: Final = 92.0
-"""Temperature of a computer whose fan stands, degrees Celsius."""
 COOL: Final = 48.0
 SHORT_WRITES: Final = 19
 """Maximum number of consecutive writes cut in half."""
@@ -644,7 +642,8 @@ def _worker(rng: np.random.Generator, name: str) -> CatalogFault:
 def _rail_12v(rng: np.random.Generator) -> CatalogFault:
     def lose(context: SimContext) -> None:
         context.command("stabiliser", "power off")
-        context.monitored("host", "temperature", str(HOT))
+        # 92.0: temperature of a computer whose fan stands, degrees Celsius
+        context.monitored("host", "temperature", str(92.0))
 
     def give(context: SimContext) -> None:
         context.command("stabiliser", "power on")

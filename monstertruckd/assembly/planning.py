@@ -43,9 +43,6 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.config.truck import PathConfig, TruckConfig
 from monstertruckd.recorder.picture import MapService
 
-STEP_DEADLINE: Final = 5.0
-"""Seconds after which a tracker elsewhere is given up; the gate stops the truck long before."""
-
 
 def _drawn(config: PathConfig, frame: str, events: EventSink) -> Path | None:
     """The configured path; None, and an event, if its file cannot be used."""
@@ -145,7 +142,8 @@ def _build_tracker(
         inputs["attitude"] = bus.subscribe(topics.COMPASS, latest())
     actor = None
     if placement != "loop":
-        actor = actors.actor(placement, TRACKING, STEPS[TRACKING], latency=0.0, deadline=STEP_DEADLINE)
+        # 5.0: seconds after which a tracker elsewhere is given up; the gate stops the truck long before
+        actor = actors.actor(placement, TRACKING, STEPS[TRACKING], latency=0.0, deadline=5.0)
     return TrackerService(
         TrackSetup(with_response(tracker, config.devices), body.chassis.bicycle, body.footprint, body.points.mount),
         clock,

@@ -32,8 +32,6 @@ DEPTH: Final = 64
 """Requests of one topic that may wait for the loop."""
 
 MAX_VALUES: Final = 16_384
-MAX_MARKS: Final = 512
-"""Commas, and brackets, braces and quotes, of one request: many small objects would take tens of milliseconds."""
 
 MAX_OWNERS: Final = 64
 """Owners whose rates are known; the least recent one is dropped for a new one."""
@@ -254,7 +252,9 @@ class Intake:
         ordinary = self.topic is REQ_CONTROL and not _may_stop(data)
         if ordinary and not self._may_order(sender):
             return
-        if data.count(b",") > MAX_VALUES or sum(map(data.count, (b"[", b"{", b'"'))) > MAX_MARKS:
+        # 512: commas, and brackets, braces and quotes, of one request: many small objects would take tens of
+        # milliseconds
+        if data.count(b",") > MAX_VALUES or sum(map(data.count, (b"[", b"{", b'"'))) > 512:
             self._refusals.add(Reason.BAD_INPUT, source, f"{name}: request of too many parts")
             return
         try:

@@ -11,8 +11,6 @@ from monstertruck_runtime.clock import MILLISECOND, SECOND
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import Topic
 
-OFTEN: Final = 1.0
-"""Topics of so many messages a second or more may wait for others."""
 BEHIND: Final = MILLISECOND
 """Nanoseconds after the multiples at which batches leave: what the gate publishes there leaves with them."""
 BATCH: Final = 10
@@ -40,7 +38,8 @@ class Outgoing:
     def send(self, topic: Topic[Any], message: Message, at: int) -> None:
         """Deliver now or soon; messages never overtake each other."""
         self._waiting.append((topic, message, at))
-        if not self._period or topic.rate is None or topic.rate < OFTEN:
+        # 1.0: topics of so many messages a second or more may wait for others
+        if not self._period or topic.rate is None or topic.rate < 1.0:
             self.flush()
         elif self._timer is None:
             loop = asyncio.get_running_loop()

@@ -17,13 +17,6 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import owner_of
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, access_rules
 
-HANG_UP_US: Final = 2_000_000
-"""Microseconds after which a station is disconnected that does not take an answer, or a message that must not be
-dropped. Zenoh's own 5 s are too long for requests that wait behind it; a large map needs some time as well."""
-
-LOCAL_SESSIONS: Final = 16
-"""Sessions of the robot's own command line."""
-
 OWNER_NAME: Final = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.@-]{0,31}")
 """Common names of certificates: one part of a key, without the colon that begins the name of one of its programs, and
 without a first dot: the name is that of a folder, too."""
@@ -176,7 +169,7 @@ def listeners(config: ZenohConfig) -> list[Listener]:
         driving = {name: grant for name, grant in grants.items() if grant.role.covers(AccessRole.PILOT)}
         found.append(Listener(config.listen_pilots, config.max_sessions, (), tls.pilots_ca, driving, guarded=guarded))
     if config.local_socket and (local := local_endpoint(config.listen)) is not None:
-        found.append(Listener((local,), LOCAL_SESSIONS, guarded=guarded))
+        found.append(Listener((local,), 16, guarded=guarded))  # sessions of the robot's own command line
     return found
 
 
@@ -187,6 +180,9 @@ def session_config(robot: str, config: ZenohConfig, listener: Listener, *, probe
     (``wait_before_drop`` 0) because a put happens on the event loop; each is deep enough for the largest message.
     No shared memory: it takes 20 MB and a thread of its own, and for scans it is the slower way.
     """
+    # 2_000_000: microseconds after which a station is disconnected that does not take an answer, or a message that must
+    # not be dropped. Zenoh's own 5 s are too long for requests that wait behind it; a large map needs some time as
+    # well.
     transport: dict[str, Any] = {
         "unicast": {"max_sessions": listener.places},
         "shared_memory": {"enabled": False},
@@ -196,7 +192,7 @@ def session_config(robot: str, config: ZenohConfig, listener: Listener, *, probe
                     "size": {"data_high": 16, "data": 16, "data_low": 16},
                     "congestion_control": {
                         "drop": {"wait_before_drop": 0},
-                        "block": {"wait_before_close": HANG_UP_US},
+                        "block": {"wait_before_close": 2_000_000},
                     },
                 }
             },

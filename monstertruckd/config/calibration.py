@@ -31,8 +31,6 @@ C = TypeVar("C", bound=TruckConfig)
 CONFIDENCE: Final = 0.95
 """Confidence of every interval: the share of trucks measured like this whose true value is inside."""
 
-MOST_BYTES: Final = 1_000_000
-"""Size of one file at most."""
 
 Value = bool | int | float
 Grade = Literal["A", "B", "C"]
@@ -197,7 +195,7 @@ class CalibrationStore:
             ConfigError: it is damaged, too long, or of another truck; names the file and what to do.
         """
         try:
-            require_file(path, MOST_BYTES)
+            require_file(path, 1_000_000)  # size of one file at most
             file = CalibrationFile.model_validate_json(path.read_bytes())
         except Exception as error:
             what = error.strerror if isinstance(error, OSError) else cause_of(error)

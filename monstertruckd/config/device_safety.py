@@ -85,10 +85,6 @@ BY_CELLS: Final = (
 """Voltages of a pack, which are compared cell by cell."""
 EMPTY: Final = 3.0
 """Volts of a lithium-polymer cell at which it has nothing left."""
-FULL: Final = 4.5
-"""Volts of one that no charger reaches."""
-SAG: Final = 0.5
-"""Volts of a cell, the most that a motor's current may explain."""
 
 
 def unattended_times(devices: Devices) -> Iterator[tuple[str, float]]:
@@ -168,7 +164,9 @@ def _beyond_cells(place: str, pack: PackConfig) -> Iterator[str]:
         volts = getattr(pack, name)
         if volts < EMPTY * pack.cells:
             yield f"{place}.{name} {volts:g} V: at least {EMPTY * pack.cells:g}, where {pack.cells} cells are empty"
-    for name, most in (("plausible_max", FULL), ("max_compensation", SAG)):
+    # 4.5: volts of one that no charger reaches
+    # 0.5: volts of a cell, the most that a motor's current may explain
+    for name, most in (("plausible_max", 4.5), ("max_compensation", 0.5)):
         volts = getattr(pack, name)
         if volts > most * pack.cells:
             yield f"{place}.{name} {volts:g} V: at most {most * pack.cells:g}, of {pack.cells} cells"

@@ -44,8 +44,6 @@ PERIOD: Final = 1.0
 """Seconds between two checks of the drive's position: half of it at most is missing of every reversal."""
 PUBLISH: Final = 60
 """Periods between two messages, and between two writings of the odometer."""
-WORTH_WRITING: Final = 1.0
-"""Metres: less is not written, to spare the memory card."""
 
 
 _UNKNOWN: Final[Mapping[str, str]] = MappingProxyType({})
@@ -257,7 +255,8 @@ class CalibrationWatch:
 
     async def _keep(self) -> None:
         odometer = self.odometer
-        if odometer.file is None or abs(odometer.metres - odometer.written) < WORTH_WRITING:
+        # 1.0: metres: less is not written, to spare the memory card
+        if odometer.file is None or abs(odometer.metres - odometer.written) < 1.0:
             return
         try:
             await self._offload(odometer.save)

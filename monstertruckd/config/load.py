@@ -45,15 +45,10 @@ PLACEHOLDER = "{robot}"
 HEAD: Final = (
     "Settings changed while the robot ran (monstertruckd set --save); they replace those of the configuration."
 )
-MOST_NODES: Final = 5_000
-"""Keys and values in the text of one file, at most: read in a quarter of a second; a full configuration has some
-hundreds."""
 MOST_VALUES = 20_000
 """Values of one file at most; a full configuration has a few hundred."""
 MOST_MISTAKES = 50
 """Named at once."""
-ALIEN = 0.75
-"""Share of unknown sections from which on the file is taken to be no configuration."""
 YAML_1_1 = ("yes", "no", "on", "off")
 """Booleans of YAML 1.1 in lower case: text since 1.2."""
 
@@ -443,7 +438,9 @@ def _build_mapping(node: Node, builder: _Builder, key: Key) -> dict[str, Any]:
 
 def reader() -> YAML:
     """Reads one document of plain data; ``_build`` bounds what is behind aliases, and names it."""
-    return bounded_yaml(MOST_NODES, expand=False)
+    # 5_000: keys and values in the text of one file, at most: read in a quarter of a second; a full configuration has
+    # some hundreds
+    return bounded_yaml(5_000, expand=False)
 
 
 def node_kind(node: Node) -> str:
@@ -664,7 +661,8 @@ def _require_kind(data: dict[str, Any], path: Path, model: type[Schema]) -> None
     """Report a mission file in one line, instead of an error for each of its keys."""
     found = [str(key) for key in data if key != "version"]
     strange = set(found) - set(model.model_fields)
-    if len(strange) > 1 and len(strange) >= ALIEN * len(found):
+    # 0.75: share of unknown sections from which on the file is taken to be no configuration
+    if len(strange) > 1 and len(strange) >= 0.75 * len(found):
         expected = [name for name, field in model.model_fields.items() if field.is_required() and name != "version"]
         raise ConfigError(f"{path}:1: another kind of file: expected {', '.join(expected)}, found {', '.join(found)}")
 

@@ -23,11 +23,7 @@ log = logging.getLogger(__name__)
 PERIOD = 1.0
 SUMMARY_AFTER: Final = 5
 """Periods after the start at which the log says what is there and what is not."""
-STEP = SECOND // 20
-"""A change of the real-time offset within one period beyond this is a step, not drift (NTP slews < 1 ms/s)."""
 
-LASTS: Final = 3
-"""Seconds with late ticks after which the log says that the computer is busy: a start has some."""
 SAY_AGAIN: Final = 60.0
 """Seconds until it says so again."""
 PASSING: Final = frozenset({Reason.SLOW_LINK})
@@ -203,7 +199,9 @@ class ClockService:
         before: int | None = None
         while True:
             offset = self._clock.real_offset()
-            step = offset - before if before is not None and abs(offset - before) > STEP else 0
+            # SECOND // 20: a change of the real-time offset within one period beyond this is a step, not drift (NTP
+            # slews < 1 ms/s)
+            step = offset - before if before is not None and abs(offset - before) > SECOND // 20 else 0
             if step:
                 self._events(Reason.CLOCK_STEPPED, Severity.WARNING, self.name, seconds=step / SECOND)
             now = self._clock.now()
@@ -277,7 +275,8 @@ class MeterService:
     def _say_busy(self, health: LoopHealth) -> None:
         """Log that the computer is busy once it lasts, at most once in ``SAY_AGAIN``."""
         self._late = self._late + 1 if health.busy else max(0, self._late - 1)
-        if health.busy and self._late >= LASTS and _again(self._said, health.stamp):
+        # 3: seconds with late ticks after which the log says that the computer is busy: a start has some
+        if health.busy and self._late >= 3 and _again(self._said, health.stamp):
             self._said = health.stamp
             log.warning("%s", health.busy)
 

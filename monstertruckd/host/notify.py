@@ -13,10 +13,6 @@ from monstertruck_schemas.state import GateMode
 
 PERIOD: Final = 1.0
 """Seconds between two looks without a watchdog."""
-POLL: Final = 0.02
-"""Seconds between two looks until the first tick."""
-PACE: Final = 0.5
-"""Part of the nominal ticks between two looks without which the tick counts as hanging."""
 
 
 class Notify(Protocol):
@@ -78,7 +74,8 @@ class NotifyService:
         self._period = PERIOD if watchdog is None else watchdog / 3
         self._clock = clock
         self._ticks = ticks
-        self._enough = PACE * rate * self._period
+        # 0.5: part of the nominal ticks between two looks without which the tick counts as hanging
+        self._enough = 0.5 * rate * self._period
         self._status = status
         self._up = False
         self._seen_ticks = 0
@@ -96,7 +93,7 @@ class NotifyService:
         """Notify systemd until cancelled."""
         ready()
         while not (self._up and self._ticks() and self._notify("READY=1")):
-            await self._clock.sleep(POLL)
+            await self._clock.sleep(0.02)  # seconds between two looks until the first tick
         while True:
             await self._clock.sleep(self._period)
             self._notify()

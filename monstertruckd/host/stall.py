@@ -19,8 +19,6 @@ log = logging.getLogger(__name__)
 
 STALL: Final = 0.2
 """Seconds without a tick that are worth a dump."""
-LOOK: Final = 0.05
-"""Seconds between two looks."""
 INTERVAL: Final = 60.0
 """Least seconds between two dumps."""
 KEPT: Final = 20
@@ -81,7 +79,7 @@ class StallWatch:
         """The thread."""
         seen, since, looked = 0, self._clock.now(), self._clock.now()
         stalled = False
-        while not self._ending.wait(LOOK):
+        while not self._ending.wait(0.05):  # seconds between two looks
             now, ticks = self._clock.now(), self._ticks()
             if now - looked > self._stall:
                 since = now  # nor did this thread run: the whole process was stopped, or the lock was held

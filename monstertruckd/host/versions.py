@@ -14,8 +14,6 @@ from monstertruckd import __version__
 
 PACKAGES: Final = ("eclipse-zenoh", "mcap", "numpy", "pydantic", "uvloop")
 ROOT: Final = Path(__file__).resolve().parents[2]
-TIMEOUT: Final = 2.0
-"""Seconds git may take."""
 
 
 @cache
@@ -41,7 +39,8 @@ def checkout(root: Path) -> str | None:
         return None
     command = [git, "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
     try:
-        answer = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=True)  # noqa: S603
+        # 2.0: seconds git may take
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=2.0, check=True)  # noqa: S603
     except (OSError, subprocess.SubprocessError):
         return None
     return answer.stdout.strip()

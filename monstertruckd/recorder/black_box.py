@@ -144,14 +144,8 @@ class BlackBoxFolder:
 
 BATCH: Final = 8
 """Messages written without a pause: a fraction of a millisecond in which the control loop would have to wait."""
-PAUSE: Final = 0.001
-"""Seconds between two batches, for the control loop."""
-CHUNK_SIZE: Final = 64 * 1024
-"""Bytes compressed at once; more takes longer."""
 
 
-BACKLOG: Final = 2
-"""Boxes that may wait for a slow disk, with the memory they take."""
 LAST_SECONDS: Final = 5.0
 """What is not on the disk so long after the end is given up."""
 
@@ -312,7 +306,7 @@ class BlackBox:
             if not await self._is_due(pending) or pending not in self._pending:
                 continue
             self._pending.remove(pending)
-            if self._taken.qsize() < BACKLOG:
+            if self._taken.qsize() < 2:  # boxes that may wait for a slow disk, with the memory they take
                 self._taken.put_nowait((pending, self.ring.snapshot()))
             else:
                 slow = TimeoutError(errno.ETIMEDOUT, "the disk is too slow")
@@ -378,13 +372,14 @@ class BlackBox:
         part = self._folder.part(name)
         start = next((entry.log_time for entry in entries), 0)
         try:
-            file = LogFile(part, Compression.ZSTD, CHUNK_SIZE, self._attachments, metadata, start, offset)
+            # 64 * 1024: bytes compressed at once; more takes longer
+            file = LogFile(part, Compression.ZSTD, 64 * 1024, self._attachments, metadata, start, offset)
             try:
                 for count, entry in enumerate(entries):
                     if self._given_up.is_set():
                         raise TimeoutError(errno.ETIMEDOUT, "given up")
                     if offloaded and count % BATCH == 0:
-                        self._hurry.wait(PAUSE)
+                        self._hurry.wait(0.001)  # seconds between two batches, for the control loop
                     file.add(entry)
                 file.finish()
             except BaseException:

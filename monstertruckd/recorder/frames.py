@@ -55,8 +55,6 @@ HEAD: Final = struct.Struct("<BQ")
 """Head of a record: opcode, length of the content."""
 CHECKSUM: Final = struct.Struct("<I")
 _PIECE: Final = 1 << 20
-_TIMES: Final = 16
-"""Bytes of a chunk's two times."""
 
 READERS: Final[dict[int, Any]] = {
     Opcode.HEADER: Header,
@@ -141,7 +139,8 @@ def read_statistics(file: BinaryIO, size: int) -> Statistics | None:
 
 def digest_of(opcode: int, content: bytes) -> bytes:
     """Return the digest by which a repeated record is recognised."""
-    begin = _TIMES if opcode == Opcode.CHUNK else 0  # no checksum covers a chunk's times
+    # 16: bytes of a chunk's two times
+    begin = 16 if opcode == Opcode.CHUNK else 0  # no checksum covers a chunk's times
     return blake2b(content[begin:], digest_size=16).digest()
 
 

@@ -22,8 +22,6 @@ from monstertruckd.recorder.config import MapRender
 TARGET = "monstertruckd.recorder.picture_worker:MapRenderer"
 SPACING = 0.02
 """Metres between two remembered poses of the driven path, at first."""
-REMEMBERED = 2000
-"""Poses after which every other one is forgotten and the spacing doubles."""
 
 
 class MapService:
@@ -104,7 +102,7 @@ class MapService:
         pose = (odometry.pose.x, odometry.pose.y, odometry.pose.yaw)
         if not self._driven or math.dist(pose[:2], self._driven[-1][:2]) > self._spacing:
             self._driven.append(pose)
-            if len(self._driven) > REMEMBERED:
+            if len(self._driven) > 2000:  # poses after which every other one is forgotten and the spacing doubles
                 self._driven = self._driven[::2]
                 self._spacing *= 2
         if scan.tilt is not None and scan.tilt > self._config.max_tilt:

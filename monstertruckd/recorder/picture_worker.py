@@ -44,14 +44,10 @@ STYLES: Mapping[str, Style] = {
 
 _UNKNOWN, _FREE, _WALL = (np.array(rgb, dtype=np.float64) for rgb in ((216, 221, 227), (250, 251, 252), (34, 43, 54)))
 _INK, _FAINT, _RULE, _PAPER = "#222b36", "#6b7785", "#c3cad3", "#ffffff"
-_LONG_SIDE = 1200
-"""Pixels of the map's longer side."""
 _OVERSAMPLING = 2
 _MARGIN, _HEAD, _FOOT = 28, 84, 64
 _AROUND = 0.4
 """Metres shown around everything that was seen or driven."""
-_ARROW = 0.35
-"""Length of the truck's symbol, m."""
 
 
 class MapRenderer:
@@ -131,7 +127,8 @@ class _Frame:
 
     @classmethod
     def around(cls, area: Area) -> "_Frame":
-        return cls(area, _LONG_SIDE * _OVERSAMPLING / max(area.x1 - area.x0, area.y1 - area.y0))
+        # 1200: pixels of the map's longer side
+        return cls(area, 1200 * _OVERSAMPLING / max(area.x1 - area.x0, area.y1 - area.y0))
 
     @property
     def unit(self) -> float:
@@ -235,7 +232,8 @@ def _ends(pen: ImageDraw.ImageDraw, frame: _Frame, poses: Array, style: Style) -
     )
     if poses.shape[1] > 2:
         yaw = poses[-1, 2]
-        outline = np.array([[0.6, 0.0], [-0.4, 0.32], [-0.2, 0.0], [-0.4, -0.32]]) * _ARROW
+        # 0.35: length of the truck's symbol, m
+        outline = np.array([[0.6, 0.0], [-0.4, 0.32], [-0.2, 0.0], [-0.4, -0.32]]) * 0.35
         turned = outline @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]]) + poses[-1, :2]
         pen.polygon([frame.pixel(*corner) for corner in turned], fill=style.color, outline=_PAPER, width=_OVERSAMPLING)
 

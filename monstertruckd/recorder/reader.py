@@ -43,9 +43,6 @@ from monstertruckd.recorder.salvage import ChannelFacts, Salvage
 CONFIG: Final = "config.json"
 """The attachment with the daemon's configuration."""
 
-_BEYOND: Final = 1 << 16
-"""Numbers of schemas in a file are below."""
-
 
 def spare_log(output: Path) -> None:
     """Refuse to overwrite a log.
@@ -320,7 +317,7 @@ def _introduction(number: int, facts: ChannelFacts) -> Iterator[Schema | Channel
     """A channel that may not have been introduced yet, with its schema, under a number that no file can hold."""
     schema = 0
     if facts.schema is not None:
-        schema = _BEYOND + number
+        schema = (1 << 16) + number  # numbers of schemas in a file are below
         name, encoding, data = facts.schema
         yield Schema(id=schema, name=name, encoding=encoding, data=data)
     yield Channel(

@@ -49,9 +49,6 @@ log = logging.getLogger(__name__)
 _STEP: Final = SECOND
 """So far apart are a file's dates and the computer's after a step of its clock, not by its drift."""
 
-_STEP_PERIOD: Final = 10 * SECOND
-"""Shortest time between two files for want of the right date: a clock that is set again and again makes no flood."""
-
 
 class LogWriter:
     """Writes entries into numbered files; a context manager that finishes the last one.
@@ -140,7 +137,9 @@ class LogWriter:
         age = now - self._file.start
         if self._removed or self._file.size >= self._config.rotate_bytes or age >= self._config.rotate_seconds * SECOND:
             return True
-        return age >= _STEP_PERIOD and abs(log_offset(now, self.real_offset) - self._file.offset) > _STEP
+        # 10 * SECOND: shortest time between two files for want of the right date: a clock that is set again and again
+        # makes no flood
+        return age >= 10 * SECOND and abs(log_offset(now, self.real_offset) - self._file.offset) > _STEP
 
     def _open(self, start: int) -> LogFile:
         while True:
@@ -190,12 +189,6 @@ class LogWriter:
             del self._others[path]
             excess -= size
 
-
-_BATCH: Final = 256
-"""Messages handed to the thread together; each hand-over makes both threads wait for the interpreter."""
-
-_BATCH_SECONDS: Final = 0.05
-"""A batch is handed over after this time even if it is not full."""
 
 FailureSink = Callable[[Reason, str], None]
 RepairSink = Callable[[str], None]
@@ -297,9 +290,11 @@ class Recorder:
         self._messages += 1
         self._bytes += len(payload)
         if not self._batch and not self._deterministic:
-            self._loop.call_later(_BATCH_SECONDS, self._hand_over)
+            # 0.05: a batch is handed over after this time even if it is not full
+            self._loop.call_later(0.05, self._hand_over)
         self._batch.append(LogEntry(topic, self._clock.now() if at is None else at, stamp, sequence, payload))
-        if len(self._batch) >= _BATCH:
+        # 256: messages handed to the thread together; each hand-over makes both threads wait for the interpreter
+        if len(self._batch) >= 256:
             self._hand_over()
 
     def refuse(self, error: OSError) -> None:

@@ -17,12 +17,8 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.topics import Topic
 from monstertruckd.recorder.log_file import LogEntry
 
-BLOCK: Final = 256 * 1024
-"""Bytes of entries that are freed together."""
 SHARE: Final = 32
 """Part of the whole memory that a block takes at most."""
-EXPIRY_PERIOD: Final = SECOND // 10
-"""Nanoseconds between two removals of expired entries: removing many at a time is cheaper."""
 
 _HEAD: Final = Struct("<qqqII")
 """Log time, stamp, sequence, number of the topic, length of the payload."""
@@ -201,7 +197,7 @@ class Ring:
 
     def __init__(self, span: Retention, limit: int) -> None:
         self._limit = limit
-        block = min(BLOCK, limit // SHARE)
+        block = min(256 * 1024, limit // SHARE)  # bytes of entries that are freed together
         self._rest = _Part(span.everything, block)
         self._journal = _Part(span.journal, block)
         self._fresh = _Part(span.pictures, block)
@@ -243,7 +239,8 @@ class Ring:
 
     def _trim(self) -> None:
         """Remove expired entries; whatever then exceeds the limit is removed and counted as lost."""
-        self._next_expiry = self._newest + EXPIRY_PERIOD
+        # (SECOND // 10): nanoseconds between two removals of expired entries: removing many at a time is cheaper
+        self._next_expiry = self._newest + (SECOND // 10)
         self._expire(self._newest)
         while self.size > self._limit and (crowded := self._fullest()) is not None:
             self._drop(crowded.popleft())

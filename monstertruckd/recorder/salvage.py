@@ -57,8 +57,6 @@ _SIZE: Final = struct.Struct("<Q")
 _INDEX_HEAD: Final = struct.Struct("<HI")
 _INDEX_ENTRY: Final = 16
 """Bytes: log time and offset of a message."""
-_LEAST_MESSAGE: Final = 22
-"""Bytes of a message without its data."""
 _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17}
 """Of records whose content has one length."""
 _WINDOW: Final = 1 << 20
@@ -451,7 +449,7 @@ class _Scan:
             case Opcode.MESSAGE_INDEX:
                 whole = self._is_message_index(part) and self._is_followed(part)
             case Opcode.MESSAGE:
-                whole = part.length >= _LEAST_MESSAGE and self._is_followed(part)
+                whole = part.length >= 22 and self._is_followed(part)  # bytes of a message without its data
             case opcode if opcode in _LENGTHS:
                 whole = part.length == _LENGTHS[opcode]
             case Opcode.CHUNK:

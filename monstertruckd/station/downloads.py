@@ -18,8 +18,6 @@ from monstertruckd.station.address import RobotAddress
 
 log = logging.getLogger(__name__)
 
-WAIT: Final = 5.0
-"""Seconds in which the robot answers."""
 MOST_BYTES: Final = 2_000_000_000
 """Size of a recording that is fetched to be shown at most: it is kept in the station's temporary folder."""
 RANGE: Final = re.compile(r"bytes=(\d{1,15})-")
@@ -80,7 +78,7 @@ async def fetch(
 
 
 def _session(address: RobotAddress, user: str, clock: Clock) -> TruckClient:
-    return address.session(f"{user}{'.' * bool(user)}files", clock, WAIT)
+    return address.session(f"{user}{'.' * bool(user)}files", clock, 5.0)  # seconds in which the robot answers
 
 
 async def _stream(

@@ -38,11 +38,6 @@ RETRY: Final = 1.0
 KEPT_EVENTS: Final = 200
 """Events a browser gets when it begins to look at a robot."""
 
-GROUND_BUDGET: Final = 20_000.0
-"""Bytes a second that pictures of the ground may take."""
-CAMERA_BUDGET: Final = 300_000.0
-"""Bytes a second that pictures of the camera may take."""
-
 
 @dataclass(frozen=True, slots=True)
 class Shown(Generic[M]):
@@ -60,13 +55,14 @@ def _whole(topic: Topic[M], kind: str, period: float = 0.0) -> Shown[M]:
     return Shown(topic, kind, partial(frames.message, kind), period)
 
 
+# 300_000.0: bytes a second that pictures of the camera may take
 SHOWN: Final[tuple[Shown[Any], ...]] = (
     _whole(topics.GATE, "gate"),
     _whole(topics.STOP, "stop"),
     _whole(topics.EXPLORE, "explore", 0.5),
     _whole(topics.MISSION, "mission", 0.5),
     _whole(topics.CALIBRATION, "calibration"),
-    Shown(topics.GROUND, "ground", frames.ground, 2.0, GROUND_BUDGET),
+    Shown(topics.GROUND, "ground", frames.ground, 2.0, 20_000.0),  # bytes a second that pictures of the ground may take
     Shown(topics.SCAN, "scan", frames.scan, 0.1),
     Shown(topics.TRANSFORMS, "transforms", frames.transforms, 0.2),
     Shown(topics.PATH, "path", frames.path),
@@ -85,7 +81,7 @@ SHOWN: Final[tuple[Shown[Any], ...]] = (
     _whole(topics.HOST, "host"),
     _whole(topics.SLAM, "slam", 0.5),
     _whole(topics.USB, "usb"),
-    Shown(topics.CAMERA, "camera", frames.picture, 0.1, CAMERA_BUDGET),
+    Shown(topics.CAMERA, "camera", frames.picture, 0.1, 300_000.0),
     _whole(topics.POINTS, "points", 0.5),
 )
 

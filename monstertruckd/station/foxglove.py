@@ -36,12 +36,8 @@ PORT: Final = 8765
 LAYOUT: Final = Path(__file__).parent / "foxglove_layout.json"
 TELEOP: Final = "/teleop"
 """Topic of the layout's teleop panel."""
-LEASE: Final = 0.25
-"""Seconds for which a message of the teleop panel stands."""
 RETRY: Final = 1.0
 """Seconds between two attempts to reach the robot, and in which it answers."""
-TOO_LARGE: Final = 4096
-"""Bytes from which on a message of a client is no twist."""
 
 
 def twist(data: bytes) -> tuple[float, float, float]:
@@ -51,7 +47,7 @@ def twist(data: bytes) -> tuple[float, float, float]:
         InputError: it is none, or not finite.
     """
     try:
-        if len(data) > TOO_LARGE:
+        if len(data) > 4096:  # bytes from which on a message of a client is no twist
             raise ValueError(f"{len(data)} bytes")
         given = json.loads(data)
         found = given["linear"]["x"], given["linear"]["y"], given["angular"]["z"]
@@ -196,7 +192,7 @@ class FoxgloveServer:
 
     async def _request(self, client: TruckClient, motion: tuple[float, float, float]) -> None:
         with suppress(TruckError):  # the robot says why on its topics
-            await client.drive_twist(*motion, lease=LEASE)
+            await client.drive_twist(*motion, lease=0.25)  # seconds for which a message of the teleop panel stands
 
     def _service(self, order: Order, loop: asyncio.AbstractEventLoop) -> Service:
         empty = MessageSchema(encoding="json", schema=Schema(name="none", encoding="jsonschema", data=b"{}"))

@@ -8,7 +8,7 @@ import json
 import struct
 import zlib
 from pathlib import PurePath
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from monstertruck_schemas.sensor import CompressedImage, LaserScan
 from monstertruck_schemas.state import Grid, Ground, Odometry, Transforms
 
 Frame = str | bytes
-
-LONGEST_RANGE: Final = 65.0
-"""Ranges travel as millimetres in 16 bits, m."""
 
 
 def text(kind: str, **fields: Any) -> str:
@@ -48,7 +45,8 @@ def refusal(number: int, error: TruckError) -> str:
 
 def scan(of: LaserScan) -> bytes:
     """A scan; payload: uint16 ranges in mm, little-endian, 0 = none."""
-    ranges = np.where(np.isfinite(of.ranges) & (of.ranges < LONGEST_RANGE), of.ranges * 1000.0, 0.0)
+    # 65.0: ranges travel as millimetres in 16 bits, m
+    ranges = np.where(np.isfinite(of.ranges) & (of.ranges < 65.0), of.ranges * 1000.0, 0.0)
     return binary(
         "scan",
         np.rint(ranges).astype("<u2").tobytes(),

@@ -14,8 +14,6 @@ LONGEST: Final = 5.0
 """Seconds that a handshake may take."""
 MOST_OF_NETWORK: Final = 32
 """Connections of one network that are being set up; further connections are closed at once."""
-BACKLOG: Final = 128
-"""Connections that wait to be taken."""
 PAUSE: Final = 0.2
 """Seconds before connections are taken again after there was no file descriptor for one."""
 
@@ -55,8 +53,9 @@ class WebListener:
         loop = asyncio.get_running_loop()
         found = await loop.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         with ExitStack() as made:
+            # 128: connections that wait to be taken
             sockets = [
-                made.enter_context(socket.create_server(address[:2], family=family, backlog=BACKLOG))
+                made.enter_context(socket.create_server(address[:2], family=family, backlog=128))
                 for family, address in dict.fromkeys((row[0], row[4]) for row in found)
             ]
             self._sockets = made.pop_all()

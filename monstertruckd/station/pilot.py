@@ -65,8 +65,6 @@ MOST_ASKED: Final = 16
 """Commands of one browser whose outcome is waited for at once."""
 RETRY: Final = 1.0
 """Seconds between two attempts to reach the robot, and in which it answers."""
-TELL_LATE: Final = 1.0
-"""Seconds between two remarks on late heartbeats."""
 SPACING: Final = 0.05
 """Distance between two poses of a drawn path, m."""
 SMOOTHING: Final = 0.12
@@ -154,7 +152,7 @@ class Pilot:
         now = self._clock.now() / SECOND
         late = self._lateness.late(motion.heard / 1e3, motion.since / 1e3, now)
         if late is not None:
-            if now - self._said_late > TELL_LATE:
+            if now - self._said_late > 1.0:  # seconds between two remarks on late heartbeats
                 self._said_late = now
                 self._viewer.send(frames.text("late", seconds=round(late, 3)))
             return

@@ -19,11 +19,7 @@ log = logging.getLogger(__name__)
 
 MOST_BYTES: Final = 400_000_000
 """Payload of a recording that is kept in memory."""
-AGAIN: Final = 0.4
-"""Seconds after which what stands still is shown once more: pages detect a silent robot by it."""
 AGAIN_KINDS: Final = ("gate", "pose", "scan")
-EVENTS: Final = 50
-"""Events shown of the time before the place that was chosen."""
 FASTEST: Final = 20.0
 
 
@@ -180,7 +176,8 @@ class ReplayFeed:
 
     def _events(self) -> Iterator[Frame]:
         track = self._tracks[topics.EVENT.name]
-        for event in _decoded(track.messages[max(track.index - EVENTS, 0) : track.index]):
+        # 50: events shown of the time before the place that was chosen
+        for event in _decoded(track.messages[max(track.index - 50, 0) : track.index]):
             yield frames.message("event", event)
 
     # Time
@@ -196,7 +193,8 @@ class ReplayFeed:
                 self._play(min(self._at + round((now - before) * self._rate), self._end))
             before = now
             if self._viewers and now >= due:
-                due = now + round(AGAIN * SECOND)
+                # 0.4: seconds after which what stands still is shown once more: pages detect a silent robot by it
+                due = now + round(0.4 * SECOND)
                 for kind in AGAIN_KINDS:
                     if kind in self._viewers.newest:
                         self._viewers.show(kind, self._viewers.newest[kind])

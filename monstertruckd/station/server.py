@@ -48,8 +48,6 @@ MOST_REPLAYS: Final = 4
 """Recordings that are shown, and kept in memory, at once."""
 RECORDING: Final = re.compile(r"[A-Za-z0-9_.-]{1,120}\.mcap")
 TYPES: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
-BEAT: Final = 10.0
-"""Seconds between two pings of the WebSocket itself; a browser that does not answer for half of it is let go."""
 LOOK: Final = 1.0
 """Seconds between two checks of robots that appeared, users that were revoked, and the number of connections."""
 END: Final = 5.0
@@ -417,7 +415,9 @@ class Station:
 
     async def _converse(self, request: web.Request, browser: "_Browser") -> web.WebSocketResponse:
         name, peer = browser.name, request.remote
-        socket = web.WebSocketResponse(max_msg_size=commands.MOST_BYTES, heartbeat=BEAT, compress=False)
+        # 10.0: seconds between two pings of the WebSocket itself; a browser that does not answer for half of it is let
+        # go
+        socket = web.WebSocketResponse(max_msg_size=commands.MOST_BYTES, heartbeat=10.0, compress=False)
         await socket.prepare(request)
         self._remarks.add(peer, f"browser {name} connected from {peer}", logging.INFO)
         self._viewers.add(browser.viewer)

@@ -36,8 +36,6 @@ PAUSE: Final = 1.0
 REMEMBERED: Final = 256
 MOST_WAITING: Final = 16
 """Attempts of one address that wait for their turn; further ones are wrong at once."""
-MOST_HASHES: Final = 2
-"""Computed at once."""
 HASH: Final = re.compile(rf"[0-9a-f]{{{2 * LENGTH}}}:[0-9a-f]{{{2 * LENGTH}}}")
 NO_HASH: Final = ":".join(("00" * LENGTH,) * 2)
 """Compared with for unknown names, so that they take as long as known ones."""
@@ -84,7 +82,7 @@ class StationUsers:
         self._secret = secrets.token_bytes(LENGTH)
         self._turns: dict[str, tuple[asyncio.Lock, int]] = {}
         """Of every address that waits, and how many of its attempts do."""
-        self._hashing = asyncio.Semaphore(MOST_HASHES)
+        self._hashing = asyncio.Semaphore(2)  # computed at once
 
     async def refresh(self) -> bool:
         """Read the file again if it has changed; whether the users have.

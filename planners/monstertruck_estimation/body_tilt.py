@@ -16,10 +16,6 @@ from monstertruck_schemas.state import Odometry
 GRAVITY: Final = 9.81
 KEPT: Final = 64
 """Readings of the odometry."""
-GREATEST: Final = 2.0
-"""Acceleration of the body that is trusted at most, m/s^2: beyond it the wheels spin, and nothing is taken out."""
-FELT: Final = 0.06
-"""Seconds over which the odometry's acceleration is averaged, as the compass's accelerometer feels it."""
 
 
 class Tilt(NamedTuple):
@@ -36,7 +32,8 @@ class BodyAcceleration:
         felt: seconds over which it is averaged.
     """
 
-    def __init__(self, felt: float = FELT) -> None:
+    # 0.06: seconds over which the odometry's acceleration is averaged, as the compass's accelerometer feels it
+    def __init__(self, felt: float = 0.06) -> None:
         self._felt = round(felt * SECOND)
         self._speeds: deque[tuple[int, float, float]] = deque(maxlen=KEPT)
 
@@ -73,4 +70,5 @@ def without(acceleration: tuple[float, float], tilt: Tilt) -> Tilt:
 
 
 def _believed(acceleration: float) -> float:
-    return acceleration if abs(acceleration) <= GREATEST else 0.0
+    # 2.0: acceleration of the body that is trusted at most, m/s^2: beyond it the wheels spin, and nothing is taken out
+    return acceleration if abs(acceleration) <= 2.0 else 0.0

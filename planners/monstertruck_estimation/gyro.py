@@ -11,14 +11,8 @@ from monstertruck_schemas.base import Positive, Schema
 
 STILL: Final = 1e-4
 """Distance of the fastest shaft between two readings, m, up to which the robot stands."""
-KEPT: Final = 100
-"""Rates that are kept."""
 LONG: Final = 20 * SECOND
 """Turns are compared over so long as well, ns: what a bias that has crept away adds up to."""
-TRIM: Final = 0.05
-"""Curvature by which the wheels may be off all the time, rad/m."""
-LATE: Final = SECOND // 10
-"""A rate this much older than the wheels' reading still stands for it, ns."""
 
 
 class GyroConfig(Schema):
@@ -49,7 +43,7 @@ class Gyro:
 
     def __init__(self, config: GyroConfig) -> None:
         self._config = config
-        self._rates: deque[tuple[int, float]] = deque(maxlen=KEPT)
+        self._rates: deque[tuple[int, float]] = deque(maxlen=100)  # rates that are kept
         self._rest: list[float] = []
         self._rested = 0.0
         self._turns: deque[tuple[int, float, float]] = deque()
@@ -83,7 +77,8 @@ class Gyro:
             distance: of the fastest shaft, m.
         """
         found = [rate for at, rate in self._rates if since < at <= stamp]
-        if not found and self._rates and stamp - self._rates[-1][0] <= LATE:
+        # SECOND // 10: a rate this much older than the wheels' reading still stands for it, ns
+        if not found and self._rates and stamp - self._rates[-1][0] <= SECOND // 10:
             found = [self._rates[-1][1]]
         if not found:
             self._forget()
@@ -155,7 +150,8 @@ class Gyro:
             rows.clear()
             self._sums = (0.0, 0.0)
             return
-        rows.append((stamp, wheels, gyro, config.share * abs(wheels) + TRIM * distance))
+        # 0.05: curvature by which the wheels may be off all the time, rad/m
+        rows.append((stamp, wheels, gyro, config.share * abs(wheels) + 0.05 * distance))
         off, allowed = self._sums[0] + gyro - wheels, self._sums[1] + rows[-1][3]
         while stamp - rows[0][0] > LONG:
             _, by_wheels, by_gyro, may = rows.popleft()

@@ -19,10 +19,6 @@ from monstertruck_schemas.sensor import Imu, Vector3
 
 SETTLE: Final = 2.0
 """Time constant with which the vertical follows the specific force, s."""
-PLAUSIBLE: Final = 1.0
-"""A force that differs more from gravity, m/s^2, says nothing of the vertical."""
-UNSURE: Final = 5.0
-"""Seconds without a plausible force after which the tilt is not known."""
 GAP: Final = 0.5
 """Seconds without a measurement after which it starts again."""
 STEEPEST: Final = 0.7
@@ -43,9 +39,11 @@ class InertialTilt:
         if self._up is not None and dt <= 0.0:
             return
         strength = math.hypot(*force)
-        felt = _scaled(force, 1.0 / strength) if abs(strength - GRAVITY) < PLAUSIBLE else None
+        # 1.0: a force that differs more from gravity, m/s^2, says nothing of the vertical
+        felt = _scaled(force, 1.0 / strength) if abs(strength - GRAVITY) < 1.0 else None
         self._felt = self._felt if felt is None else stamp
-        if self._up is None or dt > GAP or stamp - self._felt > UNSURE * SECOND:
+        # 5.0: seconds without a plausible force after which the tilt is not known
+        if self._up is None or dt > GAP or stamp - self._felt > 5.0 * SECOND:
             up = felt
         else:
             up = added(self._up, _scaled(_cross(self._up, rate), dt))

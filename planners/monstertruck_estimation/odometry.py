@@ -32,12 +32,6 @@ from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import Odometry
 
-STILL: Final = 0.02
-"""Distance from the start up to which the truck counts as standing there, m."""
-
-RATES: Final = 32
-"""Measurements of an IMU queued at most."""
-
 SOURCE_TIMEOUT: Final = SECOND
 """Time after a reading for which a sensor is listed as a source, ns."""
 
@@ -353,7 +347,8 @@ class DeadReckoning:
 
     def _align(self, off: float, config: CompassConfig) -> None:
         self._aligning.append(off)
-        if len(self._aligning) >= config.alignment or self._driven > STILL:
+        # 0.02: distance from the start up to which the truck counts as standing there, m
+        if len(self._aligning) >= config.alignment or self._driven > 0.02:
             self._north = math.atan2(
                 sum(math.sin(value) for value in self._aligning), sum(math.cos(value) for value in self._aligning)
             )
@@ -502,7 +497,8 @@ class OdometryContext:
         """Its IMU, if there is one and the configuration uses it."""
         if self.imu is None or config is None:
             return None
-        measured, events = self.bus.subscribe(topics.IMU, fifo(RATES)), self.bus.event_sink()
+        # 32: measurements of an IMU queued at most
+        measured, events = self.bus.subscribe(topics.IMU, fifo(32)), self.bus.event_sink()
         return InertialInput(Inertial(config, self.imu), measured, events, OdometryService.name)
 
     def inputs(self) -> dict[str, Any]:

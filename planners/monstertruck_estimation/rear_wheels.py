@@ -46,10 +46,6 @@ KEPT: Final = 256
 """Readings, and poses, that are kept."""
 STANDS: Final = 0.2
 """Share of the expected distance below which a wheel stands still."""
-RUNS: Final = 1.5
-"""Share of the driven wheel's distance that both rear wheels cannot exceed."""
-NARROW: Final = 0.3
-"""Share of the axle's speed below which a wheel does not determine it: the robot turns about that wheel."""
 
 
 class EncoderConfig(Schema):
@@ -117,7 +113,8 @@ def judged(expected: Pair, counted: Pair, turned: float, least: float, config: E
         return EncoderVerdict(text=f"{text}, by the steering {expected[1] - expected[0]:+.2f} m")
     if abs(counted[1] - counted[0] - turned) <= config.tolerance + config.share * abs(rolled):
         share = rolled / driven if abs(driven) > config.tolerance else math.inf
-        if STANDS < share <= RUNS or share == math.inf:
+        # 1.5: share of the driven wheel's distance that both rear wheels cannot exceed
+        if STANDS < share <= 1.5 or share == math.inf:
             text = f"the rear wheels roll {rolled:.2f} m, the driven wheel {driven:.2f} m"
             return EncoderVerdict(slips=True, text=text)
     faults = [
@@ -364,7 +361,8 @@ class RearWheelReckoning(DeadReckoning):
         trusted = self.encoders.believed
         if not all(trusted):
             speed, share = (left, 1.0 - lean) if trusted[0] else (right, 1.0 + lean)
-            if abs(share) < NARROW:
+            # 0.3: share of the axle's speed below which a wheel does not determine it: the robot turns about that wheel
+            if abs(share) < 0.3:
                 return None
             left, right = speed / share * (1.0 - lean), speed / share * (1.0 + lean)
         rolled = max(abs(left), abs(right)) * dt

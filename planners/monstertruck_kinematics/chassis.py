@@ -71,8 +71,6 @@ STANDING: Final = 0.1
 CONTRADICTION: Final = 0.2
 """Shaft speeds may be off the motion they agree on best by this share of the fastest."""
 
-ROUNDING: Final = 1e-9
-"""m/s."""
 
 STRAIGHT: Final = 1e-6
 """Axle angles this close count as equal, rad."""
@@ -83,8 +81,6 @@ turn about when its motion passes through sideways, rad."""
 
 _HALVINGS: Final = 30
 
-ALIGNED: Final = 0.35
-"""Wheels that are steered one by one may roll while they turn to angles this close, rad."""
 
 DIRECT: Final = SteeringPolynomials(AxlePolynomials((1.0, 0.0), (1.0, 0.0)), AxlePolynomials((1.0, 0.0), (1.0, 0.0)))
 """A servo that turns its wheel itself."""
@@ -203,7 +199,7 @@ class Chassis(ABC):
         twist = self.twist(self.input_speeds(shaft_speeds, *angles), *angles)
         fit = self.shafts_along(twist, *angles)
         off, name = max((abs(a - b), name) for a, b, name in zip(shaft_speeds, fit, self.shafts, strict=True))
-        if off > CONTRADICTION * max(map(abs, shaft_speeds)) + ROUNDING:
+        if off > CONTRADICTION * max(map(abs, shaft_speeds)) + 1e-9:  # m/s
             raise KinematicsError(
                 f"the shafts push against each other: {name} is {off:.3g} m/s off the motion they agree on best"
             )
@@ -519,7 +515,8 @@ class WheelSteerChassis(Chassis):
 
     def aligned(self, angles: Angles, target: Angles) -> bool:
         """Wheels far from where they must stand scrub, and would drive the body elsewhere."""
-        return max(abs(to - at) for at, to in zip(angles, target, strict=True)) <= ALIGNED
+        # 0.35: wheels that are steered one by one may roll while they turn to angles this close, rad
+        return max(abs(to - at) for at, to in zip(angles, target, strict=True)) <= 0.35
 
     def shaft_speeds(self, speed: float, front: float, rear: float) -> Speeds:
         """Wheel speeds about the bicycle's ICR."""

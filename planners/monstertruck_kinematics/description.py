@@ -425,7 +425,8 @@ def add_tyre(wheel: str, hub: str, parts: Mechanics, links: list[Part], joints: 
     """
     if parts.tyre_stiffness == 0.0:
         return hub
-    damping = _TYRE_DAMPING * 2.0 * math.sqrt(parts.tyre_spring * parts.mass / 4.0)
+    # 0.2: share of the critical one of the robot on its tyres
+    damping = 0.2 * 2.0 * math.sqrt(parts.tyre_spring * parts.mass / 4.0)
     for name, axis in (("along", (1.0, 0.0, 0.0)), ("across", (0.0, 1.0, 0.0))):
         rim = f"{wheel}_{name}"
         links.append(Part(rim, _RIM, ZERO, (1e-6, 1e-6, 1e-6)))
@@ -441,8 +442,6 @@ def turning_mass(parts: Mechanics) -> float:
 
 _RIM: Final = 1e-3
 """Mass of a link that only carries the give of a tyre, kg."""
-_TYRE_DAMPING: Final = 0.2
-"""Share of the critical one of the robot on its tyres."""
 
 
 def add_sensors(sensors: tuple[SensorFrame, ...], links: list[Part], joints: list[PartJoint]) -> None:

@@ -59,8 +59,6 @@ FULL: Final[Range] = (-SERVO_LIMIT, SERVO_LIMIT)
 
 _ROUNDS: Final = 30
 _CONVERGED: Final = 1e-11
-_MISS: Final = 1e-3
-"""Tangent by which a clamped servo may miss an axle angle on the edge of its reach."""
 
 
 @dataclass(frozen=True)
@@ -478,7 +476,8 @@ class LinkedAxles(Axles):
             row_f, row_r = step_f * ff + step_r * rf, step_f * fr + step_r * rr
             ff, fr = ff + left_f * row_f, fr + left_f * row_r
             rf, rr = rf + left_r * row_f, rr + left_r * row_r
-        if not abs(target_f - got_f) + abs(target_r - got_r) < _MISS:
+        # 1e-3: tangent by which a clamped servo may miss an axle angle on the edge of its reach
+        if not abs(target_f - got_f) + abs(target_r - got_r) < 1e-3:
             raise KinematicsError(f"front is {front:.6g}, rear is {rear:.6g}: out of the steering linkage's reach")
         return servo_f, servo_r
 

@@ -33,8 +33,6 @@ SECOND = 1_000_000_000
 
 MILLISECOND: Final = SECOND // 1000
 
-_FIRST_DATE: Final = 946_684_800 * SECOND
-"""2000-01-01: earlier dates are from a virtual clock, or a computer whose clock was never set."""
 
 MANY_TIMERS: Final = 100
 """Number of timers from which on cancelled ones are removed."""
@@ -42,15 +40,14 @@ MANY_TIMERS: Final = 100
 GUARD: Final = 300.0
 """Seconds of processor time, or of waiting for another thread, that one virtual second may take: kernels that are
 compiled take a minute or two."""
-GUARDED_TURNS: Final = 1024
-"""Iterations of a virtual loop between two looks at the processor time."""
 ENDING: Final = 600.0
 """Virtual seconds that all tasks may take to end once a run is over."""
 
 
 def is_date(real: int) -> bool:
     """Whether a real time, ns, can be the date of a run."""
-    return real >= _FIRST_DATE
+    # 946_684_800 * SECOND: 2000-01-01: earlier dates are from a virtual clock, or a computer whose clock was never set
+    return real >= 946_684_800 * SECOND
 
 
 def processor_time() -> float:
@@ -206,7 +203,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             HungError: it does not.
         """
         self._turns += 1
-        if self._turns % GUARDED_TURNS:
+        if self._turns % 1024:  # iterations of a virtual loop between two looks at the processor time
             return
         second, used = self.instant // SECOND, time.process_time()
         if second != self._guarded_second:

@@ -41,8 +41,6 @@ PLANNER_START: Final = 240.0
 """Seconds that a planner may take to start."""
 ACCEPT_TIMEOUT: Final = 3.0
 """Seconds in which a path is accepted or refused."""
-STAND_TIMEOUT: Final = 2.0
-"""Seconds that a path waits for a truck that is still moving: one that has just reached its goal comes to rest."""
 
 
 class DriveReport:
@@ -224,7 +222,9 @@ async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, re
         driver.subscribe(PATH, latest()) as present,
     ):
         with suppress(TimeoutError):
-            async with clock.deadline(STAND_TIMEOUT):
+            # 2.0: seconds that a path waits for a truck that is still moving: one that has just reached its goal comes
+            # to rest
+            async with clock.deadline(2.0):
                 while (await stand.gate.next()).mode.moving:
                     pass
         async with taken_back(driver.stop):

@@ -56,10 +56,6 @@ def send_estop(robot: str, endpoint: str, timeout: float) -> zenoh.Session:
     return session
 
 
-TIMEOUT: Final = 0.5
-"""Seconds to wait for the link; the ordinary command waits longer."""
-
-
 @contextmanager
 def early_estop(arguments: Sequence[str]) -> Iterator[None]:
     """Send an emergency stop by the arguments of ``estop``; the session is open while the context lasts.
@@ -83,4 +79,4 @@ def _send(arguments: Sequence[str]) -> zenoh.Session | None:
         return None
     robot = given.get("-r") or given.get("--robot") or "truck"
     endpoint = given.get("-e") or given.get("--endpoint") or DEFAULT_ENDPOINT
-    return send_estop(robot, nearest(endpoint), TIMEOUT)
+    return send_estop(robot, nearest(endpoint), 0.5)  # seconds to wait for the link; the ordinary command waits longer

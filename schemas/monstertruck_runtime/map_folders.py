@@ -34,8 +34,6 @@ YAML: Final = "map.yaml"
 SAVES: Final = "saves"
 """Folder of the saves in that of a map."""
 MANIFEST: Final = "manifest.json"
-MOST_MANIFEST: Final = 1_000_000
-"""Size of a manifest at most, bytes."""
 _NUMBER: Final = re.compile(r"\d{6,}")
 _LOOSE: Final = (YAML, "map.png", "graph.npz", "ground.npz", "points.json", "point-*.jpg")
 """Files of earlier versions, which had no manifest; a new map takes their place."""
@@ -250,7 +248,7 @@ def _manifest(save: Path) -> _Manifest:
     """
     path, expected = save / MANIFEST, "the manifest of a saved map"
     with reading(path, expected):
-        return _Manifest.model_validate_json(contents(path, expected, MOST_MANIFEST))
+        return _Manifest.model_validate_json(contents(path, expected, 1_000_000))  # size of a manifest at most, bytes
 
 
 def _part(data: bytes) -> _SavedFile:

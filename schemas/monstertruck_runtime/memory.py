@@ -9,8 +9,6 @@ from typing import Final
 
 HUGE: Final = 2 * 1024 * 1024
 """Bytes of a huge page; where it is another size the kernel refuses, and nothing is lost."""
-_MADV_COLLAPSE: Final = 25
-"""See madvise(2), Linux 6.1 and later; the C library's headers came later."""
 
 _LIBRARY: Final = ctypes.CDLL(None)
 
@@ -27,7 +25,8 @@ def settle() -> None:
     with suppress(OSError):  # /proc may be hidden
         for begin, end in _heaps():
             for page in range(-(-begin // HUGE) * HUGE, end - HUGE + 1, HUGE):
-                _LIBRARY.madvise(ctypes.c_void_p(page), ctypes.c_size_t(HUGE), _MADV_COLLAPSE)
+                # 25: see madvise(2), Linux 6.1 and later; the C library's headers came later
+                _LIBRARY.madvise(ctypes.c_void_p(page), ctypes.c_size_t(HUGE), 25)
 
 
 def give_back() -> None:

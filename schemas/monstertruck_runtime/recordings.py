@@ -4,14 +4,10 @@ import base64
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.threads import in_thread
-
-SAME: Final = 4096
-"""Bytes of what is there that are compared with the robot's before more is added to them."""
 
 
 async def fetch_recording(
@@ -33,7 +29,7 @@ async def fetch_recording(
         TruckError: the robot refuses, is not there, or has no such recording.
     """
     held = await in_thread(lambda: to.stat().st_size if to.exists() else 0)
-    at = max(held - SAME, 0)
+    at = max(held - 4096, 0)  # bytes of what is there that are compared with the robot's before more is added to them
     end = await in_thread(partial(_read, to, at)) if held else b""
     while True:
         answer = await truck.call("recording_read", {"name": name, "offset": at})

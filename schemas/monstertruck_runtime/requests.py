@@ -32,12 +32,6 @@ MAX_SOURCES: Final = 64
 MAX_PROGRAMS: Final = 16
 """How many of them may be of one owner: the names of programs can be invented."""
 
-MEMORY: Final = 2.0
-"""Seconds for which a sequence number counts at least."""
-
-MAX_GAP: Final = 2**32
-"""Greatest step of a source's numbers while its lease runs: nanoseconds may be counted."""
-
 
 class Operator(Protocol):
     """Client of one robot that gives orders."""
@@ -174,7 +168,7 @@ class Sequences:
     """
 
     def __init__(self, max_age: float = math.inf) -> None:
-        self._memory = max(max_age, MEMORY) * SECOND
+        self._memory = max(max_age, 2.0) * SECOND  # seconds for which a sequence number counts at least
         self._newest: dict[str, tuple[int, int]] = {}
         """Number, and when it was accepted, ns."""
 
@@ -194,7 +188,8 @@ class Sequences:
         newest, at = self._newest.get(source, (-1, 0))
         if request.seq <= newest and now - at <= self._memory:
             return Reason.BAD_SEQUENCE
-        if source in keep and source in self._newest and abs(request.seq - newest) > MAX_GAP:
+        # 2**32: greatest step of a source's numbers while its lease runs: nanoseconds may be counted
+        if source in keep and source in self._newest and abs(request.seq - newest) > 2**32:
             return Reason.BUSY
         if source not in self._newest and (crowd := crowded(self._newest, source)):
             oldest = next((name for name in crowd if name not in keep), None)

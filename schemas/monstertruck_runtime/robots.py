@@ -2,16 +2,12 @@
 
 import json
 from collections.abc import Callable
-from typing import Final
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, announced, local_endpoints, nearest, public
 from monstertruck_runtime.errors import InputError
 
-LOOK: Final = 0.5
-"""Timeout of a liveliness query (s)."""
 
-
-def robots_at(endpoint: str, timeout: float = LOOK) -> list[str]:
+def robots_at(endpoint: str, timeout: float = 0.5) -> list[str]:  # timeout of a liveliness query (s)
     """Names of the robots that answer at an endpoint; empty if nothing does, or if it requires a certificate."""
     import zenoh  # noqa: PLC0415 - takes longer than a command's other work, and is rarely needed
 

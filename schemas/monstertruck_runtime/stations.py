@@ -19,8 +19,6 @@ from monstertruck_runtime.errors import NotFoundError, NotPermittedError
 
 TLS_VARIABLE: Final = "MONSTERTRUCKD_TLS"
 """Names the folder of the station's certificate."""
-HANDSHAKE: Final = 1.0
-"""Seconds for a step of a handshake that is to say why there is no link."""
 LONGEST_SOURCE: Final = 64
 """Characters of a source's name."""
 
@@ -136,7 +134,8 @@ def require_certificates(endpoint: str, tls: ClientTls | None) -> None:
     if tls is None:
         return
     with suppress(OSError):
-        if why := link_refusal(endpoint, tls.ca, tls, HANDSHAKE):
+        # 1.0: seconds for a step of a handshake that is to say why there is no link
+        if why := link_refusal(endpoint, tls.ca, tls, 1.0):
             text = "its certificate or this station's is refused"
             raise NotPermittedError(f"{endpoint}: {text}: {why} (`monstertruckd security show` lists dates)")
 

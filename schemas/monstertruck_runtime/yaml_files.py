@@ -15,8 +15,6 @@ from monstertruck_runtime.outside import reading, text_of
 
 MOST_BYTES: Final = 1_000_000
 """Size of one file at most: they are written by hand, or give the origin of a map."""
-MOST_NODES: Final = 20_000
-"""Keys and values of one file at most, those behind aliases counted each time: read in a second."""
 DEEPEST: Final = 50
 """Nesting of lists and mappings, at most."""
 _EXPECTED: Final = "YAML"
@@ -55,7 +53,8 @@ class _BoundedComposer(Composer):
         return node
 
 
-def bounded_yaml(most: int = MOST_NODES, *, expand: bool = True) -> YAML:
+# 20_000: keys and values of one file at most, those behind aliases counted each time: read in a second
+def bounded_yaml(most: int = 20_000, *, expand: bool = True) -> YAML:
     """Return a reader of one document of plain data with bounds of depth and size; see ``_BoundedComposer``."""
     yaml = YAML(typ="safe", pure=True)
     yaml.max_depth = DEEPEST

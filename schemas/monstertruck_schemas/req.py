@@ -48,9 +48,6 @@ class Request(Message):
         return self.source, self.instance
 
 
-NEUTRAL = 1e-3
-"""A request below this in all its speeds, m/s and rad/s, is for standstill."""
-
 AnyNumber = Annotated[float, Field(allow_inf_nan=True)]
 
 
@@ -76,10 +73,6 @@ class RequestedTwist(Schema):
     """Yaw rate, rad/s, counter-clockwise positive."""
 
 
-MAX_SHAFTS: Final = 8
-"""Rates that a request may have; a robot has four driven shafts at most, and refuses another number than its own."""
-
-
 class DriveRequest(Request):
     """A requested motion, in one form: speed and axle angles, ``twist``, or ``shafts``.
 
@@ -95,7 +88,8 @@ class DriveRequest(Request):
     """Rear axle angle of the equivalent bicycle, rad, left positive (counter-steer: opposite to front)."""
     twist: RequestedTwist | None = None
     """Velocity of the base; speed and angles are 0 then."""
-    shafts: Annotated[tuple[AnyNumber, ...], Field(min_length=1, max_length=MAX_SHAFTS)] | None = None
+    # 8: rates that a request may have; a robot has four driven shafts at most, and refuses another number than its own
+    shafts: Annotated[tuple[AnyNumber, ...], Field(min_length=1, max_length=8)] | None = None
     """Rate of the wheels on every driven shaft in the body's order, rad/s, forward positive; speed and angles are 0
     then."""
     unseen: bool = False
@@ -140,7 +134,8 @@ class DriveRequest(Request):
             speeds = self.shafts
         else:
             speeds = (self.speed,) if self.twist is None else (self.twist.vx, self.twist.vy, self.twist.wz)
-        return all(abs(speed) < NEUTRAL for speed in speeds)
+        # 1e-3: a request below this in all its speeds, m/s and rad/s, is for standstill
+        return all(abs(speed) < 1e-3 for speed in speeds)
 
 
 class Order(StrEnum):

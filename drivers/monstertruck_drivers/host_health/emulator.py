@@ -10,8 +10,6 @@ from monstertruck_runtime.errors import InputError
 
 PERIOD: Final = 0.5
 """Seconds between two writes."""
-TICKS: Final = 100
-"""Processor ticks a second and core."""
 CORES: Final = 4
 MAX_KILOHERTZ: Final = 1_800_000
 MEMORY_KIB: Final = 4_000_000
@@ -48,7 +46,7 @@ class HostEmulator:
         """Let time pass until cancelled."""
         while True:
             await self._clock.sleep(PERIOD)
-            ticks = round(TICKS * CORES * PERIOD)
+            ticks = round(100 * CORES * PERIOD)  # processor ticks a second and core
             self._ticks += ticks
             self._busy_ticks += round(ticks * self._busy)
             self.write()

@@ -17,8 +17,6 @@ from monstertruck_runtime.small_files import number_of, text_of
 
 FIRMWARE_THROTTLED: Final = "sys/devices/platform/soc/soc:firmware/get_throttled"
 THROTTLED_NOW: Final = 0xF
-PLAUSIBLE_CELSIUS: Final = (-40.0, 150.0)
-"""Zones without a sensor report values outside of this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +145,7 @@ def _resident(text: str) -> int:
 
 
 def _temperatures(folder: Path) -> Iterator[float]:
-    low, high = PLAUSIBLE_CELSIUS
+    low, high = (-40.0, 150.0)  # zones without a sensor report values outside of this
     for file in folder.glob("thermal_zone*/temp"):
         if (milli := number_of(file)) is not None and low < milli / 1000 < high:
             yield milli / 1000

@@ -10,8 +10,6 @@ from typing import Final
 from monstertruck_runtime.small_files import number_of, text_of
 from monstertruck_schemas.health import LinkMedium
 
-ARPHRD_ETHER: Final = 1
-"""``type`` of Ethernet and Wi-Fi."""
 MEGABIT: Final = 1e6
 ERROR_COUNTERS: Final = ("rx_errors", "tx_errors", "rx_dropped", "tx_dropped")
 
@@ -91,7 +89,7 @@ def _read(folder: Path, signals: dict[str, Signal]) -> Sample | None:
     name = folder.name
     wifi = name in signals or (folder / "wireless").exists() or (folder / "phy80211").exists()
     physical = wifi or (folder / "device").exists()
-    if not physical or number_of(folder / "type") != ARPHRD_ETHER:
+    if not physical or number_of(folder / "type") != 1:  # ``type`` of Ethernet and Wi-Fi
         return None
     signal = signals.get(name) if wifi else None
     connected = text_of(folder / "operstate") in ("up", "unknown") and number_of(folder / "carrier") == 1

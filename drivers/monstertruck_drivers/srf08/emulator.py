@@ -24,10 +24,6 @@ from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
 FIRMWARE: Final = 8
-REVISION: Final = 10
-"""Software of the sonars."""
-GAP: Final = 0.02
-"""Seconds after which the USB-ISS drops half a command."""
 ANSWER: Final = MILLISECOND
 """Nanoseconds that a command takes on USB and I2C."""
 SOUND: Final = 343.0
@@ -93,7 +89,8 @@ class Srf08Emulator:
             data = await end.read()
             now = self._clock.now()
             self.received.extend(data)
-            buffer = data if now - last > GAP * SECOND else buffer + data
+            # 0.02: seconds after which the USB-ISS drops half a command
+            buffer = data if now - last > 0.02 * SECOND else buffer + data
             last = now
             while (size := _size(buffer)) is not None and size <= len(buffer):
                 command, buffer = buffer[:size], buffer[size:]
@@ -191,7 +188,7 @@ class Srf08Emulator:
                 module.microseconds = module.ghost + round(JITTER * float(self._rng.standard_normal()))
         echo = module.microseconds if module.stuck is None else module.stuck
         echo = min(max(self.signals.report(f"echo_{module.name}", echo), 0), 0xFFFF)
-        return bytes((REVISION, module.light, echo >> 8 & 0xFF, echo & 0xFF)) + bytes(32)
+        return bytes((10, module.light, echo >> 8 & 0xFF, echo & 0xFF)) + bytes(32)  # software of the sonars
 
 
 def _size(buffer: bytes) -> int | None:

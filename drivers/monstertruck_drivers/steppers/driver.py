@@ -35,8 +35,6 @@ SAFE_DEADLINE: Final = 0.4
 """Seconds a session may take at its end to stop the motors and switch them off."""
 UPTIME_SLACK: Final = 200
 """Ms by which the controller's uptime may lag behind the host's time between two answers."""
-NOISY: Final = 5
-"""Damaged lines within ``NOISE_WINDOW`` that are reported."""
 NOISE_WINDOW: Final = 10 * SECOND
 
 MODES: Final = {
@@ -192,7 +190,7 @@ class StepperDriver:
                 ready()
             if self._clock.now() - noted > NOISE_WINDOW:
                 noise, noted = session.splitter.bad, self._clock.now()
-            elif session.splitter.bad - noise >= NOISY:
+            elif session.splitter.bad - noise >= 5:  # damaged lines within ``NOISE_WINDOW`` that are reported
                 text = f"{session.splitter.bad - noise} damaged lines, newest {session.splitter.strange!r}"
                 self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, text)
                 noise = session.splitter.bad

@@ -36,14 +36,6 @@ from monstertruck_runtime.errors import InputError
 
 TICK_US: Final = 10
 """Timer period, microseconds."""
-PULL_OUT: Final = 300.0
-"""Steps/s beyond which a rotor no longer follows: it stands and hums, and the counter counts on."""
-PULL_IN: Final = 150.0
-"""Steps/s below which a rotor that stands follows again."""
-FACTORY: Final = (4000, 8000, 500)
-"""Ramp and quick stop, steps/s^2, and watchdog, ms, after power-up."""
-THINKING: Final = 0.0005
-"""Seconds from the end of a line to its answer."""
 COASTING: Final = 1e6
 """Rpm/s at which a rotor without current stops: friction of its gear and wheel."""
 
@@ -93,7 +85,8 @@ class StepperEmulator:
         now = self._clock.now()
         self._splitter = Splitter()
         self._booted = self._fed = now
-        self._acceleration, self._quick, self._watchdog = FACTORY
+        # (4000, 8000, 500): ramp and quick stop, steps/s^2, and watchdog, ms, after power-up
+        self._acceleration, self._quick, self._watchdog = (4000, 8000, 500)
         self._state = MotorState.OFF
         self._rates = [0.0] * self._identity.motors
         self._ordered = [0.0] * self._identity.motors
@@ -160,7 +153,7 @@ class StepperEmulator:
         if self._noise > 0:
             self._noise -= 1
             data = data[:3] + bytes((data[3] ^ 0x04,)) + data[4:]
-        end.write(data, self._late.pop() if self._late else THINKING)
+        end.write(data, self._late.pop() if self._late else 0.0005)  # seconds from the end of a line to its answer
 
     def _obey(self, line: Line) -> Line:
         verbs: dict[str, Callable[[Line], RefusalCode | None]] = {
@@ -245,7 +238,9 @@ class StepperEmulator:
         """Let the rotors follow, as far as their torque goes."""
         now = self._clock.now()
         for i, (plant, rate) in enumerate(zip(self._plants, self._rates, strict=True)):
-            self._stalled[i] = abs(rate) > (PULL_IN if self._stalled[i] else PULL_OUT)
+            # 150.0: steps/s below which a rotor that stands follows again
+            # 300.0: steps/s beyond which a rotor no longer follows: it stands and hums, and the counter counts on
+            self._stalled[i] = abs(rate) > (150.0 if self._stalled[i] else 300.0)
             follows = self._powered and not self._stalled[i] and not self._held[i]
             target = (rate * self._rpm if follows else 0.0) if self._powered else None
             plant.command(now, target, self._ramp if follows else COASTING)

@@ -20,8 +20,6 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.threads import Offload, in_thread
 
 FONT_SIZE: Final = 20
-QUALITY: Final = 75
-"""JPEG quality, 1..95."""
 
 
 def jpeg(picture: NDArray[np.uint8], counter: int) -> bytes:
@@ -32,7 +30,7 @@ def jpeg(picture: NDArray[np.uint8], counter: int) -> bytes:
     draw.rectangle(draw.textbbox((8, 8), text, font=_font()), fill="black")
     draw.text((8, 8), text, fill="white", font=_font())
     out = io.BytesIO()
-    image.save(out, "JPEG", quality=QUALITY)
+    image.save(out, "JPEG", quality=75)  # JPEG quality, 1..95
     return out.getvalue()
 
 

@@ -11,8 +11,6 @@ from monstertruck_drivers.webcam.v4l2_source import V4l2Source
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError
 
-ANSWER_TIMEOUT: Final = 2.0
-"""Seconds until an emulated camera must grant or refuse."""
 MOST: Final = BUFFER_LIMIT // 2
 """Bytes of a picture taken at a time: the link keeps no more than its buffer holds."""
 
@@ -36,7 +34,7 @@ class RenderedSource:
         parser = PacketParser()
         try:
             link.write(f"\nOPEN {mode.width} {mode.height} {mode.rate}\n".encode())
-            async with self._clock.deadline(ANSWER_TIMEOUT):
+            async with self._clock.deadline(2.0):  # seconds until an emulated camera must grant or refuse
                 granted = await self._answer(link, parser)
             return RenderedStream(link, parser, granted)
         except TimeoutError:

@@ -16,8 +16,6 @@ from monstertruck_drivers.webcam.source import SET_FORMAT, CameraFrame, Mode, de
 from monstertruck_runtime.errors import DeviceError, DeviceLostError, DeviceMismatchError
 from monstertruck_runtime.threads import Offload, in_daemon_thread
 
-ENUMERATION_LIMIT: Final = 256
-"""Rows at most: a broken driver may never say that there are no more."""
 PATIENCE: Final = 2.0
 """Longest wait for the camera to stop at the end of a session (s)."""
 
@@ -283,7 +281,7 @@ def _enumerate(fd: int, kernel: v4l2.Kernel, request: int, layout: struct.Struct
     """Rows of an enumeration: index and key go in first, the whole structure comes back."""
     head = struct.Struct(f"@{1 + len(key)}I")
     rows: list[tuple[Any, ...]] = []
-    while len(rows) < ENUMERATION_LIMIT:
+    while len(rows) < 256:  # rows at most: a broken driver may never say that there are no more
         argument = bytearray(layout.size)
         head.pack_into(argument, 0, len(rows), *key)
         try:

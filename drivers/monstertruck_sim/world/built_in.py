@@ -172,13 +172,9 @@ def workshop() -> BuiltIn:
     return BuiltIn(canvas.map(), (0.0, 0.0, 0.0))
 
 
-TABLE = 3.0
-"""Side of the test stand's table, m."""
-
-
 def table() -> BuiltIn:
     """The flat top of a test stand with a rim all around; its middle is the origin."""
-    half = TABLE / 2
+    half = 3.0 / 2  # side of the test stand's table, m
     canvas = _Canvas((-half - _WALL, half + _WALL), (-half - _WALL, half + _WALL))
     canvas.free |= canvas.rectangle(-half, -half, half, half)
     return BuiltIn(canvas.map(), (0.0, 0.0, 0.0))

@@ -28,25 +28,11 @@ Drawing = Callable[[], Picture]
 
 WALLS, FLOOR, SKY = 0, 128, 192
 """First palette entries: 128 shades of wall, 64 of floor, 64 of sky."""
-HALF_SHADE: Final = 4.0
-"""Metres at which a wall is half as bright."""
 RIM: Final = 1
 """Cells of white paper round a tag's black square of eight cells."""
 CELLS: Final = 8
 PAPER_CELLS: Final = CELLS + 2 * RIM
 PAPER, INK = 235, 20
-TALL: Final = 1.7
-"""Height of a person, m."""
-FARTHEST: Final = 12.0
-"""Panels farther away are not drawn, m: a tag of 10 cm is 4 pixels there."""
-BEHIND: Final = 0.08
-"""A panel this far behind what the rays meet is still before it: it hangs on it, m."""
-FINEST: Final = 4
-"""Rays of a pixel along and across, at most."""
-RAYS: Final = 80_000
-"""Rays of a panel at most: fewer rays a pixel where it fills the picture."""
-_ROUNDS: Final = 6
-"""Iterations that undo the lens's distortion."""
 _GRAIN: Final = 64
 """The grain of the sensor is moved by up to so many pixels from picture to picture."""
 
@@ -184,7 +170,8 @@ class SimulatedView:
         for panel in self._panels:
             away = panel.corner + (panel.right + panel.down) / 2 - place.centre
             front = np.cross(panel.down, panel.right)
-            if away @ place.axes[2] > 0.05 and away @ front < 0 and (far := float(np.linalg.norm(away))) < FARTHEST:
+            # 12.0: panels farther away are not drawn, m: a tag of 10 cm is 4 pixels there
+            if away @ place.axes[2] > 0.05 and away @ front < 0 and (far := float(np.linalg.norm(away))) < 12.0:
                 found.append((far, panel))
         return [panel for _, panel in sorted(found, key=lambda row: -row[0])]
 
@@ -242,7 +229,7 @@ class Painter:
             place: of the camera.
         """
         depth = np.maximum(ranges * self._along, 0.05).astype(np.float32)
-        shade = (WALLS + 127 / (1 + depth / HALF_SHADE)).astype(np.uint8)
+        shade = (WALLS + 127 / (1 + depth / 4.0)).astype(np.uint8)  # metres at which a wall is half as bright
         edges = -self._above / depth, self._below / depth
         picture: Picture = _painted(self._slope, self._column, *edges, shade, self._ground, _palette())
         for panel in panels:
@@ -263,7 +250,9 @@ class Painter:
         x0, y0, x1, y1 = max(int(x0), 0), max(int(y0), 0), min(int(x1), width), min(int(y1), height)
         if x0 >= x1 or y0 >= y1:
             return
-        finer = max(1 + panel.smooth, min(FINEST, int((RAYS / ((x1 - x0) * (y1 - y0))) ** 0.5)))
+        # 4: rays of a pixel along and across, at most
+        # 80_000: rays of a panel at most: fewer rays a pixel where it fills the picture
+        finer = max(1 + panel.smooth, min(4, int((80_000 / ((x1 - x0) * (y1 - y0))) ** 0.5)))
         part = (np.arange(finer) + 0.5) / finer - 0.5
         us = (np.arange(x0, x1)[:, None] + part).ravel() - (width - 1) / 2
         vs = (np.arange(y0, y1)[:, None] + part).ravel() - (height - 1) / 2
@@ -295,7 +284,8 @@ class Painter:
         azimuths = np.angle(np.exp(1j * (np.arctan2(points[..., 1], points[..., 0]) - ahead)))
         fan = self._fan
         at = np.clip(np.searchsorted(-fan, -azimuths), 0, len(fan) - 1)
-        found: NDArray[np.bool_] = np.hypot(points[..., 0], points[..., 1]) < ranges[at] + BEHIND
+        # 0.08: a panel this far behind what the rays meet is still before it: it hangs on it, m
+        found: NDArray[np.bool_] = np.hypot(points[..., 0], points[..., 1]) < ranges[at] + 0.08
         return found
 
     def straight_pixels(self) -> tuple[float, Array]:
@@ -321,7 +311,7 @@ class Painter:
         if not (self._config.k1 or self._config.k2):
             return right, down
         x, y = right, down
-        for _ in range(_ROUNDS):
+        for _ in range(6):  # iterations that undo the lens's distortion
             square = x**2 + y**2
             factor = 1 + self._config.k1 * square + self._config.k2 * square**2
             x, y = right / factor, down / factor
@@ -398,7 +388,7 @@ def person_panel(x: float, y: float, radius: float, place: CameraPlace) -> FlatP
     toward = place.centre[:2] - (x, y)
     toward = toward / max(hypot(*toward), 1e-6)
     right = np.array((-toward[1], toward[0], 0.0)) * 2 * radius
-    down = np.array((0.0, 0.0, -TALL))
+    down = np.array((0.0, 0.0, -1.7))  # height of a person, m
     nearest = np.array((*((x, y) + toward * radius), 0.0))
     return FlatPanel(texture, opaque, nearest - right / 2 - down, right, down)
 

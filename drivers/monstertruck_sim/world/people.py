@@ -13,14 +13,8 @@ from monstertruck_sim.world.obstacles import Disc
 
 STEP_S = 0.02
 """Seconds between two checks of the path ahead."""
-ARRIVED = 0.05
-"""A way-point nearer than this is reached, m."""
-PATIENCE = 3.0
-"""Seconds of waiting for somebody else after which the next way-point is chosen."""
 SIDE = 0.25
 """What is further than this from the way somebody sweeps is passed, m."""
-LEG = (1.0, 4.0)
-"""Least and greatest length of a drawn leg, m."""
 _TURNS = (pi / 6, -pi / 6, pi / 3, -pi / 3, pi / 2, -pi / 2)
 _TRIES = 400
 _HISTORY = 40
@@ -112,7 +106,7 @@ class Person:
     def _walk(self, others: Sequence[Round], touched: Callable[[Disc], bool]) -> None:
         dx, dy = self._target[0] - self.x, self._target[1] - self.y
         left = hypot(dx, dy)
-        if left < ARRIVED:
+        if left < 0.05:  # a way-point nearer than this is reached, m
             self._pausing = float(self._rng.uniform(0.0, 2.0)) * self._config.pause
             self._choose()
             return
@@ -125,7 +119,7 @@ class Person:
                 self._waited = 0.0
                 return
         self._waited += STEP_S
-        if self._waited > PATIENCE:
+        if self._waited > 3.0:  # seconds of waiting for somebody else after which the next way-point is chosen
             self._waited = 0.0
             self._turn_back()
 
@@ -159,7 +153,8 @@ class Person:
             self._target = self._given[self._next]
             return
         for _ in range(_TRIES):
-            length, heading = self._rng.uniform(*LEG), self._rng.uniform(-pi, pi)
+            # (1.0, 4.0): least and greatest length of a drawn leg, m
+            length, heading = self._rng.uniform(1.0, 4.0), self._rng.uniform(-pi, pi)
             place = self.x + length * cos(heading), self.y + length * sin(heading)
             if self._clear((self.x, self.y), place):
                 self._target = place

@@ -18,8 +18,6 @@ from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
 
 SERVO_FRAME_NS = 20_000_000
 GRAVITY = 9.81
-_KEPT_NS = 600_000_000
-"""What the past of a robot's poses is kept for."""
 
 Xyz = tuple[float, float, float]
 
@@ -103,7 +101,8 @@ class Plant(ABC):
         """Height of the base, m."""
         self._stuck_at: Pose2 | None = None
         self._slipping = [False] * count
-        self._trail: deque[tuple[float, ...]] = deque(maxlen=_KEPT_NS // self.STEP_NS)
+        # 600_000_000: what the past of a robot's poses is kept for
+        self._trail: deque[tuple[float, ...]] = deque(maxlen=600_000_000 // self.STEP_NS)
         self.joints: JointSource | None = None
         """Joints of the lidar's mount; None: it is fixed."""
         self.together: Callable[[int], None] = lambda _: None

@@ -26,8 +26,6 @@ from monstertruck_sim.world.truck_plant import STEP_NS
 
 MOVING = 0.01
 """A body slower than this stands, m/s."""
-_APART = 0.08
-"""Two bodies that are further apart have parted, m: more than a stride."""
 _RAYS = 64
 """Rays of a sweep that meet the others at one instant: 6 ms of the lidar's revolution."""
 _WALK_NS = round(STEP_S * 1e9)
@@ -212,7 +210,8 @@ class Surroundings:
     def _part(self) -> None:
         """Forget pairs that are apart: if they meet again, it is another contact."""
         for pair in sorted(self._touching):
-            first, second = (self._shape(name, 2 * _APART) for name in pair)
+            # 0.08: two bodies that are further apart have parted, m: more than a stride
+            first, second = (self._shape(name, 2 * 0.08) for name in pair)
             box, other = (first, second) if isinstance(first, Box) else (second, first)
             if isinstance(box, Box) and penetration(box, other) == 0.0:
                 self._touching.discard(pair)

@@ -53,8 +53,6 @@ _STEP_ANGLE = 2 * pi / 1024
 BEAM_ANGLES = (np.arange(STEPS) - 384) * _STEP_ANGLE
 _BEAM_DELAYS = (np.arange(STEPS) * (SWEEP_NS // 1024)).astype(np.int64)
 _LEVEL = 1e-4
-CARRIED = 5.0
-"""A robot that was faster than this between two looks was carried, m/s."""
 
 Beams = tuple[Array, Array, Array]
 """Directions: components x, y, z, each (n,)."""
@@ -449,7 +447,7 @@ class SimulatedRearWheels:
     def _roll(self, before: Pose2, now: Pose2, dt: int) -> None:
         """Along an arc; nothing where the robot was carried."""
         way = hypot(now[0] - before[0], now[1] - before[1])
-        if way > CARRIED * dt / SECOND:
+        if way > 5.0 * dt / SECOND:  # a robot that was faster than this between two looks was carried, m/s
             return
         turn, middle = now[2] - before[2], (now[2] + before[2]) / 2
         chord = (now[0] - before[0]) * cos(middle) + (now[1] - before[1]) * sin(middle)

@@ -11,8 +11,6 @@ from monstertruck_kinematics.se2 import Twist2
 from monstertruck_sim.world.config import SkidModelConfig
 from monstertruck_sim.world.noise import SKID, generator
 
-ROLLING: Final = 1e-3
-"""Slower robots stand, m/s."""
 TURNING_TIME: Final = 0.2
 """Seconds that the turn at a reversal takes."""
 
@@ -42,7 +40,7 @@ class SkidEffects:
     def twist(self, twist: Twist2, yaw: float, dt: float) -> Twist2:
         """Velocity of the body, from what its wheels make of it; m/s, rad/s."""
         vx, vy, wz = twist
-        if abs(vx) > ROLLING:
+        if abs(vx) > 1e-3:  # slower robots stand, m/s
             direction = copysign(1.0, vx)
             if direction == -self._direction:
                 self._rate, self._left = self._turn() / TURNING_TIME, TURNING_TIME

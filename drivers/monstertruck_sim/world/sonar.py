@@ -25,20 +25,7 @@ from monstertruck_sim.world.sensors import turned
 
 SPEED_OF_SOUND: Final = 343.0
 """m/s, in air of 20 degrees Celsius."""
-_STEP: Final = 0.015
-"""Angle between the rays of a cone, rad."""
-_WINDOW: Final = 0.08
-"""Points this near on both sides tell the direction of a wall, m: some cells of a map."""
-_EDGE: Final = 0.25
-"""Spread across over spread along, from which on points are no wall but a corner."""
 _JUMP: Final = 0.12
-_JUMP_SHARE: Final = 0.2
-"""Neighbouring rays have an edge between them where their ranges differ by more, m, and their inverse ranges by more
-of the greater one: along a straight wall these are near each other even where it is seen at a grazing angle."""
-_NEIGHBOURS: Final = 3
-"""Rays on both sides that tell the direction of a wall at any distance."""
-_KEPT: Final = 32
-"""Pings that are remembered: more than are sent before the sound of one dies away."""
 
 
 Solids = Callable[[float, float, float, float], Caster | None]
@@ -82,7 +69,7 @@ def beam(cast: Caster, ping: Ping, model: SonarModelConfig) -> float:
 
 def surface(cast: Caster, ping: Ping, model: SonarModelConfig) -> Surface:
     """What is in the cone of one sonar, and how it reflects."""
-    count = 2 * ceil(model.field_of_view / 2 / _STEP) + 1
+    count = 2 * ceil(model.field_of_view / 2 / 0.015) + 1  # angle between the rays of a cone, rad
     angles = ping.yaw + np.linspace(-model.field_of_view / 2, model.field_of_view / 2, count)
     ranges = cast(np.full(count, ping.x), np.full(count, ping.y), angles, model.audible)
     hit = np.isfinite(ranges)
@@ -162,14 +149,19 @@ def _normals(x: Array, y: Array, ranges: Array) -> tuple[Array, NDArray[np.bool_
     count = len(ranges)
     near, far = np.minimum(ranges[1:], ranges[:-1]), np.maximum(ranges[1:], ranges[:-1])
     with np.errstate(invalid="ignore", divide="ignore"):
-        gaps = (far - near > _JUMP) & (1.0 - near / far > _JUMP_SHARE)
+        # 0.2: neighbouring rays have an edge between them where their ranges differ by more, m, and their inverse
+        # ranges by more of the greater one: along a straight wall these are near each other even where it is seen at a
+        # grazing angle
+        gaps = (far - near > _JUMP) & (1.0 - near / far > 0.2)
     piece = np.concatenate([[0], np.cumsum(gaps)])
     scatters = np.zeros(count, dtype=np.bool_)
     # The nearer side of a jump within the cone is an edge.
     nearer = np.flatnonzero(gaps) + (ranges[1:] < ranges[:-1])[gaps]
     scatters[nearer] = np.isfinite(ranges[nearer])
-    around = np.hypot(x[:, None] - x, y[:, None] - y) <= _WINDOW
-    around |= np.abs(np.arange(count)[:, None] - np.arange(count)) <= _NEIGHBOURS
+    # 0.08: points this near on both sides tell the direction of a wall, m: some cells of a map
+    around = np.hypot(x[:, None] - x, y[:, None] - y) <= 0.08
+    # 3: rays on both sides that tell the direction of a wall at any distance
+    around |= np.abs(np.arange(count)[:, None] - np.arange(count)) <= 3
     around &= piece[:, None] == piece
     weights = around / around.sum(axis=1, keepdims=True)
     dx, dy = x - (weights @ x)[:, None], y - (weights @ y)[:, None]
@@ -177,7 +169,8 @@ def _normals(x: Array, y: Array, ranges: Array) -> tuple[Array, NDArray[np.bool_
     along = np.arctan2(2 * xy, xx - yy) / 2
     middle, half = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     with np.errstate(invalid="ignore"):
-        scatters |= np.sqrt(np.maximum(middle - half, 0.0)) > _EDGE * np.sqrt(middle + half)
+        # 0.25: spread across over spread along, from which on points are no wall but a corner
+        scatters |= np.sqrt(np.maximum(middle - half, 0.0)) > 0.25 * np.sqrt(middle + half)
     return along + pi / 2, scatters
 
 
@@ -230,7 +223,8 @@ class SimulatedSonars:
     ) -> None:
         self._plant, self._cast, self._config, self._seed, self._solids = plant, cast, config, seed, solids
         self._over = wall_height - config.height
-        self._pings: deque[tuple[str, Ping, Caster, Surface | None]] = deque(maxlen=_KEPT)
+        # 32: pings that are remembered: more than are sent before the sound of one dies away
+        self._pings: deque[tuple[str, Ping, Caster, Surface | None]] = deque(maxlen=32)
         self._heard = 0
 
     def fire(self, name: str, time_ns: int) -> None:

@@ -23,8 +23,6 @@ from monstertruck_sim.world.skid import SkidEffects
 STEP_NS = 5_000_000
 _FREED = 0.005
 _SLIP_PERIOD_NS = 200_000_000
-_FELT = 0.05
-"""Time constant with which an accelerometer feels the body's acceleration, s: its mount and filter."""
 
 Contact = Callable[[float, float, float], float]
 """How deep the footprint at (x, y, yaw) reaches into things, m; 0 = free."""
@@ -126,7 +124,8 @@ class TruckPlant(Plant):
     def _accelerate(self, before: tuple[float, float, float], dt: float) -> None:
         vx, vy, wz = self._twist
         true = (vx - before[0]) / dt - wz * vy, (vy - before[1]) / dt + wz * vx
-        share = 1.0 - exp(-dt / _FELT)
+        # 0.05: time constant with which an accelerometer feels the body's acceleration, s: its mount and filter
+        share = 1.0 - exp(-dt / 0.05)
         forward, left = self._felt
         self._felt = forward + share * (true[0] - forward), left + share * (true[1] - left)
 

@@ -3,7 +3,6 @@
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from math import atan, tan
-from typing import Final
 
 import numpy as np
 
@@ -12,9 +11,6 @@ from monstertruck_sim.world.camera import CameraPlace, Drawing, Painter, Picture
 from monstertruck_sim.world3d.model import Group
 from monstertruck_sim.world3d.picture import CameraPose, WorldRenderer, standing
 from monstertruck_sim.world3d.plant import RigidPlant
-
-FULL_SIZE: Final = (640, 480)
-"""Pixels: with what it is tried whether this computer can draw."""
 
 
 class RenderedView(SimulatedView):
@@ -39,7 +35,7 @@ class RenderedView(SimulatedView):
         self._thread = ThreadPoolExecutor(1, "camera")
         """A context of EGL belongs to one thread."""
         self._renderers: dict[tuple[int, int], tuple[WorldRenderer, float, Painter]] = {}
-        self._renderer(FULL_SIZE)
+        self._renderer((640, 480))  # pixels: with what it is tried whether this computer can draw
         # At the program's end the thread is gone before, and the context with it.
         weakref.finalize(self, _close, self._thread, self._renderers).atexit = False
 

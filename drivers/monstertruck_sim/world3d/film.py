@@ -20,8 +20,6 @@ SIZE: Final = (480, 320)
 """Pixels."""
 _BEHIND, _ASIDE, _ABOVE = 1.25, 0.7, 0.95
 """Place of the camera from the robot, m; it swings round behind a robot that turns."""
-_SWING: Final = 0.12
-"""Share of the way round that it makes from frame to frame."""
 _COLOURS: Final = 128
 _PLAIN: Final = Image.Dither.NONE
 
@@ -69,7 +67,7 @@ class Film:
         self._world.truth(now)
         x, y, yaw = self._plant.pose
         z = self._plant.height
-        self._heading += _SWING * (yaw - self._heading)
+        self._heading += 0.12 * (yaw - self._heading)  # share of the way round that it makes from frame to frame
         c, s = cos(self._heading), sin(self._heading)
         camera = x - _BEHIND * c + _ASIDE * s, y - _BEHIND * s - _ASIDE * c, z + _ABOVE
         view = looking_at(camera, (x + 0.3 * c, y + 0.3 * s, z + 0.1))

@@ -27,8 +27,6 @@ from monstertruck_sim.world.terrain import LEVEL, Profile, Terrain
 from monstertruck_sim.world3d.heights import HeightGrid
 from monstertruck_sim.world3d.model import Block
 
-MOST_XML: Final = 10 * MEGABYTE
-"""Bytes of an MJCF file."""
 HEIGHT_STEP: Final = 0.05
 """Distance of the points of the height field, m."""
 _MARGIN: Final = 1.0
@@ -143,7 +141,7 @@ def scenery(path: Path) -> tuple[list[ET.Element], list[ET.Element]]:
             another sequence of Euler angles.
     """
     expected = "MJCF (sim.world.mjcf)"
-    text = contents(path, expected, MOST_XML)
+    text = contents(path, expected, 10 * MEGABYTE)  # bytes of an MJCF file
     with reading(path, expected):
         if b"<!ENTITY" in text:
             raise InputError(f"sim.world.mjcf: {path}: <!ENTITY: expected XML without entities")

@@ -30,20 +30,6 @@ from monstertruck_sim.world3d.model import (
 )
 
 _FREED: Final = 0.005
-_STANDING: Final = 0.01
-"""Slower than this, m/s, it has not run into what it touches."""
-_FELT: Final = 0.05
-"""Time constant with which an accelerometer feels the body's acceleration, s: its mount and filter."""
-_SETTLE: Final = 400
-"""Steps that a robot which was put down gets to come to rest."""
-_RESTS: Final = 0.5
-"""Speed upwards or downwards that one which came to rest cannot have, m/s."""
-_LOW: Final = 0.002
-"""Height below which a wheel gets no block, m."""
-_LEANS: Final = 0.1
-"""Greatest difference between the tilt of a robot and that of its blocks that its springs explain, rad."""
-_INSIDE: Final = 0.03
-"""Depth to which nothing gives way under it, m."""
 _UNSTABLE: Final = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -186,7 +172,8 @@ class RigidPlant(Plant):
         before, self._on_blocks = self._on_blocks, (pitch, roll)
         try:
             self.carry(self._pose)
-            if hypot(self._attitude[0] - pitch, self._attitude[1] - roll) > _LEANS:
+            # 0.1: greatest difference between the tilt of a robot and that of its blocks that its springs explain, rad
+            if hypot(self._attitude[0] - pitch, self._attitude[1] - roll) > 0.1:
                 wanted = f"pitch {degrees(pitch):.0f} deg and roll {degrees(roll):.0f} deg"
                 raise InputError(f"tilt: the robot falls off blocks that give it {wanted}")
         except InputError:
@@ -215,7 +202,7 @@ class RigidPlant(Plant):
             body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"support_{i}")
             geom, mocap = model.body_geomadr[body], model.body_mocapid[body]
             ahead, aside, rise = (x, y, base) + feet[i] if i < len(feet) else np.zeros(3)
-            used = rise > _LOW
+            used = rise > 0.002  # height below which a wheel gets no block, m
             kind, affinity = CARRIES if used else (0, 0)
             model.geom_contype[geom] = model.body_contype[body] = kind
             model.geom_conaffinity[geom] = model.body_conaffinity[body] = affinity
@@ -240,14 +227,15 @@ class RigidPlant(Plant):
         self._deflection = [0.0] * len(self._deflection)
         self._command(0.0, [servo.angle for servo in self._servos])
         self._warned = Warnings.count
-        for _ in range(_SETTLE):
+        for _ in range(400):  # steps that a robot which was put down gets to come to rest
             mujoco.mj_step(self.model, data)
             if Warnings.count != self._warned:
                 break
             data.qpos[:2] = x, y
             data.qvel[:2] *= 0.5
-        inside = data.ncon > 0 and data.contact.dist.min() < -_INSIDE
-        if self._unstable() or inside or not abs(data.qvel[2]) < _RESTS:
+        inside = data.ncon > 0 and data.contact.dist.min() < -0.03  # depth to which nothing gives way under it, m
+        # 0.5: speed upwards or downwards that one which came to rest cannot have, m/s
+        if self._unstable() or inside or not abs(data.qvel[2]) < 0.5:
             raise InputError(f"the robot does not come to rest at ({x:.2f}, {y:.2f}): something is in its place there")
         data.qvel[:] = 0.0
         mujoco.mj_forward(self.model, data)
@@ -361,7 +349,8 @@ class RigidPlant(Plant):
         """The acceleration of a step, from the velocity before it, through the sensor's filter."""
         ax, ay, az = ((now - then) / TIMESTEP for now, then in zip(self._velocity, before, strict=True))
         c, s = cos(self._pose[2]), sin(self._pose[2])
-        share = 1.0 - exp(-TIMESTEP / _FELT)
+        # 0.05: time constant with which an accelerometer feels the body's acceleration, s: its mount and filter
+        share = 1.0 - exp(-TIMESTEP / 0.05)
         forward, left, up = self._felt
         self._felt = (
             forward + share * (c * ax + s * ay - forward),
@@ -373,7 +362,8 @@ class RigidPlant(Plant):
         """Walls and what stands or moves around stop the robot; ground and blocks carry it."""
         solid = self._solid
         if self.data.ncon and any(solid[a] or solid[b] for a, b in self.data.contact.geom.tolist()):
-            if self._stuck_at is None and hypot(*self._twist[:2]) > _STANDING:
+            # 0.01: slower than this, m/s, it has not run into what it touches
+            if self._stuck_at is None and hypot(*self._twist[:2]) > 0.01:
                 self.on_blocked(self._pose, self._twist)
             self._stuck_at = self._pose
         elif self._stuck_at is not None:

@@ -27,10 +27,6 @@ GROUND: Final = 0.1
 """Greatest offset, V: 10 mV along the ground wire, times the divider."""
 EVEN: Final = math.sqrt(3)
 """Greatest error over standard deviation where all errors up to the greatest are as likely."""
-FINEST: Final = 1e-4
-"""Error of a reading at least, V: less no multimeter states, and no fit bears."""
-ROUNDING: Final = 0.5
-"""Part of the rounding of one reading that is left in their mean: noise averages it out, but is never relied on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +99,9 @@ class BatteryWizard:
         raw = (np.array([message.raw_voltage for message in taken]) - offset) / gain
         if raw.min() <= 0 or raw.std() > 0.02 * raw.mean():
             raise InputError(f"the input reads {raw.min():.2f} to {raw.max():.2f} V: no steady voltage to compare with")
-        rounding = ROUNDING * step / math.sqrt(12)
+        # 0.5: part of the rounding of one reading that is left in their mean: noise averages it out, but is never
+        # relied on
+        rounding = 0.5 * step / math.sqrt(12)
         return MeterReading(float(raw.mean()), volts, math.hypot(float(raw.std()) / math.sqrt(raw.size), rounding))
 
     def _result(self, readings: list[MeterReading], keys: tuple[str, str]) -> Result:
@@ -142,7 +140,8 @@ class BatteryWizard:
         volts = np.array([reading.volts for reading in readings])
         noise = np.array([reading.error for reading in readings]) * volts / raw
         self._check(raw, volts, NORMAL * noise)
-        sigma = np.maximum(np.hypot(self.meter_digits / EVEN, noise), FINEST)
+        # 1e-4: error of a reading at least, V: less no multimeter states, and no fit bears
+        sigma = np.maximum(np.hypot(self.meter_digits / EVEN, noise), 1e-4)
         share = max(self.meter_share, 1e-6)
         rows = np.vstack(
             (

@@ -28,18 +28,8 @@ from monstertruckd.tools.calibrate.board_views import BoardView
 
 NAMES: Final = ("x", "y", "z", "yaw", "pitch", "roll")
 """Parameters of a mount."""
-LEAST: Final = 10
-"""Beams on the board."""
-GAP: Final = 0.05
-"""Step of the range from beam to beam that no board makes, m."""
 EDGES: Final = 2
 """Beams at both ends of the board that may have met its edge."""
-NEAR: Final = (0.2, 0.04)
-"""m: how far beams may be off the board's plane, at first and once the mount is known."""
-MARGIN: Final = (0.12, 0.0)
-"""m: by how much they may miss the board, at first and once the mount is known."""
-STRAIGHT: Final = 0.02
-"""m: root mean square by which the points of a line may be off it."""
 FLAT: Final = 0.001
 """Standard deviation of a board's middle off its plane, m."""
 WARPED: Final = 0.003
@@ -50,10 +40,6 @@ PRINT: Final = 0.003
 """Relative error of the board's size: a ruler, and paper."""
 UNKNOWN: Final = 0.3
 """Standard deviation before the lidar is used."""
-WRONG_SIZE: Final = 0.01
-"""Share by which the board's size must be wrong at least, to be named."""
-STRAY: Final = 5.0
-"""Residual of a view that does not belong to the others, in standard deviations."""
 LEAST_VIEWS: Final = 6
 REACH: Final = np.array((0.5, 0.5, 0.5, 0.8, 0.8, 0.8))
 """Greatest error of the configured mount, m and rad."""
@@ -105,11 +91,13 @@ def line_on_board(
     finite = np.isfinite(view.ranges)
     flat = np.where(finite, view.ranges, 0.0)[:, None] * directions(view.angles)
     on = in_board(flat, pose, mount, lidar)
-    board, margin = reader.board, MARGIN[known]
+    # (0.12, 0.0): m: by how much they may miss the board, at first and once the mount is known
+    board, margin = reader.board, (0.12, 0.0)[known]
     inside = (on[:, 0] > -margin) & (on[:, 0] < board.width + margin)
     inside &= (on[:, 1] > -margin) & (on[:, 1] < board.height + margin)
-    run = longest(finite & inside & (np.abs(on[:, 2]) < NEAR[known]), view.ranges)[EDGES:-EDGES]
-    if run.size < LEAST:
+    # (0.2, 0.04): m: how far beams may be off the board's plane, at first and once the mount is known
+    run = longest(finite & inside & (np.abs(on[:, 2]) < (0.2, 0.04)[known]), view.ranges)[EDGES:-EDGES]
+    if run.size < 10:  # beams on the board
         return None
     points = flat[run]
     middle = points.mean(axis=0)
@@ -117,7 +105,7 @@ def line_on_board(
     along = (points - middle) @ direction
     off = np.linalg.norm(points - middle - along[:, None] * direction, axis=1)
     noise = float(np.sqrt(np.mean(off**2)))
-    if noise > STRAIGHT:
+    if noise > 0.02:  # m: root mean square by which the points of a line may be off it
         return None
     half = float(np.abs(along).max())
     ends = middle + np.array(((-half,), (half,))) * direction
@@ -149,7 +137,7 @@ def longest(chosen: NDArray[np.bool_], ranges: Array) -> NDArray[np.intp]:
     """Indices of the longest run of beams that are chosen, without a step of their ranges."""
     step = np.zeros(chosen.size, dtype=bool)
     with np.errstate(invalid="ignore"):
-        step[1:] = ~(np.abs(np.diff(ranges)) < GAP)
+        step[1:] = ~(np.abs(np.diff(ranges)) < 0.05)  # step of the range from beam to beam that no board makes, m
     groups = np.cumsum(~chosen | step)
     numbers, counts = np.unique(groups[chosen], return_counts=True)
     if not numbers.size:
@@ -263,7 +251,8 @@ def _agreeing(lines: list[BoardLine], found: FitResult, lidar: LidarPlace) -> li
         InputError: there are more.
     """
     off = np.abs(residuals(found.parameters, lines, lidar)).max(axis=1)
-    limit = STRAY * max(1.0, float(np.median(off)))
+    # 5.0: residual of a view that does not belong to the others, in standard deviations
+    limit = 5.0 * max(1.0, float(np.median(off)))
     kept = [line for line, residual in zip(lines, off.tolist(), strict=True) if residual < limit]
     if len(kept) < max(LEAST_VIEWS, 0.8 * len(lines)):
         raise InputError(
@@ -280,7 +269,7 @@ def _check_size(found: FitResult, board: BoardConfig) -> None:
         InputError: so it is.
     """
     size, sigma = float(found.parameters[6]), float(found.standard_errors[6])
-    if abs(size - 1.0) > WRONG_SIZE + 3.0 * sigma:
+    if abs(size - 1.0) > 0.01 + 3.0 * sigma:  # share by which the board's size must be wrong at least, to be named
         raise InputError(
             f"by the lidar the board is {size:.3f} times as large as stated: measure a square, "
             f"{1000 * size * board.square:.1f} mm instead of {1000 * board.square:.1f}; state --square and --marker"

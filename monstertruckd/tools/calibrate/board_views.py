@@ -22,36 +22,15 @@ from monstertruckd.tools.calibrate.beams import bearings_of, stacked_ranges
 
 HOLD: Final = round(0.7 * SECOND)
 """Time for which the board is held still, ns."""
-STILL: Final = 1.0
-"""Pixels that four corners of five move meanwhile, at most: a single one may be found wrong."""
-LEAST_PICTURES: Final = 3
-"""Pictures of a view, at least."""
-ANOTHER: Final = 12.0
-"""Pixels by which corners differ from those of every other view, on average."""
 BLURRED: Final = 2.0
 """Pixels: standard deviation of the step of an edge."""
 LEAST_SCANS: Final = 3
 """Scans of a view, at least."""
 ROWS: Final = ("upper", "middle", "lower")
 COLUMNS: Final = ("left", "middle", "right")
-IN_CELL: Final = 6
-"""Corners in each ninth of the picture."""
 VIEWS: Final = 24
-BEAMED: Final = 16
-"""Views in which the lidar sees the board, too."""
 TILT: Final = math.radians(12.0)
-TILTED: Final = 3
-"""Views needed that are tilted by more, to each of four sides."""
-TILTED_BEAMED: Final = 3
-"""Views needed that the lidar sees as well."""
 STEEP: Final = math.radians(30.0)
-STEEP_BEAMED: Final = 8
-"""Views that the lidar sees, tilted by more than ``STEEP``, upper and lower edge nearer each: by these alone height and
-pitch of the camera are known, and pitch to 0.5 degrees."""
-APART: Final = 1.5
-"""Distance of the farthest of them over that of the nearest: it tells height from pitch."""
-DEEP: Final = 1.3
-"""Distance of the farthest view over that of the nearest."""
 SIDES: Final = ("left edge nearer", "right edge nearer", "upper edge nearer", "lower edge nearer")
 
 
@@ -152,16 +131,18 @@ class BoardGuide:
             else:
                 attempts.blurred, attempts.blur = attempts.blurred + 1, sighting.blur
             return None
-        if self._held and moved(self._held[0][1], sighting) > STILL:
+        # 1.0: pixels that four corners of five move meanwhile, at most: a single one may be found wrong
+        if self._held and moved(self._held[0][1], sighting) > 1.0:
             attempts.moved += 1
             self._held = []
         self._held.append((stamp, sighting))
         first = self._held[0][0]
-        if stamp - first < HOLD or len(self._held) < LEAST_PICTURES:
+        if stamp - first < HOLD or len(self._held) < 3:  # pictures of a view, at least
             return None
         mean = averaged([seen for _, seen in self._held])
         self._held = self._held[-1:]
-        if any(apart(view.sighting, mean).mean() < ANOTHER for view in self.views if _shared(view.sighting, mean)):
+        # 12.0: pixels by which corners differ from those of every other view, on average
+        if any(apart(view.sighting, mean).mean() < 12.0 for view in self.views if _shared(view.sighting, mean)):
             return None
         pose = board_pose(mean, self.reader, self.lens)
         if pose is None:
@@ -176,16 +157,17 @@ class BoardGuide:
         found = [f"the board in the {cell} of the picture" for cell in self.uncovered()]
         if self.views and not self.uncovered():
             distances = [view.pose.place[2] for view in self.views]
-            if max(distances) < DEEP * min(distances):
+            if max(distances) < 1.3 * min(distances):  # distance of the farthest view over that of the nearest
                 found.append(f"the board nearer and farther than {min(distances):.2f} to {max(distances):.2f} m")
-        found += self._tilts(self.views, TILTED, "")
+        found += self._tilts(self.views, 3, "")  # views needed that are tilted by more, to each of four sides
         found += _more(VIEWS - len(self.views), "view of it", "views of it")
         if self.beams is not None:
-            found += self._tilts(self.seen_by_lidar, TILTED_BEAMED, ", across the lidar's beam")
+            # 3: views needed that the lidar sees as well
+            found += self._tilts(self.seen_by_lidar, 3, ", across the lidar's beam")
             found += self._steep()
             if self.views and not any(view.ranges.size for view in self.views):
                 found.insert(0, f"scans of the lidar: {LEAST_SCANS} or more in {HOLD / SECOND:g} s")
-            more = BEAMED - len(self.seen_by_lidar)
+            more = 16 - len(self.seen_by_lidar)  # views in which the lidar sees the board, too
             found += _more(more, "view across the lidar's beam", "views across the lidar's beam")
         return found
 
@@ -202,19 +184,22 @@ class BoardGuide:
             "middle" if i == j == 1 else f"{row} {column}".removeprefix("middle ")
             for i, row in enumerate(ROWS)
             for j, column in enumerate(COLUMNS)
-            if counts[i, j] < IN_CELL
+            if counts[i, j] < 6  # corners in each ninth of the picture
         ]
 
     def _steep(self) -> list[str]:
         poses = [view.pose for view in self.seen_by_lidar]
         steep = f"by {math.degrees(STEEP):.0f} degrees or more, across the lidar's beam"
+        # 8: views that the lidar sees, tilted by more than ``STEEP``, upper and lower edge nearer each: by these alone
+        # height and pitch of the camera are known, and pitch to 0.5 degrees
         found = [
             f"its {side} {steep} ({more} more)"
             for side, sign in zip(SIDES[2:], (1, -1), strict=True)
-            if (more := STEEP_BEAMED - sum(sign * pose.lean > STEEP for pose in poses)) > 0
+            if (more := 8 - sum(sign * pose.lean > STEEP for pose in poses)) > 0
         ]
         distances = [float(pose.place[2]) for pose in poses if abs(pose.lean) > STEEP]
-        if not found and max(distances) < APART * min(distances):
+        # 1.5: distance of the farthest of them over that of the nearest: it tells height from pitch
+        if not found and max(distances) < 1.5 * min(distances):
             found.append(f"it so nearer and farther than {min(distances):.2f} to {max(distances):.2f} m")
         return found
 

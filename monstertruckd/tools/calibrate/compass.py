@@ -28,19 +28,12 @@ ROOM: Final = "2 m x 2 m, level, outdoors or well away from iron: no car, no rei
 
 ANGLE: Final = 0.35
 """Angle of both axles, in opposite directions, rad: a circle of 0.44 m."""
-OVERLAP: Final = 1.05
-"""Turns to be driven."""
 TILT: Final = math.radians(0.5)
 """Greatest error of the unit's own tilt, rad (its data sheet): through it the vertical field looks like hard iron."""
 LINEARITY: Final = 0.001
 """Share by which a magnetoresistive sensor's output bends over the earth's field, and with it the ellipse."""
 FEWEST: Final = 24
 """Readings: one in 30 degrees of both circles."""
-DISTURBED: Final = 0.03
-"""Residual, as a share of the circle's radius, from which on it is no ellipse: headings would err by 2 degrees."""
-GROUND: Final = 3.0
-"""By how many times what ``lasting`` finds, iron in the ground, the ellipse may be off: of bumps that were drawn at
-random, 0.3 to 4 microtesla high, 96 % put its middle off by less, and 93 % its shape."""
 GAP: Final = math.radians(30)
 """Greatest gap between directions of the field that still is a circle."""
 
@@ -107,7 +100,7 @@ class CompassWizard:
         )
         await context.confirm(CLEAR)
         length = 2 * math.pi / context.chassis.bicycle.curvature(ANGLE, -ANGLE)
-        full = 2 * math.pi * OVERLAP
+        full = 2 * math.pi * 1.05  # turns to be driven
         tracks = [
             await context.move(
                 MoveStep(
@@ -143,14 +136,17 @@ def result_of(circle: FieldCircle) -> Result:
             "(setting E of the unit)"
         )
     radius = float(fit.parameters[4])
-    if not np.isfinite(fit.standard_errors[:5]).all() or fit.rms > DISTURBED * radius:
+    # 0.03: residual, as a share of the circle's radius, from which on it is no ellipse: headings would err by 2 degrees
+    if not np.isfinite(fit.standard_errors[:5]).all() or fit.rms > 0.03 * radius:
         raise InputError(
             f"the field is {fit.rms:.1f} uT off the ellipse of {radius:.0f} uT that the robot's own iron can make of "
             "it: a magnet is near the compass, or iron in the ground or passing by; go elsewhere, or move the compass"
         )
     errors = NORMAL * correlation_factor(fit.residuals) * _iron_errors(fit)
     vertical = float(np.abs(circle.z).mean()) * math.sin(TILT)
-    ground = GROUND * lasting(fit.residuals)
+    # 3.0: by how many times what ``lasting`` finds, iron in the ground, the ellipse may be off: of bumps that were
+    # drawn at random, 0.3 to 4 microtesla high, 96 % put its middle off by less, and 93 % its shape
+    ground = 3.0 * lasting(fit.residuals)
     bounds = [vertical + ground if name.startswith("hard") else LINEARITY + ground / radius for name in _NAMES]
     taken_out = np.degrees(np.abs(wrap(circle.heading - angle - mean_angle(circle.heading - angle))).max())
     tilt = f"95 % of the readings' noise, {math.degrees(TILT):g} deg of the unit's tilt error, and iron in the ground"

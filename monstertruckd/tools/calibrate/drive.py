@@ -36,8 +36,6 @@ BENT: Final = 0.35
 """Turn in one run, rad, beyond which a straight tape measures nothing useful."""
 ASIDE: Final = math.tan(BENT / 2)
 """How far aside of straight ahead such a run ends, per metre of the tape."""
-APART: Final = 0.03
-"""Share by which two runs may differ before one of them must be a slip of the pen."""
 
 _FORWARD: Final = Confirm("forward", "Did the robot roll FORWARD, lidar first?", fact=True)
 _MARK: Final = Confirm("mark", "Mark the floor straight below the middle of the front bumper. Done?")
@@ -116,7 +114,8 @@ class DriveWizard:
         values = [run.turns / run.length for run in runs]
         middle = float(np.median(values))
         for number, value in enumerate(values, start=1):
-            if abs(value / middle - 1) > APART:
+            # 0.03: share by which two runs may differ before one of them must be a slip of the pen
+            if abs(value / middle - 1) > 0.03:
                 off = 100 * (value / middle - 1)
                 raise InputError(f"run {number} differs by {off:.1f} % from the others: measure again")
         # A compass disturbed by iron shows that there is a bend, not how much.

@@ -28,14 +28,8 @@ TILT: Final = math.radians(0.2)
 points."""
 ANGLE: Final = 0.35
 """Angle of both axles, in opposite directions, rad."""
-RESTING: Final = 500
-"""Readings at rest."""
 LEAST: Final = 2
 """Turns that determine the scale, at least."""
-MOVED: Final = 0.02
-"""Greatest standard deviation of a resting yaw rate, rad/s: more is a unit that is being moved."""
-SILENT: Final = 0.5
-"""Seconds without a reading: what the robot turned meanwhile is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +61,8 @@ class Turn:
         over = abs(math.remainder(turned, math.tau))
         between = (stamps >= record.left / SECOND - 0.2) & (stamps <= record.arrived / SECOND + 0.2)
         heard = np.concatenate(((record.left / SECOND,), stamps[between], (record.arrived / SECOND,)))
-        if (silent := float(np.diff(heard).max())) > SILENT:
+        # 0.5: seconds without a reading: what the robot turned meanwhile is not known
+        if (silent := float(np.diff(heard).max())) > 0.5:
             raise InputError(f"the unit was silent for {silent:.1f} s while the robot turned: measure again")
         integral = float(np.trapezoid(rates[between], stamps[between]))
         seconds = float(np.ptp(stamps[between]))
@@ -95,7 +90,7 @@ class ImuWizard:
         """Measure."""
         rate = context.value(f"{IMU}.rate_z"), context.value(f"{IMU}.rate_scale")
         await context.confirm(CLEAR)
-        resting = await context.collect(Collect("the unit at rest", topics.IMU, RESTING, 60.0))
+        resting = await context.collect(Collect("the unit at rest", topics.IMU, 500, 60.0))  # readings at rest
         tilt = await context.collect(Collect("the robot's tilt", topics.COMPASS, 20))
         turns = []
         if self.turns:
@@ -135,7 +130,8 @@ def result_of(
     """
     rates = np.array([(r.angular_velocity.x, r.angular_velocity.y, r.angular_velocity.z) for r in resting])
     rates = rates / (1.0, 1.0, before["rate_scale"]) + [before[f"rate_{axis}"] for axis in "xyz"]
-    if rates[:, 2].std() > MOVED:
+    # 0.02: greatest standard deviation of a resting yaw rate, rad/s: more is a unit that is being moved
+    if rates[:, 2].std() > 0.02:
         raise InputError(f"the unit was moved: its yaw rate varies by {rates[:, 2].std():.3f} rad/s at rest")
     forces = np.array([(r.linear_acceleration.x, r.linear_acceleration.y) for r in resting])
     forces += np.array((before["force_x"], before["force_y"]))

@@ -47,12 +47,8 @@ SPEED: Final = 0.12
 ANGLE: Final = 0.35
 """Angle of both axles, in opposite directions, rad."""
 QUARTER: Final = math.pi / 2
-STRAIGHT: Final = 1.0
-"""m."""
 LEAST_OVERLAP: Final = 0.5
 """Least overlap of two scans that are registered."""
-BETTER: Final = 0.2
-"""Overlap by which another way round has to be better, to be named."""
 LEAST_SCANS: Final = 3
 """Scans at each rest, at least."""
 SCAN: Final = 0.002
@@ -61,8 +57,6 @@ CRAB: Final = 0.005
 """Standard deviation of the direction of travel on one leg, by tyres, rad."""
 DRIFT: Final = 0.006
 """Standard deviation of the distance of one leg, by slip, as a share."""
-SCALE: Final = 0.02
-"""Standard deviation of the scale of all distances before it is measured."""
 CENTRE: Final = 0.002
 """m: how far the turning centre of all arcs may be ahead or behind by tyres that slip outward."""
 TILT: Final = math.radians(0.2)
@@ -169,7 +163,7 @@ class LidarWizard:
         moves = []
         for side, name in ((1, "left"), (-1, "right")):
             moves += [
-                MoveStep(f"straight {word}", sign * SPEED, metres=STRAIGHT, also=(topics.SCAN,))
+                MoveStep(f"straight {word}", sign * SPEED, metres=1.0, also=(topics.SCAN,))  # m
                 for sign, word in ((1, "ahead"), (-1, "back"))
             ]
             moves += [
@@ -304,7 +298,8 @@ def fit_mount(legs: Sequence[LidarLeg], mount: tuple[float, float, float], crab:
     def residual(parameters: Array) -> Array:
         found = seen_motion(parameters, distances, seen[:, 2], travels)
         off = (found[:, :2] - seen[:, :2]) / sigmas[:, None]
-        return np.append(off.ravel(), ((parameters[3] - 1.0) / SCALE, parameters[4] / max(crab, 1e-6)))
+        # 0.02: standard deviation of the scale of all distances before it is measured
+        return np.append(off.ravel(), ((parameters[3] - 1.0) / 0.02, parameters[4] / max(crab, 1e-6)))
 
     return least_squares(residual, start, start - reach, start + reach)
 
@@ -359,7 +354,8 @@ def check_way_round(before: Scan, after: Scan, moved: tuple[float, float], mount
         guess = between(turned, compose(body, turned))
         found = register(seen(after), Cloud.of(seen(before)), guess, reach=0.3)
         found = register(seen(after), Cloud.of(seen(before)), found.pose)
-        if found.overlap > max(LEAST_OVERLAP, overlap + BETTER):
+        # 0.2: overlap by which another way round has to be better, to be named
+        if found.overlap > max(LEAST_OVERLAP, overlap + 0.2):
             raise InputError(
                 f"the lidar {what}: a leg's scans overlap by {found.overlap:.0%} so, by {overlap:.0%} as configured"
             )

@@ -25,14 +25,10 @@ LEASE: Final = 0.5
 """Requested, s; the gate may grant less."""
 ARMING: Final = 3.0
 """Seconds in which the truck must be armed."""
-REST_REQUESTS: Final = 3
-"""Requests for standstill before the order to arm."""
 STEERING: Final = 1.0
 """Seconds for turning the wheels while the truck stands."""
 STUCK: Final = 3.0
 """Seconds without progress after which a move is cancelled."""
-PROGRESS: Final = 0.01
-"""Distance, m, that counts as progress."""
 STILL: Final = 0.1
 """Turn of the motor, rad, that counts as rest: an encoder may alternate between two counts."""
 AT_REST: Final = 0.5
@@ -138,7 +134,7 @@ class Mover:
             report(new)
             if new >= move.metres or (move.done is not None and move.done(run.track)):
                 return
-            if new - distance > PROGRESS:
+            if new - distance > 0.01:  # distance, m, that counts as progress
                 distance, since = new, self._clock.now()
             elif self._clock.now() - since > STUCK * SECOND:
                 text = f"{move.name}: no progress for {STUCK:g} s ({run.state.why if run.state else 'silent'})"
@@ -230,7 +226,8 @@ class _Run:
                 requests += 1
                 if arming is not None and arming.done():
                     refusal, arming = arming.result(), None
-                elif arming is None and requests >= REST_REQUESTS and self.state and not self.state.mode.active:
+                # 3: requests for standstill before the order to arm
+                elif arming is None and requests >= 3 and self.state and not self.state.mode.active:
                     arming = asyncio.create_task(self._try_to_arm())
                 await self._clock.sleep(PERIOD)
                 self._take()

@@ -41,8 +41,6 @@ LINKAGE: Final = 0.004
 ON_THE_SPOT: Final = 0.004
 """Share of a corner by which wheels turn the body as they are steered at its ends, where it stands, half a 95 %
 interval: 0.005 rad among rigid bodies."""
-SAME: Final = 0.5
-"""Share of the turn by the steering that the compass must see."""
 BELIEVED: Final = (0.05, 0.05, math.radians(6.0))
 """Standard deviations before anything is measured: share of distance and of wheelbase, servo angle, rad."""
 
@@ -288,7 +286,7 @@ def check_senses(model: "SquareModel", squares: Sequence[Square]) -> None:
     legs = [leg for square in squares for leg in square.legs]
     said, turned = model.turns(legs, np.array((1.0, 1.0, 0.0))), np.array([leg.turn for leg in legs])
     share = float(said @ turned) / float(said @ said)
-    if share < SAME:
+    if share < 0.5:  # share of the turn by the steering that the compass must see
         raise InputError(
             f"the corners turn by {share:.0%} of what the steering says: an axle steers the other way, or its servo is "
             "on another channel; calibrate the steering first"

@@ -9,7 +9,6 @@ its square in how they are rounded off.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -18,11 +17,6 @@ from monstertruck_kinematics.fitting import least_squares
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import CONFIDENCE, Estimate
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor
-
-START: Final = (0.08, 0.03**2)
-"""First guess of the delay (s) and the square of the lag (s^2)."""
-SLOWEST: Final = (0.5, 0.2**2)
-"""Greatest delay (s) and square of the lag (s^2)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +85,10 @@ class ResponseFit:
         Raises:
             InputError: the measurement does not depend on them.
         """
-        bounds = np.array(SLOWEST)
-        fit = least_squares(lambda parameters: residuals(*parameters.tolist()), np.array(START), -bounds, bounds)
+        bounds = np.array((0.5, 0.2**2))  # greatest delay (s) and square of the lag (s^2)
+        fit = least_squares(
+            lambda parameters: residuals(*parameters.tolist()), np.array((0.08, 0.03**2)), -bounds, bounds
+        )
         if not np.isfinite(fit.standard_errors).all():
             raise InputError("dead time and lag do not show: does the robot follow its commands?")
         halves = NORMAL * correlation_factor(fit.residuals) * fit.standard_errors

@@ -32,8 +32,6 @@ OBSERVERS: Final[dict[Observer, Topic[Any]]] = {"stand": topics.STAND_POSE, "pos
 ROOM: Final = "ten lengths of the robot around it"
 RADII: Final = (4.0, 2.0, 0.0)
 """Radii of the arcs, in tracks; 0 = straight."""
-REST: Final = 1.5
-"""Seconds at each end: 30 poses of a stand."""
 LEAST: Final = 5
 """Poses at each end, at least."""
 SLIDING: Final = 0.004
@@ -114,7 +112,8 @@ class SlipWizard:
                     direction = 1 if number % 2 == 0 else -1
                     side_name = {1: "left", -1: "right", 0: "straight"}[side]
                     name = f"{side_name}, {share:g} tracks, {'ahead' if direction > 0 else 'back'}"
-                    move = MoveStep(name, direction * speed, front, 0.0, metres, rest=REST, also=also)
+                    # 1.5: seconds at each end: 30 poses of a stand
+                    move = MoveStep(name, direction * speed, front, 0.0, metres, rest=1.5, also=also)
                     arcs.append(SkidArc.of(await context.move(move), self.by, context.chassis))
         return context.fit("turning centres", lambda: result_of(arcs, config.geometry.wheel_radius, track / 2))
 

@@ -33,12 +33,8 @@ ROOM: Final = (
     "a flat wall 5 m long and as high as the sonars see, 1.7 m to the robot's left; nothing else within 2 m before, "
     "behind and to the right of the robot"
 )
-RADIUS: Final = 0.4
-"""Least radius of the arcs, m."""
 ANGLE: Final = 0.35
 """Angle of both axles of a truck, in opposite directions, rad."""
-SHARE: Final = 0.96
-"""Share of the greatest angle that the gate allows."""
 NOISE: Final = (0.005, 0.01)
 """Standard deviation of a range: m, and share of it, added in quadrature."""
 DRIFT: Final = (0.003, 0.003, 0.01)
@@ -49,18 +45,12 @@ BELIEVED: Final = 0.01, 0.003
 distance by odometry: on another floor or under another load the wheels roll a little further or less far."""
 NEAR: Final = 0.2
 """Greatest error of a range that still may be the wall, m, before anything is fitted."""
-SIGMAS: Final = 4.0
-"""The greatest error afterwards, in standard deviations."""
 BEYOND: Final = 0.3
 """Past the cone's edge the wall is still heard, rad: grazing sound is reflected away."""
 LEAST: Final = 12
 """Echoes of a sonar that its place rests on, at least."""
 SPAN: Final = 1.0
 """Turn to each side, rad, at least."""
-BODY: Final = 0.3
-"""Greatest difference of a range from the wall's distance of the robot's middle, m."""
-ASTRAY: Final = 0.4
-"""Angle between the middle of the echoes and that of those that are due, rad, that no mount is off by."""
 COMMON: Final = 5
 """Parameters before those of the arcs: distance and direction of the wall, half the cone, factors of the ranges and of
 the distance by odometry."""
@@ -223,7 +213,9 @@ def arc(chassis: Chassis, limit: float) -> tuple[float, float, float]:
     if isinstance(chassis, TruckChassis):
         angles = ANGLE, -ANGLE
     else:
-        angles = min(SHARE * limit, math.atan((chassis.bicycle.l_f + chassis.bicycle.l_r) / RADIUS)), 0.0
+        # 0.96: share of the greatest angle that the gate allows
+        # 0.4: least radius of the arcs, m
+        angles = min(0.96 * limit, math.atan((chassis.bicycle.l_f + chassis.bicycle.l_r) / 0.4)), 0.0
     return (*angles, 1.0 / float(chassis.bicycle.curvature(*angles)))
 
 
@@ -311,7 +303,7 @@ class SonarModel:
             InputError: too few echoes of a sonar.
         """
         found = self._solve(self._start, edges=False)
-        sigmas = SIGMAS * _sigma(self._echoes.ranges)
+        sigmas = 4.0 * _sigma(self._echoes.ranges)  # the greatest error afterwards, in standard deviations
         for bounds in (NEAR / 2 + sigmas, sigmas):
             self.kept = self._chosen(found.parameters, bounds, BEYOND)
             found = self._solve(found.parameters)
@@ -398,7 +390,8 @@ def _check_places(legs: Sequence[SonarLeg], places: Mapping[str, SonarPose], wal
             due = np.abs(wrap(bearings - place.yaw)) <= half + BEYOND
             off[at] = abs(wrap(mean_angle(bearings[near]) - mean_angle(bearings[due]))) if due.any() else math.pi
         nearest = min(off, key=lambda at: off[at])
-        if off[name] > ASTRAY and nearest != name:
+        # 0.4: angle between the middle of the echoes and that of those that are due, rad, that no mount is off by
+        if off[name] > 0.4 and nearest != name:
             wrong.append(f"{name} hears what is due at {nearest}")
     if deaf:
         raise InputError(f"sonar {', '.join(deaf)}: too few echoes of the wall: is it where it was taped?")
@@ -410,7 +403,8 @@ def _bearings(legs: Sequence[SonarLeg], name: str, wall: float) -> tuple[Array, 
     """Direction of the wall on the body at every ping, rad, and whether the sonar heard something as far off; (n,)."""
     poses = np.concatenate([leg.poses[name] for leg in legs if name in leg.poses] or [np.empty((0, 3))])
     ranges = np.concatenate([leg.ranges[name] for leg in legs if name in leg.poses] or [np.empty(0)])
-    return math.pi / 2 - poses[:, 2], np.abs(ranges - (wall - poses[:, 1])) < BODY
+    # 0.3: greatest difference of a range from the wall's distance of the robot's middle, m
+    return math.pi / 2 - poses[:, 2], np.abs(ranges - (wall - poses[:, 1])) < 0.3
 
 
 def _sigma(ranges: Array) -> Array:

@@ -37,26 +37,14 @@ ROOM: Final = (
 )
 TILT: Final = math.radians(0.2)
 """Standard deviation of the compass's tilt, rad."""
-SETTLED: Final = 0.3
-"""Position, steps, to which a unit reads itself: half a step, evenly."""
 BLOCKS: Final = (math.radians(4.0), math.radians(15.0))
 """Tilt of a body on blocks, rad."""
 FOLLOWS: Final = math.radians(2.0)
 """Difference between a joint and the tilt that it takes out, rad, up to which it follows."""
 SECTOR: Final = math.radians(20.0)
 """Angle to both sides of the direction in which a tilted lidar meets the floor."""
-NEAR: Final = 0.15
-"""Share by which a range may differ from the floor's."""
-NEARER: Final = 0.8
-"""Share of the distance of what stands there, up to which a floor differs clearly from it."""
-REACH: Final = 4.0
-"""Distance up to which the lidar sees a floor, m."""
 MOST: Final = 0.6
 """Share of the beams of the sector that must be on the floor, for the lidar to look there."""
-FEW: Final = 0.2
-"""Share that may be on the floor, for the lidar not to look there."""
-LEAST: Final = 10
-"""Beams in the sector."""
 JOINTS: Final = ("pitch", "roll")
 
 _LEVEL: Final = Confirm("level", "Stand the robot on the level floor, wheels straight, and let go. Done?")
@@ -183,9 +171,10 @@ def result_of(
     for axis, (name, joint, change) in enumerate(zip(JOINTS, joints, changes, strict=True)):
         direction = joint.direction * change
         position = joint.zero + joint.direction * flat.joints[axis] / STEP
+        # 0.3: position, steps, to which a unit reads itself: half a step, evenly
         zero = Interval(
             position - direction * really[axis] / STEP,
-            NORMAL * math.hypot(math.hypot(error / walls[axis], TILT) / STEP, SETTLED),
+            NORMAL * math.hypot(math.hypot(error / walls[axis], TILT) / STEP, 0.3),
         )
         _check_range(name, joint, zero.value)
         estimates += [
@@ -264,7 +253,7 @@ def _turns(stand: RestMeasurement, flat: RestMeasurement, height: float, axis: i
         raise InputError(f"with the {low} low the lidar leans with the body: the horn of the {name} joint is loose")
     if max(seen(joints) or 0.0 for joints in swapped) > MOST:
         raise InputError(f"with the {low} low the lidar leans aside: pitch and roll servo are swapped (their ids)")
-    if max(turned, leaning) < FEW:
+    if max(turned, leaning) < 0.2:  # share that may be on the floor, for the lidar not to look there
         return 1
     raise InputError(
         f"with the {low} low the lidar sees neither a clear floor nor none: {turned:.0%} of its beams are where the "
@@ -282,10 +271,13 @@ def _on_floor(
     up = beams_up(stand.body, joints, stand.angles)
     floor = np.where(up < 0.0, height / np.maximum(-up, 1e-9), np.inf)
     sector: NDArray[np.bool_] = np.abs(stand.angles - direction) <= SECTOR
-    due = sector & (floor < NEARER * flat.ranges) & (floor < REACH)
-    if due.sum() < max(LEAST, sector.sum() / 4):
+    # 0.8: share of the distance of what stands there, up to which a floor differs clearly from it
+    # 4.0: distance up to which the lidar sees a floor, m
+    due = sector & (floor < 0.8 * flat.ranges) & (floor < 4.0)
+    if due.sum() < max(10, sector.sum() / 4):  # beams in the sector
         return None
-    return float((np.abs(stand.ranges[due] / floor[due] - 1) < NEAR).mean())
+    # 0.15: share by which a range may differ from the floor's
+    return float((np.abs(stand.ranges[due] / floor[due] - 1) < 0.15).mean())
 
 
 def beams_up(body: RollPitch, joints: RollPitch, angles: Array) -> Array:

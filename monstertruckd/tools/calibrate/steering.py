@@ -32,8 +32,6 @@ dead, should it go the wrong way."""
 ARC: Final = (0.12, 0.18, 1.0)
 FULL: Final = 0.12
 """Speed of full circles."""
-TRAVEL: Final = (0.1, 0.6)
-"""Speed and length of arcs with the wheels as far over as the gate lets them."""
 STRAIGHT: Final = (0.12, 2.0)
 APPROACH: Final = 0.2
 
@@ -45,18 +43,10 @@ SPAN: Final = 50.0
 """Degrees of the servo between full circles to the left and to the right."""
 UNSCALED: Final = 0.5
 """Share of a turn that may be wrong before compass and drive are calibrated."""
-WHEELBASE: Final = 0.003
-"""Share by which a taped wheelbase may be wrong."""
-DISTANCE_ERROR: Final = 0.02
-"""Share by which the distance may be wrong while the drive is not calibrated."""
 SHORT: Final = math.radians(2.0)
 """Servo angle, rad, that has to be missing before a stop is assumed; circles keep as far from the ends."""
 MARGIN: Final = 1.0
 """Degrees of servo angle kept from a stop: a servo that pushes against one burns."""
-SCALE: Final = 0.02
-"""Share by which the scale known from short arcs may be wrong."""
-SEEN: Final = 5.0
-"""Standard errors of a turn that make its direction sure."""
 
 _TURNED: Final = Confirm(
     "turned", "Steered to the left and driving ahead: did the robot turn to the LEFT, seen from above?", fact=True
@@ -166,7 +156,7 @@ class SteeringWizard:
     @staticmethod
     async def _travel(context: WizardContext, maps: Maps, model: SteeringModel, first: Maps) -> "list[AxleTravel]":
         """How far each axle follows to each side."""
-        speed, metres = TRAVEL
+        speed, metres = (0.1, 0.6)  # speed and length of arcs with the wheels as far over as the gate lets them
         limit = context.config.gate.angle
         reached = []
         for axle, name in enumerate(AXLES):
@@ -234,7 +224,8 @@ class SteeringWizard:
         fit = model.fit(legs, first)
         maps = Maps.from_parameters(fit.parameters)
         travel = [AxleTravel.of(reach.axle, reach.sign, reach.legs, model, maps) for reach in travel]
-        halves, share = half_widths(fit), _distance_error(context) + WHEELBASE
+        # 0.003: share by which a taped wheelbase may be wrong
+        halves, share = half_widths(fit), _distance_error(context) + 0.003
         eye = "" if self.strings else "; errors common to both axles by eye and circles alone"
         band = f"95 % of the legs' noise, and the servo's dead band of {DEAD_BAND:g} us"
         estimates: list[Estimate] = []
@@ -301,7 +292,8 @@ class AxleTravel:
         servo = reached if stopped else meant
         angle = model.axle_angle(axle, servo, maps)
         noise = max(math.hypot(leg.sigma, SLIP * math.sqrt(model.distance(leg))) / abs(leg.turn) for leg in legs)
-        half = abs(angle) * (NORMAL * noise / math.sqrt(len(legs)) + SCALE)
+        # 0.02: share by which the scale known from short arcs may be wrong
+        half = abs(angle) * (NORMAL * noise / math.sqrt(len(legs)) + 0.02)
         return cls(axle, sign, servo, angle, stopped, half, tuple(legs))
 
     def estimates(self, name: str, centre: float, scale: float, before: Result | None) -> list[Estimate]:
@@ -353,7 +345,7 @@ def steered_senses(arcs: tuple[list[SteeringRun], list[SteeringRun]]) -> tuple[i
         pattern = np.array((1, -1, -1, 1)) * (1 if axle == 0 else -1)
         turn = float(pattern @ [leg.turn for leg in legs]) / 4
         error = math.hypot(*(leg.sigma for leg in legs)) / 4
-        if abs(turn) < SEEN * error:
+        if abs(turn) < 5.0 * error:  # standard errors of a turn that make its direction sure
             raise InputError(
                 f"{AXLES[axle]} wheels: steered, they turn the robot by {math.degrees(turn):.2f} deg only: "
                 "a servo without supply, or on another channel?"
@@ -430,5 +422,5 @@ def _distance_error(context: WizardContext) -> float:
     drive = context.known.get("drive")
     ratio = None if drive is None else drive.estimate("turns_per_metre")
     if ratio is None or ratio.low is None or ratio.high is None:
-        return DISTANCE_ERROR
+        return 0.02  # share by which the distance may be wrong while the drive is not calibrated
     return (ratio.high - ratio.low) / 2 / float(ratio.value)

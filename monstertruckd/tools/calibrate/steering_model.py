@@ -38,10 +38,6 @@ LINKAGE: Final = 0.005
 """Share of a turn by which the linkage may differ from its polynomials."""
 EYE: Final = math.radians(3.0)
 """Servo angle, rad, within which straight wheels look straight: without a string the only word on a common error."""
-DEFICIT: Final = 0.3
-"""Standard deviation of a coefficient of the turn deficit before it is measured: 5 % of the turn at full lock."""
-GAIN: Final = 0.15
-"""Share by which a pulse map may differ from the configured one, before anything is measured."""
 
 
 _HALVINGS: Final = 40
@@ -171,7 +167,8 @@ class SteeringModel:
         """Distance rolled on a leg, m."""
         return float(np.abs(self.chassis.drivetrain.distance(leg.motor)).sum())
 
-    def fit(self, legs: Sequence[SteeringRun], start: Maps, gain: float = GAIN) -> FitResult:
+    # 0.15: share by which a pulse map may differ from the configured one, before anything is measured
+    def fit(self, legs: Sequence[SteeringRun], start: Maps, gain: float = 0.15) -> FitResult:
         """Pulse maps that explain all legs; parameters as ``Maps.parameters``.
 
         Args:
@@ -187,13 +184,15 @@ class SteeringModel:
         def residual(parameters: Array) -> Array:
             turned, aside = self.predict(legs, Maps.from_parameters(parameters))
             off = np.radians((parameters[[0, 2]] - guess[[0, 2]]) / guess[[1, 3]])
+            # 0.3: standard deviation of a coefficient of the turn deficit before it is measured: 5 % of the turn at
+            # full lock
             return np.array(
                 (
                     *((turned - turns) / sigmas),
                     *((aside[k] - offset) / sigma for k, offset, sigma in strings),
                     off.sum() / (math.sqrt(2) * EYE),
                     *((parameters[[1, 3]] / guess[[1, 3]] - 1) / gain),
-                    *(parameters[4:] / DEFICIT),
+                    *(parameters[4:] / 0.3),
                 )
             )
 

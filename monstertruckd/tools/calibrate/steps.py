@@ -4,7 +4,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -17,8 +17,6 @@ from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.topics import Topic
 
-CURRENT_VALID: Final = 0.5
-"""Seconds for which a motor current counts: not every feedback carries one."""
 M = TypeVar("M", bound=Message)
 
 
@@ -94,7 +92,8 @@ class MoveRecord:
             return np.zeros(stamps.shape)
         times, values = np.array(known, dtype=np.float64).T
         nearest = np.abs(times[:, None] - stamps[None, :]).min(axis=0)
-        return np.where(nearest < CURRENT_VALID * SECOND, np.interp(stamps, times, values), 0.0)
+        # 0.5: seconds for which a motor current counts: not every feedback carries one
+        return np.where(nearest < 0.5 * SECOND, np.interp(stamps, times, values), 0.0)
 
     def steps(self) -> tuple[Array, Array, Array]:
         """Motor turned between readings, rad, and both servo angles then, rad: (n,) each."""

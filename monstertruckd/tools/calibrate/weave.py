@@ -40,8 +40,6 @@ LEAST: Final = 60
 """Turns that dead time and lag have to rest on."""
 BASE: Final = 0.3
 """Seconds between two headings that are compared, about as long as the steering keeps to one side."""
-STEADY: Final = 0.9
-"""Share of the greatest speed from which on a truck neither sets off nor stops."""
 HALF_FRAME: Final = 0.010
 """Half the period of the servo pulses, s. How long a command waits for the next pulse is constant while the daemon
 runs, and another time after each start: nothing between 0 and a period can be excluded."""
@@ -76,7 +74,8 @@ class Weave:
         """From what was read while the truck was at speed; None where that is too little to compare headings."""
         times = np.array([reading.stamp for reading in record.drive]) / SECOND
         speeds = np.abs([reading.velocity for reading in record.drive])
-        steady = times[speeds >= STEADY * speeds.max(initial=0.0)]
+        # 0.9: share of the greatest speed from which on a truck neither sets off nor stops
+        steady = times[speeds >= 0.9 * speeds.max(initial=0.0)]
         if not (record.steering_commands and steady.size):
             return None
         seen = [reading for reading in record.attitude if steady[0] <= reading.stamp / SECOND <= steady[-1]]

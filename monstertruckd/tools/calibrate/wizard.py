@@ -29,8 +29,6 @@ from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, Mo
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
 
-WATCHED: Final = 64
-"""Messages kept between two looks."""
 CLEAR: Final = Confirm("clear", "The robot is about to move. Is the floor free as described?")
 
 
@@ -159,7 +157,8 @@ class WizardContext:
         """
         with ExitStack() as feeds:
             newest = feeds.enter_context(self._truck.subscribe(step.topic, latest()))
-            others = {t.name: feeds.enter_context(self._truck.subscribe(t, fifo(WATCHED))) for t in step.also}
+            # 64: messages kept between two looks
+            others = {t.name: feeds.enter_context(self._truck.subscribe(t, fifo(64))) for t in step.also}
             done, total = 0.0, 1.0
             while done < total:
                 message = await newest.next_within(step.timeout)

@@ -22,8 +22,6 @@ from monstertruck_runtime.small_files import replace_file
 from monstertruckd.config.load import YamlText
 
 POLL: Final = 0.2
-SETTLE: Final = 0.4
-"""Seconds after the first loss until all of it is seen: a hub takes its devices along."""
 
 
 async def find_cable(role: str, machine: Machine, say: Callable[[str], None], timeout: float) -> UsbPortConfig:
@@ -77,7 +75,8 @@ async def _unplugged(machine: Machine, say: Callable[[str], None]) -> UsbDevice:
         if not _lost(before, now):
             before = now
             continue
-        await machine.clock.sleep(SETTLE)
+        # 0.4: seconds after the first loss until all of it is seen: a hub takes its devices along
+        await machine.clock.sleep(0.4)
         now = await look()
         lost = _lost(before, now)
         if len(lost) == 1 and lost[0].nodes:

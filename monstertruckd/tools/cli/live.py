@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from monstertruck_runtime.clock import Clock
     from monstertruck_schemas.topics import Topic
 
-SILENCE: Final = 2.0
-"""Seconds without a message after which `echo` says what it is waiting for."""
 
 SHORT: Final = 16
 """Values of a list that a terminal shows; text it cuts at four times as many characters."""
@@ -84,7 +82,7 @@ def echo(
 async def _explain_silence(client: "TruckClient", clock: "Clock", topic: "Topic[Any]") -> None:
     from monstertruck_schemas.topics import Writer
 
-    await clock.sleep(SILENCE)
+    await clock.sleep(2.0)  # seconds without a message after which `echo` says what it is waiting for
     if not await client.alive():
         remark(f"no robot {client.robot!r} seen at {client.endpoint}; waiting for {topic.name}")
     elif topic.writer is Writer.STAND:

@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from monstertruck_schemas.req import Order
     from monstertruck_schemas.state import GateState
 
-HEARD = 0.3
-"""Seconds within which a tracker with a path sends its requests."""
-
 
 @dataclass(frozen=True, slots=True)
 class OrderOutcome:
@@ -106,7 +103,7 @@ async def _set_off(client: "TruckClient", gate: "GateState | None") -> list[str]
     names = [] if gate is None else list(gate.waiting)
     if gate is not None and not gate.mode.active and "tracker" not in names:
         with client.subscribe(TRACKER, latest()) as tracker, suppress(TimeoutError):
-            async with asyncio.timeout(HEARD):
+            async with asyncio.timeout(0.3):  # seconds within which a tracker with a path sends its requests
                 along = await tracker.next()
             path = f"path {along.path!r}" if along.path else "its path"
             names.append(f"tracker, along {path} of {along.length:.1f} m")

@@ -42,10 +42,6 @@ WIDE_CELL: Final = 48
 """Longer cells fold on a terminal, and in a pipe reach beyond their column instead of widening it for all."""
 
 
-NARROW: Final = 24
-"""Least width of a column of words on a terminal; what has less room stands below its row."""
-
-
 def on_terminal(stream: TextIO | None) -> bool:
     """Whether a standard stream is a terminal, which is None if it was closed before the start."""
     return stream is not None and stream.isatty()
@@ -147,7 +143,8 @@ def _has_room(lines: Sequence[Sequence[str]]) -> bool:
     *others, last = zip(*lines, strict=True)
     room = shutil.get_terminal_size().columns - sum(max(map(len, column)) + 2 for column in others)
     longest_word = max((len(word) for cell in last for word in cell.split()), default=0)
-    return max(map(len, last)) <= room or (room >= NARROW and longest_word <= room)
+    # 24: least width of a column of words on a terminal; what has less room stands below its row
+    return max(map(len, last)) <= room or (room >= 24 and longest_word <= room)
 
 
 def _with_last_below(

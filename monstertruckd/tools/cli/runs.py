@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.drives import TaskEnd, run_task
@@ -15,9 +15,6 @@ from monstertruck_schemas.req import BehaviourOrder, ExploreOrder, MissionOrder
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import BEHAVIOUR, EXPLORE, MISSION
 from monstertruckd.tools.cli.output import progress, with_remedy
-
-EVERY: Final = 5.0
-"""Seconds between two lines on an exploration that does the same all the time."""
 
 Report = Callable[[str], object]
 """Gets a line of progress now and then."""
@@ -80,7 +77,8 @@ async def run_exploration(
         found = 0 if state.find is None else state.found
         now = () if stands else (state.phase, state.goals, found, state.text)  # these come and go while it stands
         if report is not None and (now != shown or state.elapsed >= due):
-            shown, due = now, state.elapsed + EVERY
+            # 5.0: seconds between two lines on an exploration that does the same all the time
+            shown, due = now, state.elapsed + 5.0
             report(progress_line(state, stands))
 
     with monitor_standstill(client) as stand:

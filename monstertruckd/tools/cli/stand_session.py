@@ -18,13 +18,6 @@ if TYPE_CHECKING:
     from monstertruckd.tools.stand.poses import RobotPose
     from monstertruckd.tools.stand.track import Stream
 
-RETRY = 2.0
-"""Seconds after which a robot that is not there is looked for again."""
-HEARD = 100
-"""Newest messages of a robot by which its clock is known."""
-APART = 200_000_000
-"""Nanoseconds from which a robot's clock is another one than this computer's; messages take less."""
-
 
 async def run(clock: Clock, config: "OverheadConfig", endpoint: str) -> None:
     """Track live, and publish to every robot that is there."""
@@ -125,7 +118,7 @@ class RobotLink:
         self._robot, self._endpoint, self._clock, self._say = robot, endpoint, clock, say
         self._said = ""
         self._client: Any = None
-        self._ways: deque[int] = deque(maxlen=HEARD)
+        self._ways: deque[int] = deque(maxlen=100)  # newest messages of a robot by which its clock is known
         """This clock's time of receipt less the robot's stamp, of its newest messages, ns."""
         self._count = 0
 
@@ -153,7 +146,7 @@ class RobotLink:
                 self._report(f"no robot answers at {self._endpoint}")
             except TruckError as error:
                 self._report(str(error))
-            await self._clock.sleep(RETRY)
+            await self._clock.sleep(2.0)  # seconds after which a robot that is not there is looked for again
 
     def _report(self, text: str) -> None:
         if text != self._said:
@@ -174,7 +167,8 @@ def clocks_apart(ways: Iterable[int]) -> int:
     The quickest of ``ways``, from the robot's stamps to their receipt, counts as no time: a millisecond on a network.
     """
     least = min(ways)
-    return 0 if abs(least) < APART else least
+    # 200_000_000: nanoseconds from which a robot's clock is another one than this computer's; messages take less
+    return 0 if abs(least) < 200_000_000 else least
 
 
 def stand_pose(pose: "RobotPose", now: int, count: int, stamp: int) -> "StandPose":

@@ -31,8 +31,6 @@ from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from monstertruckd.tools.status.screen import draw
 from monstertruckd.tools.status.watch import PERIOD, Follower
 
-SETTLE = 3.0
-"""Seconds for the sensors, and a first map."""
 TIMEOUT = 60.0
 """Seconds for the two processes to come up (the first run compiles the ray caster)."""
 
@@ -103,7 +101,7 @@ def run_film(config_file: Path, film: Path, seconds: float) -> None:
             async with rig.running(), _filmed(rig, clock, film):
                 operator = LocalOperator(rig.daemon, clock)
                 begin = clock.now()
-                await clock.sleep(SETTLE)
+                await clock.sleep(3.0)  # seconds for the sensors, and a first map
                 await operator.arm()
                 if config.explorer is not None:
                     await operator.call("explore", {**await operator.header(), "order": "start"})

@@ -24,15 +24,9 @@ from monstertruckd.tools.security.certificates import DAY, common_name, read_cer
 SYNCHRONIZED: Final = Path("/run/systemd/timesync/synchronized")
 """Made by systemd-timesyncd once the clock is synchronized."""
 DAEMONS: Final = ("chronyd", "ntpd", "ntpsec")
-YEAR_2024: Final = 1_704_067_200 * SECOND
-"""ns since 1970: a clock before it was never set."""
 GIGABYTE: Final = 1e9
-MONTH: Final = 30
-"""Days."""
 NETWORKS: Final = Path("/etc/NetworkManager/system-connections")
 SUPPLICANT: Final = Path("/etc/wpa_supplicant/wpa_supplicant.conf")
-WORN: Final = 8
-"""Tenths of its life from which on a card is to be replaced."""
 LISTEN: Final = "0A"
 """State of a listening socket in /proc/net/tcp."""
 
@@ -42,7 +36,7 @@ def calendar(context: HostContext) -> Iterator[Finding]:
     clock = context.computer.machine.clock
     keeper = next((name for name in DAEMONS if context.runs(name)), None)
     set_ntp = "sudo timedatectl set-ntp true"
-    if clock.now() + clock.real_offset() < YEAR_2024:
+    if clock.now() + clock.real_offset() < 1_704_067_200 * SECOND:  # ns since 1970: a clock before it was never set
         yield fail("clock", Reason.CLOCK_UNSET, "is before 2024", set_ntp)
     elif context.at(SYNCHRONIZED).exists():
         yield fine("clock", "synchronized by systemd-timesyncd")
@@ -145,7 +139,7 @@ def card(context: HostContext) -> Iterator[Finding]:
         if not tenths:
             continue
         seen = f"{folder.name}: {10 * (tenths - 1)} to {10 * tenths} % of its life is used"
-        if tenths >= WORN or worn > 1:
+        if tenths >= 8 or worn > 1:  # tenths of its life from which on a card is to be replaced
             yield warn("card", Reason.RECORDING_FAILED, f"{seen}: copy it to a new one")
         else:
             yield fine("card", seen)
@@ -211,7 +205,7 @@ def _expiry(context: HostContext, file: Path, place: Path) -> Finding:
         return fail("certificate", Reason.BAD_INPUT, f"{file}: expected certificates", show)
     if days < 0:
         return fail("certificate", Reason.NOT_PERMITTED, f"{file}: that of {name} expired {-days} days ago", show)
-    if days < MONTH:
+    if days < 30:  # days
         return warn("certificate", Reason.NOT_PERMITTED, f"{file}: that of {name} expires in {days} days", show)
     return fine("certificate", f"{file}: good for {days} days")
 

@@ -29,17 +29,8 @@ METRES: Final = 0.2
 SPEED: Final = 0.06
 ANGLE: Final = 0.045
 """Angle of both axles, in opposite directions, rad: so small that the gate tolerates a turn to the wrong side."""
-LEAST_TURN: Final = 0.1
-"""Least turn of all moves together, rad, by which a sign can be judged."""
 CLEAR: Final = 0.3
 """Share of the turn that a sensor must have seen."""
-AHEAD: Final = 0.05
-"""Least distance of a move by which a sign can be judged, m."""
-UNSURE: Final = 0.05
-"""Standard deviation of a motion by scans, m, above which it is not determined: 0.01 where a wall is ahead, 0.4 along a
-corridor."""
-NOTHING: Final = 1e-3 * np.eye(3)
-"""Information of scans that see nothing."""
 SIGN_ONLY: Final = "calibrate drive --sign-only"
 ROUGH: Final = "calibrate steering --rough"
 
@@ -143,7 +134,10 @@ def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> A
         found = register(after, cloud, found.pose)
         if found.overlap > best:
             best, moved = found.overlap, compose(compose(mount, found.pose), between(mount, np.zeros(3)))
-            if ahead @ np.linalg.solve(found.information + NOTHING, ahead) > UNSURE**2:
+            # 1e-3 * np.eye(3): information of scans that see nothing
+            # 0.05: standard deviation of a motion by scans, m, above which it is not determined: 0.01 where a wall is
+            # ahead, 0.4 along a corridor
+            if ahead @ np.linalg.solve(found.information + 1e-3 * np.eye(3), ahead) > 0.05**2:
                 moved[:2] = math.nan
     return moved
 
@@ -151,17 +145,18 @@ def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> A
 def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Finding]:
     """Findings of all moves together: turns and distances of a move back count with their signs."""
     turn = sum(abs(move.turn) for move in moves)
-    if turn < LEAST_TURN:
+    if turn < 0.1:  # least turn of all moves together, rad, by which a sign can be judged
         text = f"motor and steering turned it by {math.degrees(turn):.0f} degrees in all: too little for a sign"
         yield warn("signs", Reason.STEERING_DEAD, text)
         return
     shares = shares_of_turn(moves)
     against = [name for name, share in shares.items() if share < -CLEAR]
     agree = [name for name, share in shares.items() if share > CLEAR]
+    # 0.05: least distance of a move by which a sign can be judged, m
     along = sum(
         move.distance_seen * move.distance
         for move in moves
-        if move.distance_seen is not None and abs(move.distance) > AHEAD
+        if move.distance_seen is not None and abs(move.distance) > 0.05
     )
     backward = along < 0.0
     if backward and "lidar" in against:

@@ -18,12 +18,6 @@ from monstertruckd.config.expiry import DistanceCounter, state_of
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine, warn
 
-MOST_BYTES: Final = 200_000_000
-"""Longer logs are left to `log report`."""
-LEAST_TURN: Final = 1.0
-"""Least turn in all to determine a sign, rad."""
-SATURATED: Final = 0.2
-"""Share of the commands at a limit of an axle."""
 AT_LIMIT: Final = math.radians(0.5)
 COUNTED: Final = {
     Reason.DEVICE_RESTARTED: ("brown-out", "a device lost its supply and came back: measure it while the motor starts"),
@@ -77,7 +71,7 @@ def calibration(context: HostContext) -> Iterator[Finding]:
 def newest_log(context: HostContext) -> Iterator[Finding]:
     """What the newest log says of supply, clocks, steering and signs of sensors."""
     newest = max(context.logs().glob("*.mcap"), key=lambda path: path.stat().st_mtime, default=None)
-    if newest is None or newest.stat().st_size > MOST_BYTES:
+    if newest is None or newest.stat().st_size > 200_000_000:  # longer logs are left to `log report`
         return
     try:
         yield from log_findings(newest)
@@ -123,7 +117,7 @@ def _saturated(angles: list[tuple[float, float]], log: str) -> Iterator[Finding]
     for axle, column in zip(("front", "rear"), np.abs(np.array(angles)).T, strict=True):
         most = float(column.max())
         share = float((column > most - AT_LIMIT).mean())
-        if most > math.radians(5.0) and share > SATURATED:
+        if most > math.radians(5.0) and share > 0.2:  # share of the commands at a limit of an axle
             where = f"{axle} at its limit of {math.degrees(most):.0f} degrees for {share:.0%} of {log}"
             seen = f"{where}: calibrate the steering, or drive wider turns"
             yield warn("steering", Reason.SERVO_LIMIT, seen)
@@ -145,7 +139,7 @@ def _signs(series: dict[str, Any], log: str) -> Iterator[Finding]:
             yaw = np.unwrap(rows[:, 1])
         steps = np.diff(np.interp(wheels[::20, 0], rows[:, 0], yaw)), np.diff(own[::20])
         turned = float(np.abs(steps[1]).sum())
-        if turned < LEAST_TURN:
+        if turned < 1.0:  # least turn in all to determine a sign, rad
             continue
         agreement = float(steps[0] @ steps[1]) / max(float(np.linalg.norm(steps[0]) * np.linalg.norm(steps[1])), 1e-12)
         if agreement < -0.5:

@@ -43,33 +43,12 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 
 LEG: Final = 20
 """Trials of one truck."""
-PAIRS: Final = 0.45
-"""Share of trials with two faults."""
-FROM_CATALOG: Final = 0.35
-"""Share of faults that are drawn from the catalog."""
-HOLD: Final = (1.0, 4.0)
-"""Seconds for which a signal is falsified."""
-BETWEEN: Final = (0.0, 1.0)
-"""Seconds from the end of the first fault of a pair to the second."""
-CRUISE: Final = (0.1, 0.7)
-"""Seconds of driving before the first fault."""
 FOLLOWS: Final = 4
 """Of so many trucks one is driven by its tracker, along its path or to goals of its planner, where it has one."""
 MOVES: Final = 0.03
 """True speed of a robot that drives, m/s; slower than it backs into ground that it knows little of."""
-RECORDS: Final = 5
-"""One of so many trucks records, and its disk may become full."""
-RUN_UP: Final = 0.7
-"""Distance that the operator drives straight ahead before it reverses, m: a robot that has just been armed knows
-nothing of the ground behind it."""
 RUN_UP_TIME: Final = 6.0
 """Seconds after which it reverses without."""
-TURNS: Final = 2.0
-"""Seconds in which the operator tries to drive in the direction of the trial."""
-SETTLES: Final = 1.5
-"""Seconds from the order that stops to the end of the faults; more than the judge lets a robot move."""
-ESTOPS: Final = 5
-"""Every so many trials end with an emergency stop, the others with a disarm order."""
 BY_HAND: Final[dict[str, Any]] = {
     "explorer": None,
     "planner": None,
@@ -239,7 +218,7 @@ class _Leg:
             base = with_overlay(base, BY_HAND)
         elif leg.number // FOLLOWS % 2:
             base, self._workers = with_overlay(base, TRACKER_IN_WORKER), (TRACKING,)
-        records = None if leg.number % RECORDS else folder
+        records = None if leg.number % 5 else folder  # one of so many trucks records, and its disk may become full
         self._config = truck_of_leg(base, int(self._rng.integers(2**31)), records)
         self._outcomes: list[TrialOutcome] = []
 
@@ -299,14 +278,15 @@ class _Draw:
         self._without = frozenset[FaultKind]()
 
     def __call__(self) -> Trial:
-        count = 2 if self._rng.random() < PAIRS else 1
+        count = 2 if self._rng.random() < 0.45 else 1  # share of trials with two faults
         drawn = [self._fault() for _ in range(count)]
         backwards = self._backwards and bool(self._rng.random() < 0.5)
         names, faults = tuple(name for name, _ in drawn), tuple(fault for _, fault in drawn)
-        return Trial(faults, names, backwards, float(self._rng.uniform(*BETWEEN)))
+        # (0.0, 1.0): seconds from the end of the first fault of a pair to the second
+        return Trial(faults, names, backwards, float(self._rng.uniform(0.0, 1.0)))
 
     def _fault(self) -> tuple[str, Fault[SimContext]]:
-        if self._rng.random() < FROM_CATALOG:
+        if self._rng.random() < 0.35:  # share of faults that are drawn from the catalog
             fault = self._catalog.draw(self._rng, without=self._without)
             if fault.kind is FaultKind.DISK_FULL:  # a disk becomes full once
                 self._without = frozenset({FaultKind.DISK_FULL})
@@ -314,7 +294,8 @@ class _Draw:
         roles = sorted(self._by_role)
         of_role = self._by_role[roles[self._rng.integers(len(roles))]]
         family = of_role[self._rng.integers(len(of_role))]
-        return family.name, family.draw(self._rng, float(self._rng.uniform(*HOLD)))
+        # (1.0, 4.0): seconds for which a signal is falsified
+        return family.name, family.draw(self._rng, float(self._rng.uniform(1.0, 4.0)))
 
 
 async def _arm(truck: DrillTruck) -> bool:
@@ -343,9 +324,12 @@ async def _turn(truck: DrillTruck, trial: Trial) -> None:
     if trial.backwards:
         station.run_up(RUN_UP_TIME)
         begin = judge.place
-        await truck.until(lambda: math.dist(judge.place, begin) > RUN_UP or _blocked(truck), RUN_UP_TIME, Order.ARM)
+        # 0.7: distance that the operator drives straight ahead before it reverses, m: a robot that has just been armed
+        # knows nothing of the ground behind it
+        await truck.until(lambda: math.dist(judge.place, begin) > 0.7 or _blocked(truck), RUN_UP_TIME, Order.ARM)
     station.choose(backwards=trial.backwards)
-    await truck.until(lambda: abs(truck.speed) > MOVES and (truck.speed < 0) is trial.backwards, TURNS, Order.ARM)
+    # 2.0: seconds in which the operator tries to drive in the direction of the trial
+    await truck.until(lambda: abs(truck.speed) > MOVES and (truck.speed < 0) is trial.backwards, 2.0, Order.ARM)
     station.backwards = None
 
 
@@ -361,11 +345,12 @@ async def _try(
     assert judge is not None
     await _turn(truck, trial)
     followed = not truck.by_hand
-    await clock.sleep(float(rng.uniform(*CRUISE)))
+    await clock.sleep(float(rng.uniform(0.1, 0.7)))  # seconds of driving before the first fault
     truck.reports()
     judge.begin()
     began, reverse = clock.now(), judge.speed < 0
-    order = Order.DISARM if (number + 1) % ESTOPS else Order.ESTOP
+    # 5: every so many trials end with an emergency stop, the others with a disarm order
+    order = Order.DISARM if (number + 1) % 5 else Order.ESTOP
     for fault in trial.faults:
         context = truck.rig.context  # of the present daemon
         await apply(fault.start, context)
@@ -375,7 +360,8 @@ async def _try(
             stopping = asyncio.create_task(truck.order(order), name="stopping")
             assert truck.station is not None
             truck.station.silent = True
-            await clock.sleep(SETTLES)
+            # 1.5: seconds from the order that stops to the end of the faults; more than the judge lets a robot move
+            await clock.sleep(1.5)
             travelled, standstill = judge.travelled, judge.standstill
         await apply(fault.end, context)
         truck.listen()

@@ -15,10 +15,6 @@ MAY_TRAVEL: Final = 0.3
 """Distance that a robot may travel while nothing permits motion, m."""
 MAY_MOVE: Final = 1.0
 """Seconds for which a robot may still move once nothing permits motion."""
-CONFIRMED: Final = 0.5
-"""Seconds after which the confirmation of an operator no longer counts: the robot has stopped by then."""
-STANDS_FOR: Final = 0.2
-"""Seconds without motion after which a robot stands: braked, it rocks on its tyres."""
 
 
 class WorldJudge:
@@ -120,7 +116,8 @@ class WorldJudge:
         if self._forbidden is None:
             return
         if self._stood is None and self._still_since is not None:
-            if now - self._still_since >= STANDS_FOR * SECOND:
+            # 0.2: seconds without motion after which a robot stands: braked, it rocks on its tyres
+            if now - self._still_since >= 0.2 * SECOND:
                 self._stood = self._still_since
         elif self._stood is not None and moves:
             self._stood = None
@@ -139,7 +136,8 @@ class WorldJudge:
                 self._blame("left behind", f"motor {shaft + 1} is still asked for {demand:.0f} rpm")
 
     def _touch(self, now: int, text: str) -> None:
-        if self._confirmed is not None and now - self._confirmed <= CONFIRMED * SECOND:
+        # 0.5: seconds after which the confirmation of an operator no longer counts: the robot has stopped by then
+        if self._confirmed is not None and now - self._confirmed <= 0.5 * SECOND:
             self.confirmed_contacts += 1
         else:
             self._blame("contact", text)

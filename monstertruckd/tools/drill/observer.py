@@ -36,35 +36,13 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 PERIOD: Final = SECOND // 100
 AT_REST: Final = 0.01
 """True speed of a truck that stands, m/s."""
-ROCKS: Final = 0.003
-"""Distance from where it came to rest within which a truck still stands, m: braked, it rocks on tyres and springs."""
 STOPS_WITHIN: Final = 0.6
 """Seconds from any fault that must stop the truck, or from a disarm order, to standstill."""
-CLOSEST: Final = 0.03
-"""Least distance, m, of anything that is driven towards."""
-NEAR: Final = 0.6
-"""Distance from the camera, m, within which an obstacle may keep the truck from starting."""
 SPEED_MARGIN: Final = 1.05
 """True speed over the greatest commanded one: the motor's overshoot."""
-ANGLE_MARGIN: Final = 0.01
-"""Rounding of pulses, rad."""
-TURN_ERROR: Final = 0.5
-"""Greatest difference of the true turn from the one the pulses ask for within ``TURN_WINDOW`` s, rad."""
 TURN_WINDOW: Final = 2.0
 FAN: Final = np.linspace(-1.2, 1.2, 49)
 """Directions of the distances that are checked ahead, rad."""
-FAR: Final = 100.0
-"""Distance of what is not there, m."""
-HELD_WITHIN: Final = 1.0
-"""Seconds for which a motor may be commanded to turn a shaft that is held."""
-RAMP_SLACK: Final = 0.1
-"""Seconds by which the bytes on the wire may be ahead of the ramp: ticks and exchanges have no common beat."""
-STOPS_ASKING_WITHIN: Final = 0.1
-"""Seconds after an order that stops from which on no bytes ask a moving truck for a speed."""
-BRAKES_WITHIN: Final = 0.4
-"""Seconds for which a truck may be too fast for the room before it: something may step in its way."""
-LOOKS: Final = 5
-"""Samples from one look ahead to the next: it casts rays."""
 ROOM: Final = np.linspace(0.0, 0.5, 26)
 """Ways ahead of which the ground is looked at, m."""
 REVERSES_BELOW: Final = 0.05
@@ -401,11 +379,14 @@ class _Standstill:
                 self.stood = now
         if resting:
             self._rest = here
-        if self._rest is not None and math.dist(here, self._rest) <= ROCKS:
+        # 0.003: distance from where it came to rest within which a truck still stands, m: braked, it rocks on tyres and
+        # springs
+        if self._rest is not None and math.dist(here, self._rest) <= 0.003:
             return
         ordered = min((at for at in (self.disarmed, self.estopped) if at is not None), default=now)
         asked = max((abs(each) for *_, each in seen.targets), default=0.0)
-        if now > ordered + STOPS_ASKING_WITHIN * SECOND and asked > 0:
+        # 0.1: seconds after an order that stops from which on no bytes ask a moving truck for a speed
+        if now > ordered + 0.1 * SECOND and asked > 0:
             yield "stopping bytes", f"{asked:.3f} m/s asked for at {speed:.3f} m/s though it was ordered to stop"
         limit = round(STOPS_WITHIN * SECOND)
         if self.disarmed is not None and now > self.disarmed + limit:
@@ -472,7 +453,9 @@ class _Ramp:
                 self._newest[shaft] = None
                 continue
             acceleration = self._accelerations[shaft]
-            ramp = abs(speed) + acceleration * RAMP_SLACK
+            # 0.1: seconds by which the bytes on the wire may be ahead of the ramp: ticks and exchanges have no common
+            # beat
+            ramp = abs(speed) + acceleration * 0.1
             if (newest := self._newest[shaft]) is not None:
                 before, then = newest
                 allowed = before + acceleration * (instant - then) / SECOND
@@ -507,7 +490,8 @@ class _HeldShaft:
 
     def __call__(self, seen: Observation) -> Broken:
         held = [asked for shaft, asked in enumerate(seen.target) if asked and self._world.shaft_blocked(shaft)]
-        if self._held.update(seen.now, so=bool(held)) > HELD_WITHIN:
+        # 1.0: seconds for which a motor may be commanded to turn a shaft that is held
+        if self._held.update(seen.now, so=bool(held)) > 1.0:
             yield "held shaft", f"{held[0]:.3f} m/s asked for though the shaft is held"
 
 
@@ -549,7 +533,7 @@ class _Pulses:
         self._steering = steering
         self._limits = {servo.channel: servo for servo in config.devices.steering.driver.servos}
         wheels = len(steering.chassis.straight) > 2
-        self._angle = (WHEEL_REACH if wheels else config.gate.angle) + ANGLE_MARGIN
+        self._angle = (WHEEL_REACH if wheels else config.gate.angle) + 0.01  # rounding of pulses, rad
 
     def __call__(self, seen: Observation) -> Broken:
         for channel, pulse_us in seen.pulses:
@@ -589,7 +573,8 @@ class _Turning:
         self._turn_errors.append((now, turned))
         while now - self._turn_errors[0][0] > TURN_WINDOW * SECOND:
             self._turn_errors.popleft()
-        if abs(error := sum(turn for _, turn in self._turn_errors)) > TURN_ERROR:
+        # 0.5: greatest difference of the true turn from the one the pulses ask for within ``TURN_WINDOW`` s, rad
+        if abs(error := sum(turn for _, turn in self._turn_errors)) > 0.5:
             yield "steering", f"turned {error:+.2f} rad off within {TURN_WINDOW:g} s"
 
     def _held(self, seen: Observation) -> bool:
@@ -676,19 +661,20 @@ class _Ahead:
 
     def __call__(self, seen: Observation) -> Broken:
         self._count += 1
-        if self._count % LOOKS != 1:
+        if self._count % 5 != 1:  # samples from one look ahead to the next: it casts rays
             return
         now, truth = seen.now, seen.truth
         if truth.v <= 2 * AT_REST:
             self._fast.update(now, so=False)
             return
-        ranges = np.minimum(self._world.view.ranges(now, FAN), FAR)
+        ranges = np.minimum(self._world.view.ranges(now, FAN), 100.0)  # distance of what is not there, m
         ahead, aside = self._camera + ranges * np.cos(FAN), ranges * np.sin(FAN)
         room = float(ahead[np.abs(aside) < self._width / 2].min(initial=math.inf)) - self._half
-        if room < CLOSEST:
+        if room < 0.03:  # least distance, m, of anything that is driven towards
             yield "obstacle", f"{truth.v:.3f} m/s towards something {room:.3f} m ahead"
         room = self._room(truth.wz / truth.v, ahead, aside)
-        if self._fast.update(now, so=truth.v**2 / (2 * self._braking) > room) > BRAKES_WITHIN:
+        # 0.4: seconds for which a truck may be too fast for the room before it: something may step in its way
+        if self._fast.update(now, so=truth.v**2 / (2 * self._braking) > room) > 0.4:
             yield "braking", f"{truth.v:.3f} m/s with something on its way in {room:.3f} m"
 
     def _room(self, curvature: float, ahead: Array, aside: Array) -> float:
@@ -838,7 +824,8 @@ class Observer:
 
     def before_something(self) -> bool:
         """Whether an obstacle in front is so near that the truck may rightly not start."""
-        return bool(self._world.view.ranges(self._clock.now(), FAN).min() < NEAR)
+        # 0.6: distance from the camera, m, within which an obstacle may keep the truck from starting
+        return bool(self._world.view.ranges(self._clock.now(), FAN).min() < 0.6)
 
     def metres(self) -> float:
         """Truly travelled since the fault, m, to standstill or until the call."""

@@ -31,14 +31,8 @@ from monstertruckd.tools.drill.observer import EPOS, MAESTRO, STOPS_WITHIN, Viol
 from monstertruckd.tools.drill.truck import OPTIONAL, DrillTruck
 from monstertruckd.tools.simulation.config import DEADMAN_LINE, SimulatedTruckConfig, with_overlay
 
-LEG: Final = 25
-"""Faults of one truck."""
 TIMEOUT: Final = 15.0
 """Seconds after which a service that has not recovered is stuck."""
-RECOVERS_WITHIN: Final = 4.0
-"""Seconds within which everything should be back: the goal of a lost hub."""
-ESTOPS: Final = 5
-"""Every so many faults are followed by an emergency stop, the others by a disarm order."""
 QUIET: Final = frozenset(
     {
         Reason.OK,
@@ -56,8 +50,6 @@ DEADMAN: Final[dict[str, Any]] = {"map": None, **DEADMAN_LINE}
 """Overlay of a truck: the deadman line, and no map; see ``wired``."""
 TRACKER_IN_WORKER: Final[dict[str, Any]] = {"placement": {"tracker": "worker"}}
 """Overlay of every second truck."""
-STILL_STOPS: Final = 0.05
-"""True speed of a truck that may not be armed yet, m/s."""
 
 
 def wired(config: SimulatedTruckConfig) -> SimulatedTruckConfig:
@@ -128,7 +120,8 @@ class FaultOutcome:
             return 0
         if self.stuck or self.recovered_s is None:
             return 50
-        return 100 if self.recovered_s <= RECOVERS_WITHIN else 80
+        # 4.0: seconds within which everything should be back: the goal of a lost hub
+        return 100 if self.recovered_s <= 4.0 else 80
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +200,8 @@ class Drill:
         InputError: nothing drives the robot, or its tracker has no path.
     """
 
-    def __init__(self, seed: int, count: int, config: SimulatedTruckConfig, *, leg: int = LEG) -> None:
+    # 25: faults of one truck
+    def __init__(self, seed: int, count: int, config: SimulatedTruckConfig, *, leg: int = 25) -> None:
         check_drivable(config)
         if config.tracker is not None and config.path is None:
             raise InputError(f"path: {config.robot} has none: expected one that its tracker follows; or no tracker")
@@ -280,7 +274,8 @@ class _LegRun:
             async with DrillTruck.running(self._config, self._clock, by_station=by_station) as truck:
                 await truck.until(lambda: not truck.blockers(), TIMEOUT)  # called within this turn only
                 for fault in left:
-                    order = Order.DISARM if (len(self._outcomes) + 1) % ESTOPS else Order.ESTOP
+                    # 5: every so many faults are followed by an emergency stop, the others by a disarm order
+                    order = Order.DISARM if (len(self._outcomes) + 1) % 5 else Order.ESTOP
                     outcome = await _react(truck, fault, float(self._rng.uniform(0.1, 0.7)), order)
                     if outcome is None:
                         break
@@ -327,7 +322,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: O
         observer.disarm()
     stopping = asyncio.create_task(truck.order(order), name="stopping")
     await clock.sleep(STOPS_WITHIN / 10)
-    if abs(observer.speed) > STILL_STOPS:
+    if abs(observer.speed) > 0.05:  # true speed of a truck that may not be armed yet, m/s
         await truck.order(Order.ARM)  # must be refused
     await stopping
     await clock.sleep(STOPS_WITHIN / 2)

@@ -34,16 +34,6 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
-CRUISE: Final = 0.1
-"""True speed of a truck that drives, m/s; of a slow one half of what it may."""
-CIRCLE: Final = 0.5
-"""Radius of the circle in which a station drives a robot without a tracker, m."""
-STATION_SPEED: Final = 0.8
-"""Speed that the station requests, as a share of the gate's limit."""
-REQUESTS: Final = 0.05
-"""Seconds from one request of a station to the next."""
-GIVES: Final = 0.5
-"""Seconds from one look of a giver of goals to the next."""
 OPTIONAL: Final = frozenset({"recorder"})
 """Services that a fault may end for the rest of a run: driving goes on without."""
 
@@ -86,7 +76,7 @@ class DrivingStation:
         """Send until cancelled."""
         while True:
             self.send()
-            await self._clock.sleep(REQUESTS)
+            await self._clock.sleep(0.05)  # seconds from one request of a station to the next
 
     def send(self) -> None:
         """One request, unless it is silent."""
@@ -123,18 +113,10 @@ STEERING: Final[Mapping[str, tuple[str, ...]]] = {
 itself."""
 TURN: Final = (0.0, 0.0, 0.5)
 SIDEWAYS: Final = (0.0, 0.1, 0.0)
-TWISTS: Final = 0.3
-"""Share of motions on the spot or sideways, of a body that can do them."""
-LEG_TIME: Final = (0.4, 2.0)
-"""Seconds for which a wanderer keeps a speed and its angles."""
-PATIENCE: Final = 0.5
-"""Seconds for which a wanderer that is refused unseen ground waits before it holds the second control."""
 LOOKS_AHEAD: Final = 2 * MAY_MOVE
 """Look-ahead of the operator of a robot without range sensors (s): twice ``MAY_MOVE``."""
 LOOKS: Final = 8
 """Number of poses checked over ``LOOKS_AHEAD``."""
-CHOICES: Final = 10
-"""Motions that it considers for a request; if none of them stays clear, the robot shall stand."""
 
 
 def _can(chassis: Chassis, twist: Twist2) -> bool:
@@ -201,12 +183,14 @@ class Wanderer(DrivingStation):
         free = float(rng.uniform(-1.0, 1.0)) * self._angle
         self.rear = {"front": 0.0, "counter": -self.front, "crab": self.front, "free": free}[steering]
         self.twist = None
-        if backwards is None and self._twists and rng.random() < TWISTS:
+        # 0.3: share of motions on the spot or sideways, of a body that can do them
+        if backwards is None and self._twists and rng.random() < 0.3:
             vx, vy, wz = float(rng.uniform(-1.0, 1.0)) * np.array(self._twists[rng.integers(len(self._twists))])
             self.speed = self.front = self.rear = 0.0
             self.twist = RequestedTwist(vx=float(vx), vy=float(vy), wz=float(wz))
         self.unseen, self._refused_since = False, None
-        self._until = self._clock.now() + round(float(rng.uniform(*LEG_TIME)) * SECOND)
+        # (0.4, 2.0): seconds for which a wanderer keeps a speed and its angles
+        self._until = self._clock.now() + round(float(rng.uniform(0.4, 2.0)) * SECOND)
 
     def run_up(self, seconds: float) -> None:
         """Drive straight ahead, at most so long."""
@@ -225,7 +209,8 @@ class Wanderer(DrivingStation):
             self._refused_since = None
         elif self._refused_since is None:
             self._refused_since = now
-        elif now - self._refused_since >= PATIENCE * SECOND:
+        # 0.5: seconds for which a wanderer that is refused unseen ground waits before it holds the second control
+        elif now - self._refused_since >= 0.5 * SECOND:
             self.unseen = True
         if self.unseen and not self.silent:
             self._confirm()
@@ -233,7 +218,8 @@ class Wanderer(DrivingStation):
 
     def _keep_clear(self) -> None:
         """Choose motions until one stays clear; if none does, stand."""
-        for _ in range(CHOICES):
+        # 10: motions that it considers for a request; if none of them stays clear, the robot shall stand
+        for _ in range(10):
             if self._clear(self._requested()):
                 return
             self.choose(backwards=self.backwards)
@@ -270,7 +256,7 @@ class GoalGiver:
                 with suppress(TruckError):
                     pose = {"x": x, "y": y, "yaw": float(self._rng.uniform(-math.pi, math.pi))}
                     await truck.operator.call("goal", {**await truck.operator.header(), "frame": "map", "goal": pose})
-            await truck.clock.sleep(GIVES)
+            await truck.clock.sleep(0.5)  # seconds from one look of a giver of goals to the next
 
 
 class DrillTruck:
@@ -300,15 +286,18 @@ class DrillTruck:
         self.judge = WorldJudge(rig.world, rig.clock) if judged else None
         self._observer = None if judged else Observer(rig.config, rig.world, rig.ports, rig.clock)
         self.station: DrivingStation | None = None
-        self._cruise = min(CRUISE, rig.config.gate.speed / 2)
+        # 0.1: true speed of a truck that drives, m/s; of a slow one half of what it may
+        self._cruise = min(0.1, rig.config.gate.speed / 2)
         self._heard: Daemon | None = None
         self.listen()
         if wander is not None:
             assert self.judge is not None
             self.station = Wanderer(rig.bus, rig.clock, rig.config, wander, self.judge.confirm, self._looks())
         elif by_station:
-            angle = min(math.atan(rig.config.geometry.wheelbase / CIRCLE), rig.config.gate.angle)
-            self.station = DrivingStation(rig.bus, rig.clock, STATION_SPEED * rig.config.gate.speed, angle)
+            # 0.5: radius of the circle in which a station drives a robot without a tracker, m
+            angle = min(math.atan(rig.config.geometry.wheelbase / 0.5), rig.config.gate.angle)
+            # 0.8: speed that the station requests, as a share of the gate's limit
+            self.station = DrivingStation(rig.bus, rig.clock, 0.8 * rig.config.gate.speed, angle)
 
     def _looks(self) -> Callable[[Twist2], bool]:
         """Whether a motion stays clear, as the operator sees it; a robot with range sensors has to see for itself."""

@@ -23,8 +23,6 @@ from monstertruckd.tools.driving.teleop import MODE_KEYS, TURN_RADIUS, TeleopReq
 EVENT: Final = struct.Struct("llHHi")
 """Seconds, microseconds, type, code, value."""
 EV_SYN, EV_KEY, EV_ABS = 0, 1, 3
-SYN_DROPPED: Final = 3
-"""The kernel's queue overflowed: what was held is not known."""
 
 BUTTONS: Final = {
     "south": 0x130,
@@ -55,8 +53,6 @@ AXES: Final = {
     "hat_x": 16,
     "hat_y": 17,
 }
-DEAD: Final = 0.08
-"""Share of a stick's way around its middle that counts as the middle."""
 HALF: Final = 0.5
 """Share of a hat's, or a trigger's, way from which on it is pressed."""
 
@@ -158,7 +154,7 @@ class Pad:
                 actions += self._key(code, value)
             elif kind == EV_ABS:
                 actions += self._move(code, value)
-            elif kind == EV_SYN and code == SYN_DROPPED:
+            elif kind == EV_SYN and code == 3:  # the kernel's queue overflowed: what was held is not known
                 self.release()
         self._trusted |= not self._deadman
         return actions
@@ -205,7 +201,7 @@ class Pad:
     def _stick(self, what: Literal["speed", "steer", "side"]) -> float:
         axis: Axis = getattr(self.mapping, what)
         value = self._axes.get(AXES[axis], 0.0)
-        if abs(value) < DEAD:
+        if abs(value) < 0.08:  # share of a stick's way around its middle that counts as the middle
             return 0.0
         return -value if what in self.mapping.inverted else value
 

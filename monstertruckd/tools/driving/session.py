@@ -38,18 +38,10 @@ RATE: Final = 20.0
 """Drive requests per second."""
 LEASE: Final = 0.25
 """Seconds a request stands."""
-TAKE_HOLD: Final = 0.15
-"""Seconds of neutral requests before an order to arm: they keep a tracker from driving off."""
-STALLED: Final = 0.3
-"""After a longer pause of this program, s, keys that are read late may have been released meanwhile."""
 REST: Final = 6
 """Neutral requests after the gamepad was let go, so that the truck stops by its ramp."""
 QUIET: Final = frozenset({Reason.CLIPPED, Reason.SERVO_LIMIT})
 """Limits of the driver's own request: the hand knows."""
-END: Final = 1.0
-"""Seconds to wait at the end for the truck to stop."""
-PING: Final = 1.0
-"""Seconds between two measurements of the round trip."""
 HELP = "Enter arm  WASD drive  space stop  e E-STOP  r reset  x straight  q end"
 ARROWS = {1: "▲ forward", -1: "▼ back", 0: "standing"}
 HINTS = {
@@ -154,7 +146,8 @@ class DriveSession:
             command = self._teleop.press(key, self._clock.now())
             if command is Order.ARM:
                 if self._arming is None:
-                    self._arming = asyncio.get_running_loop().call_later(TAKE_HOLD, self._arm)
+                    # 0.15: seconds of neutral requests before an order to arm: they keep a tracker from driving off
+                    self._arming = asyncio.get_running_loop().call_later(0.15, self._arm)
             elif command is not None:
                 self._hold_arming()
                 self._commands.put_nowait(command)
@@ -196,7 +189,8 @@ class DriveSession:
         while True:
             await self._clock.sleep(1.0 / RATE)
             now = self._clock.now()
-            if now - before > STALLED * SECOND:
+            # 0.3: after a longer pause of this program, s, keys that are read late may have been released meanwhile
+            if now - before > 0.3 * SECOND:
                 self._forget()
             before = now
             self._press(self._reader.flush())
@@ -267,7 +261,7 @@ class DriveSession:
                 self._stream.round_trip = (self._clock.now() - sent) / SECOND
             except TruckError:
                 self._stream.round_trip = None
-            await self._clock.sleep(PING)
+            await self._clock.sleep(1.0)  # seconds between two measurements of the round trip
 
     async def _draw(self, follower: Follower) -> None:
         """Show the state; returns when the terminal is gone, which the keyboard may notice later."""
@@ -279,7 +273,7 @@ class DriveSession:
 
     async def _stop(self, client: TruckClient) -> None:
         with suppress(TruckError, TimeoutError):
-            async with self._clock.deadline(END):
+            async with self._clock.deadline(1.0):  # seconds to wait at the end for the truck to stop
                 await client.stop()
 
 

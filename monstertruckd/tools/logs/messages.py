@@ -22,9 +22,6 @@ from monstertruck_schemas.topics import BY_NAME, CLOCK
 from monstertruckd.recorder.frames import DAMAGE, index_is_sound
 from monstertruckd.recorder.reader import LogMessage, LogReader
 
-_EVERY = 1000
-"""Messages between two calls of a progress function."""
-
 Progress = Callable[[float], None]
 """Called with the bytes of the log read so far."""
 
@@ -78,7 +75,7 @@ class Selection:
         """
         first: int | None = None
         for number, entry in enumerate(reader, start=1):
-            if progress is not None and number % _EVERY == 0:
+            if progress is not None and number % 1000 == 0:  # messages between two calls of a progress function
                 progress(reader.position)
             first = entry.log_time if first is None else first
             topic = BY_NAME.get(entry.topic)

@@ -48,10 +48,6 @@ _FIRST: Final = ("Speed", "Steering commanded", "Cross-track error", "Battery", 
 _SCAN, _PATH, _WAY, _TRUCK = (39, 104, 211), (120, 130, 145), (217, 83, 44), (28, 154, 104)
 _HEIGHT: Final = 0.15
 """Height of the truck's box, m; not configured."""
-_ROUGH: Final = 0.03
-"""Roughness that is shown in full, m."""
-_STEEP: Final = 0.35
-"""Tilt likewise, rad."""
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 _JOURNAL: Final = {
     LogLevel.DEBUG: "DEBUG",
@@ -230,7 +226,9 @@ class Scene:
         """Red as it is rough, blue as it is tilted; unknown ground is clear."""
         layers = np.stack((ground.roughness, ground.tilt)).reshape(2, ground.height, ground.width)
         known = layers[0] != GROUND_UNKNOWN
-        full = np.array((_ROUGH / ROUGHNESS_STEP, _STEEP / TILT_STEP)).reshape(2, 1, 1)
+        # 0.03: roughness that is shown in full, m
+        # 0.35: tilt likewise, rad
+        full = np.array((0.03 / ROUGHNESS_STEP, 0.35 / TILT_STEP)).reshape(2, 1, 1)
         red, blue = np.where(known, np.minimum(layers / full, 1.0) * 255.0, 0.0).astype(np.uint8)
         pixels = np.stack((red, np.zeros_like(red), blue, np.where(known, np.maximum(red, blue), 0)), axis=-1)
         layout = rr.components.ImageFormat(

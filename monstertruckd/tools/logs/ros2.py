@@ -31,8 +31,6 @@ from monstertruckd.tools.logs.export import removed_on_failure
 from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
 
 _STORE: Final = get_typestore(Stores.ROS2_JAZZY)
-_VERSION: Final = 8
-"""Version of the bag's metadata: the older one that the writer supports."""
 _PLANE: Final = (0, 1, 5)
 """Rows of (x, y, yaw) in ROS's covariances over (x, y, z, roll, pitch, yaw)."""
 _NEVER: Final = QosTime(9_223_372_036, 854_775_807)
@@ -55,9 +53,10 @@ def export_ros2(
     directory = Path(output)
     topics: dict[str, Path] = {}
     try:
+        # 8: version of the bag's metadata: the older one that the writer supports
         with (
             removed_on_failure() as made,
-            Writer(directory, version=_VERSION, storage_plugin=StoragePlugin.MCAP) as bag,
+            Writer(directory, version=8, storage_plugin=StoragePlugin.MCAP) as bag,
         ):
             made.append(directory)
             connections: dict[str, Any] = {}

@@ -21,8 +21,6 @@ from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.replay_check.goals import DEFORMED, PLANNED, TOGETHER, GoalRecord
 from monstertruckd.tools.replay_check.pace import PacedClock
 
-BEFORE: Final = SECOND // 1000
-"""A route is there this long before the tick that takes it, ns."""
 NOTHING: Final = PlanAnswer(Reason.OK, "", np.empty((0, 3)), np.empty(0))
 
 
@@ -88,7 +86,7 @@ class ReplayedPlanner(_Replayed):
         if end is None:
             await asyncio.Event().wait()
         assert end is not None
-        await self._clock.reach(end - BEFORE)
+        await self._clock.reach(end - (SECOND // 1000))  # a route is there this long before the tick that takes it, ns
         return self._book.settle(answer, self._record.path_between(end - TOGETHER, end, PLANNED))
 
 

@@ -21,8 +21,6 @@ from monstertruck_runtime.outside import MEGABYTE, contents, reading
 from monstertruck_runtime.small_files import replace_file
 
 DAY: Final = 86_400
-EARLY: Final = 300
-"""Seconds by which a certificate begins before now: computers without a clock of their own run late."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,13 +154,14 @@ def issue(issuer: Certificate, name: str, now: int, seconds: int, *, server: Seq
 def _builder(
     subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: int, seconds: int
 ) -> x509.CertificateBuilder:
+    # 300: seconds by which a certificate begins before now: computers without a clock of their own run late
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(_date(now - EARLY))
+        .not_valid_before(_date(now - 300))
         .not_valid_after(_date(now + seconds))
     )
 

@@ -24,8 +24,6 @@ ROUTER: Final = "router"
 """Common name of its certificate."""
 PLACE: Final = Path("/etc/zenohd")
 """Where the router keeps its files."""
-PLACES: Final = 512
-"""Robots and stations that may be connected at once."""
 
 
 def make_router(
@@ -83,7 +81,7 @@ def router_session(place: Path, port: int, fleet: dict[str, tuple[str, ...]]) ->
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "adminspace": {"enabled": False},
         "transport": {
-            "unicast": {"max_sessions": PLACES},
+            "unicast": {"max_sessions": 512},  # robots and stations that may be connected at once
             "link": {
                 "tls": {
                     "root_ca_certificate": str(place / "ca.pem"),

@@ -22,11 +22,6 @@ from monstertruckd.daemon import Daemon
 
 M = TypeVar("M", bound=Message)
 
-BEGINS = 1.0
-"""Seconds in which the tracker, once the truck is armed, begins a path whose end it reported before."""
-INTERRUPTIONS = 20
-"""Times in a lap that the truck is armed again after a stop; more are a fault, not a busy computer."""
-
 
 class LocalOperator(Operator):
     """An operator inside the daemon's process: for the virtual clock, on which nothing comes over Zenoh."""
@@ -132,7 +127,9 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
                 while True:
                     report = await tracker.next()
                     driven |= report.outcome is Reason.DRIVING and report.received >= start
-                    if not driven and report.received < start + BEGINS * SECOND:
+                    # 1.0: seconds in which the tracker, once the truck is armed, begins a path whose end it reported
+                    # before
+                    if not driven and report.received < start + 1.0 * SECOND:
                         continue  # of the path's end before
                     cross_track.append(report.cross_track)
                     stops |= {one.number: one.reason for one in stop.drain() if one.stamp >= start}
@@ -140,7 +137,9 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
                         reasons = tuple(stops.values())
                         return Lap(report.outcome, start, report.stamp, np.array(cross_track), reasons, armed_again)
                     state = gate.latest
-                    if state is not None and not state.mode.active and armed_again < INTERRUPTIONS:
+                    # 20: times in a lap that the truck is armed again after a stop; more are a fault, not a busy
+                    # computer
+                    if state is not None and not state.mode.active and armed_again < 20:
                         armed_again += 1
                         await _arm(operator, clock, timeout)
         except TimeoutError:

@@ -6,10 +6,6 @@ import sys
 from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager, suppress
 from pathlib import Path
-from typing import Final
-
-TIME_TO_END: Final = 15.0
-"""Seconds that a program may take to end."""
 
 
 @asynccontextmanager
@@ -37,7 +33,7 @@ async def program(output: Path | None, *arguments: str) -> AsyncIterator[asyncio
     finally:
         with suppress(ProcessLookupError):
             process.send_signal(signal.SIGTERM)
-        done, _ = await asyncio.wait([ended], timeout=TIME_TO_END)
+        done, _ = await asyncio.wait([ended], timeout=15.0)  # seconds that a program may take to end
         if not done:
             process.kill()
             await ended

@@ -44,8 +44,6 @@ ANOTHER: Final = (
     "A second robot beside it needs a configuration with a `robot` and `zenoh: listen` of its own"
 )
 """Advice for ports that are in use."""
-STAND_RETRY = 1.0
-"""Seconds between two looks for a daemon."""
 
 
 class TruthLog:
@@ -275,7 +273,7 @@ async def _see(clock: Clock, config: SimulatedTruckConfig, world: World) -> None
                 seed = config.sim.seed if config.sim.world.noise else None
                 await SimulatedStand(config.sim.stand, world, clock, client.publish_stand_pose, seed).run()
         except NotFoundError:
-            await clock.sleep(STAND_RETRY)
+            await clock.sleep(1.0)  # seconds between two looks for a daemon
 
 
 async def _watch(clock: Clock, world: World, camera: CeilingCamera, board: HeldBoard | None, seed: int) -> None:

@@ -19,8 +19,6 @@ from monstertruckd.recorder.reader import LogReader
 
 LEAST: Final = 40
 """Poses in common."""
-LEAST_TURN: Final = 0.5
-"""Least turn to determine the latency, rad."""
 REACH: Final = 0.5
 """Greatest latency, s."""
 
@@ -99,7 +97,7 @@ def error_of(what: str, seen: Array, estimate: Array) -> EstimateError:
 def latency_of(seen: Array, estimate: Array) -> float | None:
     """Seconds by which the stand's stamps are late; None: hardly any turn."""
     yaw, other = np.unwrap(seen[:, 3]), np.unwrap(estimate[:, 3])
-    if np.ptp(yaw) < LEAST_TURN:
+    if np.ptp(yaw) < 0.5:  # least turn to determine the latency, rad
         return None
     times = seen[:, 0]
     inside = (times > estimate[0, 0] + REACH) & (times < estimate[-1, 0] - REACH)

@@ -30,8 +30,6 @@ LEAST_MARKS: Final = 5
 """Marks that a camera must see, at least."""
 MISPLACED: Final = (0.002, 5.0)
 """A mark is not where it was said to be beyond so many m, and so many standard deviations of the ruler."""
-SEEN: Final = 0.0005
-"""Standard deviation of a point on the table by a camera's noise, m: a fifth of a pixel."""
 
 
 class CameraCalibration(Schema):
@@ -162,7 +160,8 @@ def join(
         off: list[Array] = []
         for tag, points in by_tag.items():
             middle = np.mean(points, axis=0)
-            off += [(point - middle) / SEEN for point in points] if len(points) > 1 else []
+            # 0.0005: standard deviation of a point on the table by a camera's noise, m: a fifth of a pixel
+            off += [(point - middle) / 0.0005 for point in points] if len(points) > 1 else []
             off.append((middle - (marks[tag].x, marks[tag].y)) / ruler)
         return np.concatenate(off)
 

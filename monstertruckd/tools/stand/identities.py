@@ -19,20 +19,10 @@ from monstertruckd.tools.stand.camera import PlacedCamera
 from monstertruckd.tools.stand.config import BlobRobot
 from monstertruckd.tools.stand.poses import MarkerPose, weight_of
 
-APART: Final = 0.012
-"""Tolerated error of the distance of two discs, m."""
-NEAR: Final = 0.06
-"""Distance from the expected position within which a robot is found again, m."""
-SWERVE: Final = 1.0
-"""Growth of that distance with the time since the robot was seen, m/s."""
 AT_START: Final = 0.15
 """m from its start at which a robot is known that cannot be distinguished from others."""
 UNSURE: Final = 0.5
 """Seconds out of sight after which robots that look alike may be mistaken for each other."""
-MIDDLE: Final = 0.1
-"""Standard deviation of a disc's middle, pixels."""
-SETTLING: Final = 0.15
-"""Seconds over which a robot's speed is averaged."""
 
 
 class Pair(NamedTuple):
@@ -105,7 +95,7 @@ class Identities:
         if track is None or stamp - track.stamp > UNSURE * SECOND:
             self._tracks[name] = _Track(stamp, place, np.zeros(2))
         elif (seconds := (stamp - track.stamp) / SECOND) > 0:
-            share = 1 - math.exp(-seconds / SETTLING)
+            share = 1 - math.exp(-seconds / 0.15)  # seconds over which a robot's speed is averaged
             track.velocity = track.velocity + share * ((place - track.place) / seconds - track.velocity)
             track.stamp, track.place = stamp, place
 
@@ -132,7 +122,9 @@ class Identities:
             return at_start if at_start is not None and at_start < AT_START else None
         expected, seconds = track.expected(stamp)
         off = float(np.hypot(*(place - expected)))
-        if off < NEAR + SWERVE * seconds:
+        # 0.06: distance from the expected position within which a robot is found again, m
+        # 1.0: growth of that distance with the time since the robot was seen, m/s
+        if off < 0.06 + 1.0 * seconds:
             return off
         return AT_START + pair.off if seconds > UNSURE and not self._alike[name] else None
 
@@ -168,10 +160,11 @@ def pairs(camera: PlacedCamera, robot: BlobRobot, blobs: Sequence[Blob]) -> Iter
                 continue
             ahead = points[i] - points[j]
             apart = float(np.hypot(*ahead))
-            if abs(apart - robot.apart) > APART:
+            if abs(apart - robot.apart) > 0.012:  # tolerated error of the distance of two discs, m
                 continue
             x, y = (points[i] + points[j]) / 2
-            sigma = MIDDLE * apart / float(np.hypot(*(pixels[i] - pixels[j])))
+            # 0.1: standard deviation of a disc's middle, pixels
+            sigma = 0.1 * apart / float(np.hypot(*(pixels[i] - pixels[j])))
             yield Pair(
                 i,
                 j,

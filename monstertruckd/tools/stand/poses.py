@@ -11,11 +11,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruckd.tools.stand.camera import PlacedCamera
 from monstertruckd.tools.stand.config import BlobRobot, TaggedRobot
 
-FADE: Final = 0.12
-"""Share of a picture's height: nearer to its border a sighting has less weight."""
 LEAST_WEIGHT: Final = 1e-3
-PIXEL: Final = 0.2
-"""Standard deviation of a corner, pixels."""
 
 
 class MarkerPose(NamedTuple):
@@ -58,7 +54,7 @@ def tag_pose(camera: PlacedCamera, sighting: Sighting, height: float) -> MarkerP
     ahead = up + np.array((-right[1], right[0]))
     side = float(np.hypot(*(points - np.roll(points, 1, axis=0)).T).mean())
     per_pixel = side / max(sighting.size, 1.0)
-    sigma = PIXEL * per_pixel
+    sigma = 0.2 * per_pixel  # standard deviation of a corner, pixels
     return MarkerPose(
         float(middle[0]),
         float(middle[1]),
@@ -72,7 +68,8 @@ def tag_pose(camera: PlacedCamera, sighting: Sighting, height: float) -> MarkerP
 
 def weight_of(camera: PlacedCamera, pixels: Array) -> float:
     """Of what lies at these pixels, (n, 2): 1, and less near the picture's border."""
-    return min(max(camera.border(pixels) / FADE, 0.0), 1.0) + LEAST_WEIGHT
+    # 0.12: share of a picture's height: nearer to its border a sighting has less weight
+    return min(max(camera.border(pixels) / 0.12, 0.0), 1.0) + LEAST_WEIGHT
 
 
 def merged(poses: Sequence[MarkerPose]) -> MarkerPose:

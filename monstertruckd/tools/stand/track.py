@@ -4,7 +4,6 @@ import asyncio
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import Final
 
 import cv2
 import numpy as np
@@ -17,9 +16,6 @@ from monstertruck_runtime.errors import TruckError
 from monstertruck_schemas.board import Colour
 from monstertruckd.tools.stand.poses import RobotPose
 from monstertruckd.tools.stand.tracking import StandTracker
-
-RETRY: Final = 1.0
-"""Seconds after which a lost camera is tried again."""
 
 Stream = Callable[[], Iterator[Picture]]
 
@@ -174,4 +170,4 @@ class StandRun:
                     said = str(error)
                     with suppress(RuntimeError):  # the loop has ended
                         loop.call_soon_threadsafe(self._say, f"camera {name}: {error}")
-            self._ended.wait(RETRY)
+            self._ended.wait(1.0)  # seconds after which a lost camera is tried again

@@ -23,24 +23,10 @@ from monstertruckd.tools.stand.config import BlobRobot, MarkConfig, TaggedRobot
 from monstertruckd.tools.stand.identities import Identities
 from monstertruckd.tools.stand.poses import MarkerPose, RobotPose, merged, robot_pose, tag_pose
 
-FASTEST: Final = 3.0
-"""Greatest speed of a robot, m/s."""
-SLACK: Final = 0.05
-"""Distance up to which a change is no jump, m."""
-RATE_TIME: Final = 0.1
-"""Seconds over which a robot's speed is a mean."""
 EXPECTED: Final = 0.5
 """Seconds for which a robot is expected where its speed takes it."""
-STUBBORN: Final = 5
-"""Pictures after which an impossible pose is accepted."""
-BUMPED: Final = 0.005
-"""m: marks of a camera that are shifted, turned or scaled by this much, rms over the marks: the camera has moved."""
-BUMP_TIME: Final = 3.0
-"""Seconds over which that is averaged."""
 BLIND: Final = 5.0
 """Seconds without any mark after which a camera looks elsewhere."""
-BLIND_PICTURES: Final = 2 * EVERYWHERE
-"""Pictures that must have come meanwhile: in two of them at least marks were searched for."""
 SILENT: Final = 1.0
 """Seconds without a picture after which a camera counts as lost."""
 
@@ -200,8 +186,11 @@ class StandTracker:
                 state.lost = lost
             if lost:
                 continue
-            blind = now - state.marked > BLIND * SECOND and state.unmarked > BLIND_PICTURES
-            moved = bool(self.marks) and (blind or state.distance > BUMPED)
+            # 2 * EVERYWHERE: pictures that must have come meanwhile: in two of them at least marks were searched for
+            blind = now - state.marked > BLIND * SECOND and state.unmarked > 2 * EVERYWHERE
+            # 0.005: m: marks of a camera that are shifted, turned or scaled by this much, rms over the marks: the
+            # camera has moved
+            moved = bool(self.marks) and (blind or state.distance > 0.005)
             if moved and not state.moved:
                 what = (
                     f"sees none of its marks for {BLIND:g} s"
@@ -229,7 +218,10 @@ class StandTracker:
             return True
         seconds = (pose.stamp - known.pose.stamp) / SECOND
         jump = math.hypot(pose.x - known.pose.x, pose.y - known.pose.y)
-        if jump > FASTEST * max(seconds, 0.0) + SLACK and known.doubts < STUBBORN:
+        # 3.0: greatest speed of a robot, m/s
+        # 0.05: distance up to which a change is no jump, m
+        # 5: pictures after which an impossible pose is accepted
+        if jump > 3.0 * max(seconds, 0.0) + 0.05 and known.doubts < 5:
             known.doubts += 1
             self.left_out += 1
             return False
@@ -239,7 +231,8 @@ class StandTracker:
         elif seconds > 0.0:
             moved = np.array((pose.x - known.pose.x, pose.y - known.pose.y, turn))
             # A mean over time: two cameras place a robot at rest some 1 mm apart, at instants of 1 ms between.
-            known.rate = known.rate - math.expm1(-seconds / RATE_TIME) * (moved / seconds - known.rate)
+            # 0.1: seconds over which a robot's speed is a mean
+            known.rate = known.rate - math.expm1(-seconds / 0.1) * (moved / seconds - known.rate)
         known.pose, known.side, known.doubts = pose, side, 0
         return True
 
@@ -254,5 +247,5 @@ class StandTracker:
         state.marked, state.unmarked = stamp, 0
         points = np.array([camera.on_plane(sighting.corners).mean(axis=0) for sighting in seen])
         places = np.array([(self.marks[s.tag].x, self.marks[s.tag].y) for s in seen])
-        share = 1.0 - math.exp(-min(max(seconds, 0.0), 1.0) / BUMP_TIME)
+        share = 1.0 - math.exp(-min(max(seconds, 0.0), 1.0) / 3.0)  # seconds over which that is averaged
         state.off = state.off + share * (shift_of(points, places) - state.off)

@@ -55,8 +55,6 @@ STATE_STYLE = {
     ServiceState.STOPPED: "dim",
 }
 EVENT_STYLE = {Severity.INFO: "green", Severity.WARNING: "yellow", Severity.ERROR: "bold red"}
-VIEW_METRES = 2.6
-"""Least distance the scan view shows ahead and to each side."""
 WIDE = 104
 HORIZON = 0.72
 """Where the truck stands in the scan view, from the top: the lidar looks ahead."""
@@ -375,7 +373,7 @@ class _Braille:
     def __rich_console__(self, _console: object, options: object) -> "list[Text]":
         width: int = getattr(options, "max_width", 60)
         height: int = getattr(options, "height", None) or 20
-        scale = min(width, height * 4 * HORIZON) / VIEW_METRES
+        scale = min(width, height * 4 * HORIZON) / 2.6  # least distance the scan view shows ahead and to each side
         cells = np.zeros((height, width), np.uint8)
         if self._state.scan is not None and not self._state.old("scan"):
             mount = _mount(self._state, self._state.scan.frame) or (0.0, 0.0, 0.0)

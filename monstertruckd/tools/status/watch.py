@@ -19,8 +19,6 @@ from monstertruckd.tools.status.screen import SHOWN, ScreenState, calibration_ba
 PICTURED = frozenset({topics.SCAN.name, topics.TRANSFORMS.name})
 """Shown by the picture alone, not in words."""
 PERIOD = 0.1
-RETRY = 1.0
-"""Seconds in which a robot that is there answers."""
 
 
 class Follower:
@@ -78,7 +76,8 @@ async def watch(clock: Clock, robot: str, endpoint: str) -> None:
 async def _follow(clock: Clock, robot: str, endpoint: str, state: ScreenState) -> None:
     while True:
         try:
-            async with TruckClient(robot, endpoint, clock=clock, timeout=RETRY) as client:
+            # 1.0: seconds in which a robot that is there answers
+            async with TruckClient(robot, endpoint, clock=clock, timeout=1.0) as client:
                 state.trouble = ""
                 await Follower(client, clock, state).run()
         except NotFoundError as error:

@@ -19,8 +19,6 @@ LEAST_WAY: Final = 0.01
 """Metres that a pass must cover: less has no direction."""
 SETTLED: Final = 1.0
 """Seconds at the beginning of a run, or of a pass, that do not count: ramps, and the turn at a reversal."""
-VELOCITY_WINDOW: Final = 1.0
-"""Seconds over which velocities are drawn."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ def centre_track(poses: Array, found: Circle) -> Array:
 
 def velocities(times: Array, poses: Array) -> tuple[Array, Array]:
     """Components of the velocity in the stand's frame over windows: times (m,), velocities (2, m), m/s."""
-    step = max(1, round(VELOCITY_WINDOW / float(np.median(np.diff(times)))))
+    step = max(1, round(1.0 / float(np.median(np.diff(times)))))  # seconds over which velocities are drawn
     gap = times[step:] - times[:-step]
     return (times[step:] + times[:-step]) / 2, (poses[:2, step:] - poses[:2, :-step]) / gap
 

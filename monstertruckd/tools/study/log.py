@@ -17,8 +17,6 @@ from monstertruck_schemas.topics import REQ_DRIVE, STAND_POSE
 from monstertruckd.recorder.reader import LogReader, open_log
 from monstertruckd.tools.study.runs import SETTLING
 
-PAUSE: Final = 3 * SECOND
-"""Requests further apart are of two runs, ns."""
 EQUAL: Final = 1e-6
 """Rad/s."""
 
@@ -90,7 +88,8 @@ def _parts(asked: list[tuple[int, float, float]]) -> Iterator[list[tuple[int, fl
     """Requests of one run each: rates that differ only in sign, pauses in between."""
     part: list[tuple[int, float, float]] = []
     for request in asked:
-        if part and (request[0] - part[-1][0] > PAUSE or _other(part, request)):
+        # 3 * SECOND: requests further apart are of two runs, ns
+        if part and (request[0] - part[-1][0] > 3 * SECOND or _other(part, request)):
             yield part
             part = []
         if part or request[1] or request[2]:

@@ -13,18 +13,12 @@ OVERSHOOTS: Final = 0.6
 """Share of the first error by which the distance goes beyond the one wanted, from which on it overshoots."""
 CALM: Final = 0.5
 """Share up to which it is calm."""
-SMALL: Final = 0.006
-"""Steady error that is small, m: what the coursework had."""
 RAISE_P: Final = 1.5, 1.2
 """Factors of K_p, at first and again later."""
 FIRST_D, RAISE_D = 0.5, 1.8
 """First K_d, of K_p, and the factor by which it grows."""
-GREATEST: Final = 60.0
-"""K_p that is tried."""
 MOST: Final = 16
 """Runs."""
-LEAST_STEP: Final = 0.03
-"""First error that counts as one, m."""
 SMOOTHED: Final = 4
 """Samples over which errors are averaged."""
 
@@ -57,7 +51,7 @@ def judged(errors: Sequence[float]) -> RunVerdict:
         raise ValueError(f"{len(errors)} samples: expected at least {3 * SMOOTHED + 1}")
     all_of = np.asarray(errors)
     smooth = np.convolve(all_of, np.ones(SMOOTHED) / SMOOTHED, "valid")
-    step = max(abs(float(smooth[0])), LEAST_STEP)
+    step = max(abs(float(smooth[0])), 0.03)  # first error that counts as one, m
     beyond = -np.sign(smooth[0]) * smooth
     steady = all_of[-len(all_of) // 3 :]
     return RunVerdict(max(float(beyond.max()), 0.0) / step, float(np.sqrt(np.mean(steady**2))))
@@ -71,7 +65,7 @@ def recipe(k_p: float) -> Generator[WallGains, RunVerdict, WallGains | None]:
     """
     gains, runs = WallGains(k_p, 0.0), 1
     verdict = yield gains
-    while verdict.overshoot < OVERSHOOTS and runs < MOST and gains.k_p * RAISE_P[0] <= GREATEST:
+    while verdict.overshoot < OVERSHOOTS and runs < MOST and gains.k_p * RAISE_P[0] <= 60.0:  # k_p that is tried
         gains, runs = WallGains(gains.k_p * RAISE_P[0], 0.0), runs + 1
         verdict = yield gains
     best: tuple[float, WallGains] | None = None
@@ -79,7 +73,7 @@ def recipe(k_p: float) -> Generator[WallGains, RunVerdict, WallGains | None]:
         if verdict.overshoot <= CALM:
             if best is None or verdict.steady < best[0]:
                 best = verdict.steady, gains
-            if verdict.steady <= SMALL:
+            if verdict.steady <= 0.006:  # steady error that is small, m: what the coursework had
                 break
             gains = WallGains(gains.k_p * RAISE_P[1], gains.k_d)
         else:

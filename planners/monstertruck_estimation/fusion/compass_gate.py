@@ -9,9 +9,6 @@ from monstertruck_estimation.fusion.config import HeadingTrust
 from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_runtime.clock import SECOND
 
-REFERENCE: Final = 20
-"""Headings from which the undisturbed strength of the field is taken."""
-
 
 class HeadingUse(StrEnum):
     """How a heading is used."""
@@ -161,7 +158,7 @@ def _field(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrus
         return gate, True
     if innovation.field is None:
         return gate, False
-    if gate.fields >= REFERENCE:
+    if gate.fields >= 20:  # headings from which the undisturbed strength of the field is taken
         if abs(innovation.field - gate.field) <= config.field * gate.field:
             return replace(gate, other_field=0.0), False
         if abs(innovation.field - gate.other_field) > config.field * gate.other_field:

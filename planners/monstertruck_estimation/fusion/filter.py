@@ -86,16 +86,12 @@ LATER: Final = slice(15, 18)
 """Pose of the scan being applied."""
 IDENTITY: Final = np.eye(SIZE)
 LARGER: Final = np.eye(SIZE + 3)
-AT_REST: Final = 0.05
-"""Standard deviation of the velocity at the start, m/s and rad/s."""
 QUANTUM: Final = (1e-5, 1e-5)
 """Standard deviation of a wheel reading that did not move, m and rad: status costs no certainty."""
 MOVED_BY: Final = ("drive", "lidar")
 """Sensors that measure motion."""
 TURNED_BY: Final = ("imu", "lidar")
 """Sensors that measure turns, and slip with no wheel."""
-STOPPING: Final = 0.1
-"""Time constant with which the velocity dies away when all of them are silent, s."""
 FRESH: Final = SECOND // 2
 """Tilt is used for this long, ns."""
 
@@ -144,7 +140,8 @@ def initial_state(stamp: int, config: FusionConfig) -> FilterState:
     mean[POSE] = config.start.x, config.start.y, config.start.yaw
     trim = config.wheels.trim if config.wheels is not None else 0.0
     spread = np.zeros(SIZE)
-    spread[TWIST], spread[NORTH], spread[TRIM] = AT_REST, math.pi, trim
+    # 0.05: standard deviation of the velocity at the start, m/s and rad/s
+    spread[TWIST], spread[NORTH], spread[TRIM] = 0.05, math.pi, trim
     spread[LOCAL] = config.compass.local if config.compass is not None else 0.0
     return FilterState(stamp, mean, np.diag(spread**2))
 
@@ -156,7 +153,8 @@ def predict(state: FilterState, stamp: int, config: FusionConfig) -> FilterState
         return state
     moved = max((state.used[name] for name in MOVED_BY if name in state.used), default=stamp)
     blind = stamp - moved > config.max_prediction * SECOND
-    lasting = STOPPING if blind else config.persistence
+    # 0.1: time constant with which the velocity dies away when all of them are silent, s
+    lasting = 0.1 if blind else config.persistence
     keep = math.exp(-dt / lasting)
     span = lasting * (1.0 - keep)
     mean = state.mean.copy()

@@ -1,7 +1,6 @@
 """Publishes the fused odometry."""
 
 from collections.abc import Sequence
-from typing import Final
 
 from monstertruck_estimation.fusion.config import FusionConfig
 from monstertruck_estimation.fusion.estimator import Fusion, FusionStatus
@@ -16,9 +15,6 @@ from monstertruck_schemas.health import OdometryHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import Odometry, ScanMotion
-
-SCANS: Final = 16
-"""Motions between scans that may wait."""
 
 
 class FusionService(OdometryService):
@@ -115,11 +111,12 @@ def build_fusion(config: FusionConfig, context: OdometryContext) -> FusionServic
     """The service with its topics, for the catalog."""
     bus, inputs = context.bus, context.inputs()
     imu = context.inertial(config.imu)
+    # 16: motions between scans that may wait
     return FusionService(
         Fusion(config, context.chassis, None if imu is None else imu.inertial),
         context.clock,
         imu=imu,
-        scans=bus.subscribe(topics.SCAN_MOTION, fifo(SCANS)) if context.slam and config.scans is not None else None,
+        scans=bus.subscribe(topics.SCAN_MOTION, fifo(16)) if context.slam and config.scans is not None else None,
         health=bus.publisher(topics.FUSION, topics.Writer.ESTIMATION),
         events=bus.event_sink(),
         rate=config.rate,

@@ -19,24 +19,14 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between, compose, compose_jacobians, interpolate
 from monstertruck_runtime.clock import SECOND
 
-SOURCE_TIMEOUT: Final = 3 * SECOND
-"""Wheel motion is remembered for this long, ns."""
-AHEAD: Final = SECOND // 8
-"""A scan may be so much newer than the wheels, ns; they are taken to go on."""
 BLIND: Final = SECOND
 """Without scans for so long, wheels are compared with the compass, ns."""
 FLOOR: Final = (0.003, 0.005)
 """Standard deviation of any comparison, m and rad."""
 JITTER: Final = 0.01
 """Standard deviation of a compass heading against one a second before, rad."""
-FASTEST: Final = 3.0
-"""No robot turns faster than this, rad/s."""
 EXPIRES: Final = 10 * SECOND
 """Slip that nothing has confirmed for so long, ns, is over: the scans have ended, and the wheels are all there is."""
-BLANK: Final = 1.0
-"""A direction in which the standard deviation of a scan is greater is unconstrained, m."""
-SPANS: Final = 2
-"""Windows over which wheels and scans are compared as well."""
 SPAN: Final = SECOND
 """Wheels and compass are compared over this long, ns."""
 
@@ -85,7 +75,7 @@ class SlipDetector:
             self._trail.append((measured.since, np.zeros(3), np.zeros((3, 3))))
         _, pose, spread = self._trail[-1]
         self._trail.append((measured.stamp, compose(pose, measured.delta), spread + measured.covariance))
-        while self._trail[0][0] < measured.stamp - SOURCE_TIMEOUT:
+        while self._trail[0][0] < measured.stamp - 3 * SECOND:  # wheel motion is remembered for this long, ns
             self._trail.popleft()
         if not self.slipping or measured.stamp - self._compared_at < EXPIRES:
             return None
@@ -99,10 +89,12 @@ class SlipDetector:
         if self._motions and self._motions[-1].stamp != measured.since:
             self._motions.clear()
             self._unproven = self._config.calm
-        if float(np.linalg.eigvalsh(measured.covariance[:2, :2])[-1]) > BLANK**2:
+        # 1.0: a direction in which the standard deviation of a scan is greater is unconstrained, m
+        if float(np.linalg.eigvalsh(measured.covariance[:2, :2])[-1]) > 1.0**2:
             self._unproven = self._config.calm
         self._motions.append(measured)
-        while len(self._motions) > 1 and measured.stamp - self._motions[1].since >= SPANS * self._window:
+        # 2: windows over which wheels and scans are compared as well
+        while len(self._motions) > 1 and measured.stamp - self._motions[1].since >= 2 * self._window:
             self._motions.popleft()
         recent = sum(1 for one in self._motions if measured.stamp - one.stamp < self._window)
         near = self._compared(recent)
@@ -153,7 +145,8 @@ class SlipDetector:
         """Take an undisturbed heading (counter-clockwise, rad); it is used where there are no scans."""
         if self._headings:
             last, before = self._headings[-1]
-            if abs(wrap_angle(yaw - before)) > JITTER * 4 + FASTEST * (stamp - last) / SECOND:
+            # 3.0: no robot turns faster than this, rad/s
+            if abs(wrap_angle(yaw - before)) > JITTER * 4 + 3.0 * (stamp - last) / SECOND:
                 # The field has changed, nothing turns so fast.
                 self._headings.clear()
         self._headings.append((stamp, yaw))
@@ -183,7 +176,8 @@ class SlipDetector:
     def _wheel_motion(self, since: int, stamp: int) -> tuple[Array, Array] | None:
         """Motion of the wheels between two instants and its covariance, (3,) and (3, 3); None if it is not known."""
         trail = self._trail
-        if len(trail) < 2 or since < trail[0][0] or stamp > trail[-1][0] + AHEAD:
+        # (SECOND // 8): a scan may be so much newer than the wheels, ns; they are taken to go on
+        if len(trail) < 2 or since < trail[0][0] or stamp > trail[-1][0] + (SECOND // 8):
             return None
         stamps = np.array([row[0] - since for row in trail], dtype=np.float64)
         poses = np.array([row[1] for row in trail])

@@ -22,16 +22,8 @@ MARGIN: Final = 20
 """Cells added when the grid has to grow."""
 LARGEST: Final = 2000
 """Cells a side at most; what lies outside is left out."""
-REMEMBERED: Final = 20
-"""Values a cell is the mean of; a later one counts as if there had been so many."""
-PATCH: Final = 0.3
-"""Side of the squares a plane is fitted to, m."""
-FEWEST: Final = 8
-"""Points of such a plane."""
 KEY: Final = 1 << 24
 """Makes one number of two of a cell or square."""
-SPREAD: Final = 0.05
-"""Standard deviation they need in every direction, m."""
 
 Cells = NDArray[np.int64]
 
@@ -67,7 +59,8 @@ class GroundGrid:
         if not len(cells) or not self._grow(cells.min(axis=0), cells.max(axis=0)):
             return
         columns, rows = (cells - self._corner).T
-        count = self._counts[rows, columns] = np.minimum(self._counts[rows, columns] + 1, REMEMBERED)
+        # 20: values a cell is the mean of; a later one counts as if there had been so many
+        count = self._counts[rows, columns] = np.minimum(self._counts[rows, columns] + 1, 20)
         values = np.stack([np.broadcast_to(value, len(points))[first] for value in (tilt, roughness)])
         self._layers[:, rows, columns] += (values - self._layers[:, rows, columns]) / count
         self._quantised[:, rows, columns] = quantised(self._layers[:, rows, columns])
@@ -162,7 +155,7 @@ def planes(points: Array) -> tuple[Array, Array, Array]:
         The points in squares with enough of them, (k, 2), with the tilt of their square's plane, (k,), rad, and the
         standard deviation of the heights about it, (k,), m.
     """
-    x, y = np.floor(points[:, :2] / PATCH).astype(np.int64).T
+    x, y = np.floor(points[:, :2] / 0.3).astype(np.int64).T  # side of the squares a plane is fitted to, m
     _, which, counts = np.unique(x * KEY + y, return_inverse=True, return_counts=True)
 
     def mean(values: Array) -> Array:
@@ -171,7 +164,9 @@ def planes(points: Array) -> tuple[Array, Array, Array]:
     dx, dy, dz = (values - mean(values)[which] for values in points.T)
     xx, xy, yy, xz, yz, zz = (mean(a * b) for a, b in ((dx, dx), (dx, dy), (dy, dy), (dx, dz), (dy, dz), (dz, dz)))
     least = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
-    good = (counts >= FEWEST) & (least >= SPREAD**2)
+    # 8: points of such a plane
+    # 0.05: standard deviation they need in every direction, m
+    good = (counts >= 8) & (least >= 0.05**2)
     determinant = np.where(good, xx * yy - xy**2, 1.0)
     along, across = (yy * xz - xy * yz) / determinant, (xx * yz - xy * xz) / determinant
     rough = np.sqrt(np.maximum(zz - along * xz - across * yz, 0.0))

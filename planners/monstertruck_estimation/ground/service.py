@@ -28,22 +28,6 @@ from monstertruck_schemas.sensor import Attitude, LaserScan
 from monstertruck_schemas.state import Ground, Odometry
 from monstertruck_schemas.topics import FUSION, ODOMETRY
 
-WINDOW: Final = 0.7
-"""Time constant of the roughness, s: about 0.15 m of travel."""
-RATE: Final = 10.0
-"""Hz."""
-MOVED: Final = 0.05
-"""Distance between two observations of the ground under the robot, m."""
-TURNED: Final = 0.2
-"""Turn between two observations of the ground under the robot, rad."""
-NEAR_GROUND: Final = 0.10
-"""Beams that go down and end this near to the robot's own level hit the ground, m."""
-POINTS: Final = 60
-"""Points of one scan at most: the fit of planes stays well below a millisecond."""
-DESCENT: Final = 0.03
-"""Metres a metre they have to fall."""
-KEPT: Final = 3 * SECOND
-"""Such points are put together for so long, ns: the robot's own height is integrated from its pitch and drifts."""
 FIT_EVERY: Final = SECOND
 """Time between two fits of planes to the points, ns."""
 
@@ -95,7 +79,7 @@ class GroundService:
         self._out, self._events, self._grid, self._save = out, events, GroundGrid(), save
         self._offload, self._load = offload, load
         self._cells = _spread(*footprint)
-        self._terrain = TerrainEstimator(WINDOW)
+        self._terrain = TerrainEstimator(0.7)  # time constant of the roughness, s: about 0.15 m of travel
         self._moved = BodyAcceleration()
         self._felt: Tilt | None = None
         self._marked: Array | None = None
@@ -109,7 +93,7 @@ class GroundService:
         """Observe until cancelled, then save."""
         await self._begin()
         ready()
-        schedule, now = Schedule(self._clock, RATE), self._clock.now()
+        schedule, now = Schedule(self._clock, 10.0), self._clock.now()  # hz
         due = {"message": now, "fit": now, "save": now + round(self._config.save_period * SECOND)}
         try:
             while True:
@@ -155,7 +139,9 @@ class GroundService:
             self._see(scan, pose)
         if self._marked is None:
             self._marked = pose
-        elif np.hypot(*(pose - self._marked)[:2]) > MOVED or abs(wrap_angle(pose[2] - self._marked[2])) > TURNED:
+        # 0.05: distance between two observations of the ground under the robot, m
+        # 0.2: turn between two observations of the ground under the robot, rad
+        elif np.hypot(*(pose - self._marked)[:2]) > 0.05 or abs(wrap_angle(pose[2] - self._marked[2])) > 0.2:
             self._marked = pose
             roughness = self._terrain.roughness * self._wheelbase / math.sqrt(2.0)
             if (slip := self._slip.latest) is not None and slip.slipping and self._fresh(slip, now):
@@ -182,18 +168,22 @@ class GroundService:
         sx, sy = plane_slopes(*angles, yaw=mount.yaw)
         bearings = scan.start_angle + scan.angle_increment * np.arange(len(scan.ranges))
         rise = np.cos(bearings) * sx + np.sin(bearings) * sy
-        valid = np.isfinite(scan.ranges) & (rise < -DESCENT)
+        valid = np.isfinite(scan.ranges) & (rise < -0.03)  # metres a metre they have to fall
         ranges, rise, bearings = scan.ranges[valid], rise[valid], bearings[valid]
         heights = mount.z + ranges * rise
-        hit = np.flatnonzero(abs(heights) < NEAR_GROUND)
-        hit = hit[:: max(math.ceil(len(hit) / POINTS), 1)]
+        # 0.10: beams that go down and end this near to the robot's own level hit the ground, m
+        hit = np.flatnonzero(abs(heights) < 0.10)
+        # 60: points of one scan at most: the fit of planes stays well below a millisecond
+        hit = hit[:: max(math.ceil(len(hit) / 60), 1)]
         level = ranges[hit] * np.sqrt(1.0 - rise[hit] ** 2)
         local = np.column_stack((level * np.cos(bearings[hit]), level * np.sin(bearings[hit])))
         in_frame = _placed(_placed(local, np.array(mount.planar)), pose)
         self._hits.append((scan.stamp, np.column_stack((in_frame, heights[hit] + self._height))))
 
     def _fit(self, now: int) -> None:
-        while self._hits and self._hits[0][0] < now - KEPT:
+        # 3 * SECOND: such points are put together for so long, ns: the robot's own height is integrated from its pitch
+        # and drifts
+        while self._hits and self._hits[0][0] < now - 3 * SECOND:
             self._hits.popleft()
         if self._hits:
             points, tilt, roughness = planes(np.vstack([hits for _, hits in self._hits]))

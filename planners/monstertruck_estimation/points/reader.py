@@ -19,12 +19,6 @@ CELLS: Final = 8
 """Cells of a tag's black square, along a side."""
 SAMPLES: Final = 6
 """Pixels of a cell that is looked at."""
-CONTRAST: Final = 25.0
-"""Least difference of white and black, of 255."""
-AROUND: Final = 0.6
-"""Margin of a tag's picture on each side, in sides of the tag."""
-WIDEST: Final = 160
-"""Pixels of a tag's picture at most."""
 PIXEL: Final = 0.25
 """Standard deviation of a corner, pixels."""
 
@@ -63,7 +57,7 @@ def decode_margin(grey: Picture, sighting: Sighting) -> float:
     means = np.asarray(flat, dtype=np.float64).reshape(CELLS, SAMPLES, CELLS, SAMPLES)[:, core, :, core].mean((1, 3))
     white = drawn(sighting.tag, CELLS) > 127
     bright, dark = float(means[white].mean()), float(means[~white].mean())
-    if bright - dark < CONTRAST:
+    if bright - dark < 25.0:  # least difference of white and black, of 255
         return -1.0
     share = (means - (bright + dark) / 2) / ((bright - dark) / 2)
     return float(np.where(white, share, -share).min())
@@ -98,12 +92,12 @@ def placed(sighting: Sighting, size: float, lens: Lens, margin: float) -> TagRea
 
 
 def _with_picture(reading: TagReading, colour: Array, sighting: Sighting) -> TagReading:
-    margin = AROUND * sighting.size
+    margin = 0.6 * sighting.size  # margin of a tag's picture on each side, in sides of the tag
     low, high = sighting.corners.min(axis=0) - margin, sighting.corners.max(axis=0) + margin
     x0, y0 = np.maximum(low, 0).astype(int)
     x1, y1 = np.minimum(np.ceil(high), (colour.shape[1], colour.shape[0])).astype(int)
     part = colour[y0:y1, x0:x1]
-    scale = WIDEST / max(part.shape[:2])
+    scale = 160 / max(part.shape[:2])  # pixels of a tag's picture at most
     if scale < 1.0:
         part = np.asarray(cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
     _, data = cv2.imencode(".jpg", part, (cv2.IMWRITE_JPEG_QUALITY, 80))

@@ -36,33 +36,15 @@ from monstertruck_schemas.topics import POSE
 TARGET: Final = "monstertruck_estimation.points.reader:ReadingStep"
 START_TIMEOUT: Final = 60.0
 """Real seconds the worker may take to start."""
-HISTORY: Final = 128
-"""Poses kept: 2.5 s at 50 Hz."""
-WAITED: Final = SECOND // 10
-"""A picture waits for a pose that is as new for so long, ns."""
 OLDEST: Final = SECOND
 """Older pictures are not read, ns."""
 STANDING: Final = (0.02, 0.02)
 """A robot that has moved and turned less, m and rad, is still at the place of the last picture."""
-LOOKS: Final = 2
-"""Pictures read at one place."""
-KEEP_RATE: Final = 2.0
-"""Checks per second at what has changed."""
 PERIOD: Final = SECOND
 """Time between two messages, ns."""
-SAVE_PERIOD: Final = 10 * SECOND
-"""Time between two writes of the file, ns."""
-AT_ONCE: Final = 4
-"""Points that are computed without letting others run."""
 PAUSE: Final = 0.02
 """Seconds that others run then."""
-RETRY: Final = 2.0
-"""Seconds after which a worker that failed is tried again."""
-CRUMB: Final = 0.5
-"""Metres between two places remembered for marks."""
 CRUMBS: Final = 4000
-MOVED: Final = 0.001
-"""A correction that moves less, m or rad, moves no point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +119,7 @@ class PointService:
         self._offload = offload
         self._map = PointMap(config, mount)
         self._sequences = Sequences(max_age)
-        self._history: deque[_Placed] = deque(maxlen=HISTORY)
+        self._history: deque[_Placed] = deque(maxlen=128)  # poses kept: 2.5 s at 50 Hz
         self._trail: deque[tuple[int, Pose2]] = deque(maxlen=CRUMBS)
         self._stamps: tuple[int, ...] = ()
         self._bases: Bases = {}
@@ -181,7 +163,7 @@ class PointService:
                 answer: ReadAnswer = await actor.step(ReadTask.of(picture.data, self._lens, self._config))
             except WorkerError as error:
                 self._events(error.reason, Severity.ERROR, self.name, str(error))
-                await self._clock.sleep(RETRY)
+                await self._clock.sleep(2.0)  # seconds after which a worker that failed is tried again
                 continue
             self._take(answer, placed)
 
@@ -203,7 +185,7 @@ class PointService:
 
     async def _placed(self, stamp: int) -> _Placed | None:
         """Where the robot was at an instant; None if that is not known."""
-        limit = self._clock.now() + WAITED
+        limit = self._clock.now() + (SECOND // 10)  # a picture waits for a pose that is as new for so long, ns
         self._gather()
         while (not self._history or self._history[-1].stamp < stamp) and self._clock.now() < limit:
             await self._clock.sleep(PAUSE)
@@ -227,7 +209,8 @@ class PointService:
                 self._history.clear()
             covariance = message.pose_covariance.reshape(3, 3)
             self._history.append(_Placed(message.stamp, pose, covariance, message.twist.wz))
-            if not self._trail or math.dist(self._trail[-1][1][:2], pose[:2]) >= CRUMB:
+            # 0.5: metres between two places remembered for marks
+            if not self._trail or math.dist(self._trail[-1][1][:2], pose[:2]) >= 0.5:
                 self._trail.append((message.stamp, pose))
 
     def _is_lost(self) -> bool:
@@ -247,14 +230,14 @@ class PointService:
             turned = abs(math.remainder(pose[2] - before[2], math.tau))
             if math.dist(before[:2], pose[:2]) < STANDING[0] and turned < STANDING[1]:
                 self._looked = before, looks + 1
-                return looks < LOOKS
+                return looks < 2  # pictures read at one place
         self._looked = pose, 1
         return True
 
     # What is kept
 
     async def _keep(self) -> None:
-        schedule = Schedule(self._clock, KEEP_RATE)
+        schedule = Schedule(self._clock, 2.0)  # checks per second at what has changed
         now = self._clock.now()
         published, saved = now - PERIOD, now
         while True:
@@ -266,7 +249,7 @@ class PointService:
             if not self._published and now - published >= PERIOD:
                 published, self._published = now, True
                 self._publish(now)
-            if self._unsaved and now - saved >= SAVE_PERIOD:
+            if self._unsaved and now - saved >= 10 * SECOND:  # time between two writes of the file, ns
                 saved, self._unsaved = now, False
                 if await self._save() is not Reason.OK:
                     self._unsaved = True
@@ -290,7 +273,7 @@ class PointService:
     async def _refresh(self) -> None:
         dirty, self._dirty = list(self._dirty), {}
         for i, name in enumerate(dirty):
-            if i and i % AT_ONCE == 0:
+            if i and i % 4 == 0:  # points that are computed without letting others run
                 await self._clock.sleep(PAUSE)
             self._map.refresh(name, self._bases)
         if dirty:
@@ -426,4 +409,5 @@ class PointService:
 
 
 def _apart(one: Pose2, other: Pose2) -> bool:
-    return max(abs(one[0] - other[0]), abs(one[1] - other[1]), abs(math.remainder(one[2] - other[2], math.tau))) > MOVED
+    # 0.001: a correction that moves less, m or rad, moves no point
+    return max(abs(one[0] - other[0]), abs(one[1] - other[1]), abs(math.remainder(one[2] - other[2], math.tau))) > 0.001

@@ -22,32 +22,10 @@ from monstertruck_schemas.points import PointKind, PointOfInterest
 
 KEPT: Final = 24
 """Sightings of a point at most."""
-SAME_PLACE: Final = 0.08
-"""Distance within which sightings count as one, m: their errors are the same."""
-SAME_TURN: Final = 0.08
-"""Difference in heading within which sightings count as one, rad."""
-APART: Final = 100_000_000
-"""Least time between two pictures that count, ns."""
-RANGE_ERROR: Final = 0.4
-"""Standard deviation of a tag's side in a picture, pixels."""
 SIDE_ERROR: Final = 0.006
 """Standard deviation across the line of sight, m."""
-BEARING_ERROR: Final = 0.004
-"""Standard deviation of the direction of the line of sight, rad: mount and lens."""
-LATENESS: Final = 0.015
-"""Error of the picture's stamp, s."""
-HEADING_ERROR: Final = 0.06
-"""Standard deviation of the normal of an unambiguous tag, rad."""
 DOUBTED: Final = 0.6
 """Ratio of the fits of the best and the second pose of a square up to which the tag is unambiguous."""
-UNKNOWN_HEADING: Final = 2.0
-"""Standard deviation of the normal of an ambiguous tag, rad."""
-MARK_ERROR: Final = 0.01
-"""Standard deviation of a place marked by an operator, m and rad."""
-LOADED: Final = 2
-"""Sightings that a point of a saved map is worth: one that disagrees changes nothing yet."""
-FAR: Final = 3.5
-"""Standard deviations at which two sightings disagree."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +100,8 @@ class PointMap:
         if known is None and len(self.points) >= self.config.most:
             return False
         # What a saved map says was on the clock of another start.
-        if known is not None and abs(stamp - known.last) < APART:
+        # 100_000_000: least time between two pictures that count, ns
+        if known is not None and abs(stamp - known.last) < 100_000_000:
             return False
         new = sighting(reading, self.mount, stamp, base, covariance, rate)
         before = known is not None and self.is_known(known)
@@ -154,7 +133,8 @@ class PointMap:
         """
         x, y, yaw = between(np.array(base), np.array(place)).tolist()
         into = _into_base(base)
-        spread = tuple(float(v) for v in (into @ covariance @ into.T + np.eye(3) * MARK_ERROR**2).ravel())
+        # 0.01: standard deviation of a place marked by an operator, m and rad
+        spread = tuple(float(v) for v in (into @ covariance @ into.T + np.eye(3) * 0.01**2).ravel())
         one = PointSighting(stamp, base, (x, y, 0.0), yaw, spread)
         self.points[name] = Tracked(name, PointKind.MARK, None, None, (one,), 0, stamp, stamp)
 
@@ -190,7 +170,8 @@ class PointMap:
         for point, picture in points:
             spread = tuple(float(v) for v in point.covariance)
             place = (point.x, point.y, point.z)
-            one = PointSighting(0, (0.0, 0.0, 0.0), place, point.yaw, spread, worth=LOADED)
+            # 2: sightings that a point of a saved map is worth: one that disagrees changes nothing yet
+            one = PointSighting(0, (0.0, 0.0, 0.0), place, point.yaw, spread, worth=2)
             self.points[point.name] = Tracked(
                 point.name, point.kind, point.tag, point.size, (one,), max(point.sightings, self.config.sightings),
                 point.first, point.last, picture, 40.0 if picture else 0.0,
@@ -233,14 +214,18 @@ def sighting(
     normal = normals[1 if second else 0]
     sure = reading.doubt <= DOUBTED or abs(level[0] - level[1]) > 0.1
     away = math.hypot(*reading.middle)
-    along = RANGE_ERROR / max(reading.pixels, 1.0) * away
-    across = SIDE_ERROR + away * (BEARING_ERROR + abs(rate) * LATENESS)
+    along = 0.4 / max(reading.pixels, 1.0) * away  # standard deviation of a tag's side in a picture, pixels
+    # 0.004: standard deviation of the direction of the line of sight, rad: mount and lens
+    # 0.015: error of the picture's stamp, s
+    across = SIDE_ERROR + away * (0.004 + abs(rate) * 0.015)
     bearing = math.atan2(place[1] - mount.y, place[0] - mount.x)
     c, s = math.cos(bearing), math.sin(bearing)
     spin = np.array(((c, -s), (s, c)))
     spread = np.zeros((3, 3))
     spread[:2, :2] = spin @ np.diag((along**2 + SIDE_ERROR**2, across**2)) @ spin.T
-    spread[2, 2] = (HEADING_ERROR if sure else UNKNOWN_HEADING) ** 2
+    # 0.06: standard deviation of the normal of an unambiguous tag, rad
+    # 2.0: standard deviation of the normal of an ambiguous tag, rad
+    spread[2, 2] = (0.06 if sure else 2.0) ** 2
     into = _into_base(base)
     by_turn = np.eye(3)
     by_turn[0, 2], by_turn[1, 2] = -place[1], place[0]
@@ -289,7 +274,8 @@ def _agreeing(places: Array, spreads: Array, worth: NDArray[np.int64], config: P
     apart = places[:, None, :2] - places[None, :, :2]
     both = spreads[:, None, :2, :2] + spreads[None, :, :2, :2]
     far = np.einsum("ijk,ijkl,ijl->ij", apart, np.linalg.inv(both), apart)
-    near = (np.hypot(apart[..., 0], apart[..., 1]) < config.agree) | (far < FAR**2)
+    # 3.5: standard deviations at which two sightings disagree
+    near = (np.hypot(apart[..., 0], apart[..., 1]) < config.agree) | (far < 3.5**2)
     votes = near @ worth
     best = len(votes) - 1 - int(np.argmax(votes[::-1]))
     return np.flatnonzero(near[best])
@@ -306,7 +292,9 @@ def _added(sightings: tuple[PointSighting, ...], new: PointSighting) -> tuple[Po
         if old.worth > 1:  # of a saved map: from where it was seen is not known
             continue
         moved = math.dist(old.base[:2], new.base[:2])
-        if moved < SAME_PLACE and abs(math.remainder(old.base[2] - new.base[2], math.tau)) < SAME_TURN:
+        # 0.08: distance within which sightings count as one, m: their errors are the same
+        # 0.08: difference in heading within which sightings count as one, rad
+        if moved < 0.08 and abs(math.remainder(old.base[2] - new.base[2], math.tau)) < 0.08:
             better = new if new.spread[0] + new.spread[4] < old.spread[0] + old.spread[4] else old
             return (*sightings[:i], better, *sightings[i + 1 :])
     kept = (*sightings, new)

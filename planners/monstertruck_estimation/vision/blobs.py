@@ -24,16 +24,6 @@ HUES: Final[dict[Colour, tuple[int, int]]] = {
     "magenta": (138, 162),
 }
 """First and last hue of each, in OpenCV's half degrees; red passes 180."""
-SATURATED: Final = 90
-"""Least saturation, of 255: tables and floors have less."""
-BRIGHT: Final = 30
-"""Least brightness, of 255: in the dark every hue is noise."""
-LEAST: Final = 12
-"""Pixels of a disc."""
-MOST: Final = 0.02
-"""Share of the picture: more is no disc."""
-ROUND: Final = 1.8
-"""Longer side of a disc's box over its shorter one, at most."""
 
 
 class Blob(NamedTuple):
@@ -64,7 +54,10 @@ class BlobReader:
             count, _, boxes, middles = cv2.connectedComponentsWithStats(_of_hue(hsv, *HUES[colour]))
             for k in range(1, count):
                 x, y, wide, high, pixels = (int(v) for v in boxes[k])
-                if not LEAST <= pixels <= MOST * width * height or max(wide, high) > ROUND * min(wide, high):
+                # 12: pixels of a disc
+                # 0.02: share of the picture: more is no disc
+                # 1.8: longer side of a disc's box over its shorter one, at most
+                if not 12 <= pixels <= 0.02 * width * height or max(wide, high) > 1.8 * min(wide, high):
                     continue
                 if x > 0 and y > 0 and x + wide < width and y + high < height:
                     found.append(Blob(colour, np.asarray(middles[k], dtype=np.float64), pixels))
@@ -73,8 +66,8 @@ class BlobReader:
 
 def _of_hue(hsv: ColourPicture, first: int, last: int) -> NDArray[np.uint8]:
     def between(low: int, high: int) -> NDArray[np.uint8]:
-        return np.asarray(
-            cv2.inRange(hsv, np.array((low, SATURATED, BRIGHT)), np.array((high, 255, 255))), dtype=np.uint8
-        )
+        # 90: least saturation, of 255: tables and floors have less
+        # 30: least brightness, of 255: in the dark every hue is noise
+        return np.asarray(cv2.inRange(hsv, np.array((low, 90, 30)), np.array((high, 255, 255))), dtype=np.uint8)
 
     return between(first, last) if first <= last else between(first, 179) | between(0, last)

@@ -16,8 +16,6 @@ from monstertruck_estimation.vision.tags import Picture, dictionary
 from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.board import BoardConfig
 
-LEAST_CORNERS: Final = 8
-"""Least number of corners of a board in a picture."""
 PROFILE: Final = 6
 """Pixels to both sides of an edge, over which its width is measured."""
 
@@ -58,7 +56,7 @@ class BoardReader:
         self.strangers |= (
             {int(tag) for tag in np.ravel(markers) if tag >= self._known} if markers is not None else set()
         )
-        if ids is None or len(ids) < LEAST_CORNERS:
+        if ids is None or len(ids) < 8:  # least number of corners of a board in a picture
             return None
         numbers, found = np.asarray(ids, dtype=np.int64).ravel(), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
         if any(np.unique(places).size < 2 for places in np.divmod(numbers, self.board.columns - 1)):

@@ -17,12 +17,6 @@ from monstertruck_kinematics.elementary import Array
 Picture = NDArray[np.uint8]
 """Grey, (height, width)."""
 
-MARGIN: Final = 1.0
-"""Margin of the window around a tag on each side, in sizes of the tag: how far it may move between two pictures."""
-LEAST_MARGIN: Final = 16
-"""Pixels."""
-LEAST_PERIMETER: Final = 32
-"""Pixels around a tag, one for each of its cells: what is smaller is noise, of which every speck takes time."""
 EVERYWHERE: Final = 8
 """Pictures from one look at the whole of it to the next: a tag that appears is found in the one after so many at the
 latest, also where it was not expected."""
@@ -107,7 +101,8 @@ class TagReader:
         return list(by_tag.values())
 
     def _detect(self, picture: Picture, x0: int, y0: int) -> list[Sighting]:
-        self._parameters.minMarkerPerimeterRate = LEAST_PERIMETER / max(picture.shape)
+        # 32: pixels around a tag, one for each of its cells: what is smaller is noise, of which every speck takes time
+        self._parameters.minMarkerPerimeterRate = 32 / max(picture.shape)
         self._detector.setDetectorParameters(self._parameters)
         corners, ids, _ = self._detector.detectMarkers(picture)
         if ids is None:
@@ -122,10 +117,6 @@ EDGE: Final = (0.12, 0.88)
 """Part of an edge that is looked at: its ends are rounded by blur."""
 ACROSS: Final = np.linspace(-2.5, 2.5, 21)
 """Pixels from an edge, over which its step is looked for."""
-STEP: Final = 3.0
-"""Least step of an edge from sample to sample, of 255."""
-ASTRAY: Final = 0.7
-"""Pixels from the others at which a sample of an edge is none of it."""
 
 
 def along_edges(picture: Picture, corners: Array) -> Array:
@@ -144,10 +135,11 @@ def along_edges(picture: Picture, corners: Array) -> Array:
         steps = np.abs(np.diff(values, axis=1))
         middles = (ACROSS[1:] + ACROSS[:-1]) / 2
         off = (steps**2 @ middles) / np.maximum((steps**2).sum(axis=1), 1e-9)
-        clear = steps.max(axis=1) > STEP
+        clear = steps.max(axis=1) > 3.0  # least step of an edge from sample to sample, of 255
         if clear.sum() < 4:
             return corners
-        clear &= np.abs(off - np.median(off[clear])) < ASTRAY
+        # 0.7: pixels from the others at which a sample of an edge is none of it
+        clear &= np.abs(off - np.median(off[clear])) < 0.7
         on = points[clear] + off[clear, None] * across
         middle = on.mean(axis=0)
         lines.append((middle, np.linalg.svd(on - middle)[2][0]))
@@ -174,7 +166,10 @@ def _windows(places: Sequence[Array], width: int, height: int) -> list[tuple[int
     """Around the corners of each tag, those that overlap joined: x0, y0, x1, y1, pixels."""
     boxes: list[tuple[int, int, int, int]] = []
     for corners in places:
-        margin = max(LEAST_MARGIN, round(MARGIN * _side(corners)))
+        # 16: pixels
+        # 1.0: margin of the window around a tag on each side, in sizes of the tag: how far it may move between two
+        # pictures
+        margin = max(16, round(1.0 * _side(corners)))
         low, high = corners.min(axis=0), corners.max(axis=0)
         box = (
             max(int(low[0]) - margin, 0),

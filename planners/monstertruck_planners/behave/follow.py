@@ -23,12 +23,6 @@ from monstertruck_schemas.topics import PEERS, POSE, Topic
 
 SPACING: Final = 0.05
 """Distance between the points of the trail, m."""
-LONGEST: Final = 400
-"""Points."""
-CLOSE_UP: Final = 0.8
-"""Speed per error of the gap, 1/s."""
-JUMP: Final = 0.5
-"""A leader that moves further than this from one step to the next was put down elsewhere, m."""
 
 Metres = Annotated[float, Field(gt=0, le=20)]
 
@@ -107,7 +101,7 @@ class LeaderFollower:
             return BehaviourStep(None, state, "follow", Reason.PATH_LOST, text)
         state = extended(state, me, leader.pose)
         gap = length((Point(me.x, me.y), *state.points))
-        pace = along(leader, me) + CLOSE_UP * (gap - config.distance)
+        pace = along(leader, me) + 0.8 * (gap - config.distance)  # speed per error of the gap, 1/s
         pace = min(max(pace, 0.0), config.speed)
         values = {"gap": gap, "apart": apart, "silent": silent}
         if gap <= config.distance and pace < 0.01 * config.speed:
@@ -123,7 +117,8 @@ class LeaderFollower:
 def extended(trail: LeaderTrail, me: Pose2D, leader: Pose2D) -> LeaderTrail:
     """The trail with the leader's newest place at its end, and without what the follower has passed."""
     points, at = trail.points, Point(leader.x, leader.y)
-    if not points or math.dist(points[-1], at) > JUMP:
+    # 0.5: a leader that moves further than this from one step to the next was put down elsewhere, m
+    if not points or math.dist(points[-1], at) > 0.5:
         points = (at,)  # straight towards it
     elif len(points) > 1 and math.dist(points[-2], at) < SPACING:
         points = (*points[:-1], at)
@@ -132,7 +127,7 @@ def extended(trail: LeaderTrail, me: Pose2D, leader: Pose2D) -> LeaderTrail:
     here = Point(me.x, me.y)
     while len(points) > 1 and _passed(here, points[0], points[1]):
         points = points[1:]
-    return replace(trail, points=points[-LONGEST:])
+    return replace(trail, points=points[-400:])  # points
 
 
 def _passed(here: Point, first: Point, second: Point) -> bool:

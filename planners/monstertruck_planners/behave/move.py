@@ -26,24 +26,10 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Odometry
 from monstertruck_schemas.topics import GATE, ODOMETRY, Topic
 
-CREEP: Final = 0.02
-"""Speed while the wheels are steered, as a share of the move's: above what counts as standstill."""
-SETTLED: Final = 0.3
-"""Seconds for which the gate has to command the move's direction: servos answer late."""
 STEERED: Final = 0.03
 """Difference of two directions up to which they are the same, 1/m and rad."""
-STEER_TIMEOUT: Final = 4.0
-"""Seconds."""
 LAG: Final = 0.3
 """Seconds of driving by which every robot is behind."""
-RETURN: Final = 2.0
-"""Speed per distance from where the robot should be, 1/s."""
-HEADING: Final = 1.5
-"""Curvature per heading error, 1/(m rad)."""
-PATIENCE: Final = 3.0
-"""Seconds without progress after which it gives up, and after which an end that is not reached is missed."""
-REACH: Final = 0.01
-"""Difference of an axle angle from the one requested that is none, rad."""
 
 
 class Amounts(NamedTuple):
@@ -201,10 +187,12 @@ class Move:
             steered = gate.twist is not None and self._steered(gate.twist)
             since = (t if state.steered is None else state.steered) if steered else None
             state = replace(state, steered=since)
-            if since is None or t - since < SETTLED:
-                if t > STEER_TIMEOUT:
+            # 0.3: seconds for which the gate has to command the move's direction: servos answer late
+            if since is None or t - since < 0.3:
+                if t > 4.0:  # seconds
                     return self._ended(state, Reason.NOT_OBEYED, "the wheels are not steered to the move")
-                return self._going(state, math.copysign(CREEP * self._amounts.speed, self._distance))
+                # 0.02: speed while the wheels are steered, as a share of the move's: above what counts as standstill
+                return self._going(state, math.copysign(0.02 * self._amounts.speed, self._distance))
             state = replace(
                 state, phase="drive", target=state.covered, best=state.covered, best_at=t, clock=self._begun(state)
             )
@@ -217,14 +205,16 @@ class Move:
         if state.phase == "arrive" and abs(left) <= self._amounts.tolerance and stands:
             way = "" if self._move.radius == 0.0 else f"{state.covered:.3f} m, "
             return self._ended(state, Reason.BEHAVIOUR_DONE, f"{way}turned {state.turned:.3f} rad")
-        if waited > PATIENCE:
+        # 3.0: seconds without progress after which it gives up, and after which an end that is not reached is missed
+        if waited > 3.0:
             unit = "rad" if self._move.radius == 0.0 else "m"
             reason = Reason.GOAL_MISSED if state.phase == "arrive" else Reason.STUCK
             return self._ended(state, reason, f"{left:.3f} {unit} left and no progress for {waited:.1f} s: {gate.why}")
         off = state.target - state.covered
         usual = LAG * abs(state.planned)
         beyond = off - min(max(off, -usual), usual)
-        return self._going(state, state.planned + RETURN * beyond)
+        # 2.0: speed per distance from where the robot should be, 1/s
+        return self._going(state, state.planned + 2.0 * beyond)
 
     def _advanced(self, state: Progress, now: Odometry) -> Progress:
         """With the motion since the last step."""
@@ -306,7 +296,8 @@ class Move:
         pace = min(max(pace, -self._amounts.speed), self._amounts.speed)
         ahead, aside, turning = (pace * part for part in self._direction)
         if self._turns and state.phase != "steer":
-            turning += abs(pace) * HEADING * (state.covered * self._direction[2] - state.turned)
+            # 1.5: curvature per heading error, 1/(m rad)
+            turning += abs(pace) * 1.5 * (state.covered * self._direction[2] - state.turned)
         vx, vy, wz = self._chassis.possible((ahead, aside, turning))
         return BehaviourStep(RequestedMotion(vx, wz, vy), state, state.phase, values=self._values(state))
 
@@ -343,7 +334,8 @@ def require_possible(move: BasicMove, body: BehaviourBody) -> Twist2:
     twist = chassis.possible(move.direction)
     angles, clipped = chassis.limited_steering(chassis.steering_for(twist, chassis.straight), body.max_angle)
     reached = chassis.reached(angles)
-    if clipped or max((abs(a - b) for a, b in zip(angles, reached, strict=True)), default=0.0) > REACH:
+    # 0.01: difference of an axle angle from the one requested that is none, rad
+    if clipped or max((abs(a - b) for a, b in zip(angles, reached, strict=True)), default=0.0) > 0.01:
         vx, vy, wz = chassis.along(twist, *reached)
         if math.isinf(move.radius):
             raise KinematicsError(

@@ -35,20 +35,8 @@ from monstertruck_schemas.topics import BEHAVIOUR, GATE, GOAL, ODOMETRY, TRACKER
 
 SOURCE: Final = ServiceName.BEHAVIOURS.value
 """Source of the drive requests."""
-LEASE: Final = 0.3
-"""Lease of each drive request, s."""
-REPORT: Final = SECOND // 5
-"""Period of reports without a change, ns."""
 CHANGES: Final = ("number", "running", "phase", "outcome")
 """Fields of the report whose change is reported at once."""
-DISOBEYED: Final = 2.0
-"""Seconds of requested but not executed motion after which a behaviour gives up."""
-SETTLE: Final = 1.0
-"""Seconds for which standstill is requested after the end."""
-AT_REST: Final = 0.01
-"""m/s, rad/s."""
-IDLE_RATE: Final = 10.0
-"""Steps a second of a service whose behaviours all have others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +108,7 @@ class BehaviourService:
             max_age,
             bus.publisher(BEHAVIOUR, Writer.PLANNER),
             changes=CHANGES,
-            period=REPORT,
+            period=SECOND // 5,  # period of reports without a change, ns
             others=(self._goal,),
             drives=attrgetter("accepts_motion"),
         )
@@ -131,7 +119,8 @@ class BehaviourService:
         """Serve until cancelled."""
         self.tasks.report()
         ready()
-        rate = max((config.rate for config in self.configs.values()), default=IDLE_RATE)
+        # 10.0: steps a second of a service whose behaviours all have others
+        rate = max((config.rate for config in self.configs.values()), default=10.0)
         schedule, due = Schedule(self._clock, rate), 0.0
         while True:
             await schedule.next()
@@ -249,7 +238,8 @@ class BehaviourService:
             return Reason.BUSY, other
         if (stale := self._stale(run.behaviour, now)) is not None:
             return Reason.INPUT_STALE, stale
-        if run.disobeyed is not None and now - run.disobeyed > DISOBEYED * SECOND:
+        # 2.0: seconds of requested but not executed motion after which a behaviour gives up
+        if run.disobeyed is not None and now - run.disobeyed > 2.0 * SECOND:
             reason = next(iter(gate.reasons), Reason.NOT_OBEYED)
             return reason, f"the gate does not let it drive: {gate.why}"
         return None
@@ -291,9 +281,10 @@ class BehaviourService:
     def _settle(self, now: int) -> None:
         """Ask for standstill until the robot is at rest, then send nothing."""
         run, odometry = self._run, self._odometry.latest
-        if run is None or run.ended is None or now - run.ended > SETTLE * SECOND:
+        # 1.0: seconds for which standstill is requested after the end
+        if run is None or run.ended is None or now - run.ended > 1.0 * SECOND:
             return
-        still = odometry is not None and max(abs(odometry.twist.vx), abs(odometry.twist.wz)) < AT_REST
+        still = odometry is not None and max(abs(odometry.twist.vx), abs(odometry.twist.wz)) < 0.01  # m/s, rad/s
         if not still:
             self._ask(RequestedMotion(), now)
 
@@ -303,7 +294,8 @@ class BehaviourService:
             return
         twist = RequestedTwist(vx=motion.vx, vy=motion.vy, wz=motion.wz)
         seq = self._drive.next_seq()
-        self._drive.put(planner_request(seq, gate, now, SOURCE, LEASE, speed=0.0, front=0.0, twist=twist))
+        # 0.3: lease of each drive request, s
+        self._drive.put(planner_request(seq, gate, now, SOURCE, 0.3, speed=0.0, front=0.0, twist=twist))
 
     def state(self, now: int) -> BehaviourState:
         """The report on the newest behaviour."""

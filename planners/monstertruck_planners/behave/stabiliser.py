@@ -44,14 +44,8 @@ from monstertruck_schemas.state import Odometry
 from monstertruck_schemas.topics import COMPASS, ODOMETRY, PLAN_STABILISER, Writer
 
 FILTERS: Final = 5
-CALMER: Final = 0.6
-"""Each next filter forgets this much of what the one before it forgets."""
 JUDGED: Final = 2
 """Readings over which a prediction is checked: about as far ahead as it is used."""
-JUDGEMENT: Final = 0.1
-"""Share that the newest reading has in a filter's errors."""
-DECIDED: Final = 4
-"""Power of the mean square with which filters that are wrong more often lose."""
 LEAST_ERROR: Final = math.radians(0.1)
 """Filters better than this are equally good, rad: the compass's resolution."""
 
@@ -127,7 +121,8 @@ class TiltFilter:
     def __init__(self, config: StabiliserConfig) -> None:
         self._config = config
         self._stamp: int | None = None
-        self._forget: Array = np.asarray((1 - config.memory) * CALMER ** np.arange(FILTERS, dtype=np.float64))[:, None]
+        # 0.6: each next filter forgets this much of what the one before it forgets
+        self._forget: Array = np.asarray((1 - config.memory) * 0.6 ** np.arange(FILTERS, dtype=np.float64))[:, None]
         self._past: deque[tuple[int, Array]] = deque(maxlen=JUDGED)
         """Stamps and states after the newest readings: angle, rate, acceleration; shape (3, filters, 2 axes)."""
         self._errors = np.zeros((FILTERS, 2))
@@ -154,7 +149,8 @@ class TiltFilter:
             if len(self._past) == JUDGED:
                 before, old = self._past[0]
                 missed = measured - _ahead(old, (attitude.stamp - before) / SECOND)
-                self._errors += JUDGEMENT * (missed**2 - self._errors)
+                # 0.1: share that the newest reading has in a filter's errors
+                self._errors += 0.1 * (missed**2 - self._errors)
             state = _corrected(self._past[-1][1], measured, dt, self._forget)
         self._past.append((attitude.stamp, state))
 
@@ -165,7 +161,8 @@ class TiltFilter:
         age = (now - self._stamp) / SECOND
         if age > self._config.stale_after:
             return None
-        weights = (self._errors + LEAST_ERROR**2) ** -DECIDED
+        # 4: power of the mean square with which filters that are wrong more often lose
+        weights = (self._errors + LEAST_ERROR**2) ** -4
         predicted = _ahead(self._past[-1][1], min(age + self._config.lead, self._config.coast))
         roll, pitch = ((weights * predicted).sum(axis=0) / weights.sum(axis=0)).tolist()
         return Tilt(roll, pitch)

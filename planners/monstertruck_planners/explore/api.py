@@ -30,35 +30,11 @@ from monstertruck_planners.route.heuristic import (
     cost_to_go,
 )
 
-LONGEST: Final = 2.5
-"""Frontiers longer than this are divided, m."""
 AROUND: Final = 3.0
 """Distance of a viewpoint from its frontier at most, m."""
-COMPARED: Final = 160
-"""Viewpoints compared for each frontier by how much of it is visible."""
-PLACES: Final = 32
-"""The best of these that are compared by the new area seen."""
-MARGIN: Final = 1.0
-"""A result is valid until something changes within this distance of such places, m."""
-SAMPLES: Final = 12
-"""Cells of a frontier whose visibility is tested."""
-SEEN: Final = 0.6
-"""Least share of a frontier that must be visible."""
-SHORT: Final = 0.5
-"""Margin on the sensor's range for visibility, m."""
 BEAMS: Final = 96
-DEPTH: Final = 1.0
-"""See ``new_area``, m."""
-WORTH: Final = 0.6
-"""Places that show less than this share of what the best one shows are passed over."""
 LEAST: Final = 0.06
 """New area that makes a place worth going to, m^2."""
-BANNED: Final = 0.5
-"""Frontiers whose centre is this near to a banned place are skipped, m."""
-AVOIDED: Final = 0.25
-"""Metres round an avoided place without viewpoints."""
-NEARBY: Final = 0.6
-"""A path begins at an open cell this near to the robot, m."""
 BEHIND: Final = 4
 """Coarse cells over which the direction of a path is measured."""
 SIDEWARD: Final = 0.4
@@ -223,7 +199,7 @@ class ExplorationView:
     def _open_cell(self, cell_cost: NDArray[np.int16], cell: float, place: Point) -> tuple[int, int] | None:
         """The open cell nearest to a place, if there is one nearby."""
         row, column = cell_at(self._field, cell, *place)
-        reach = math.ceil(NEARBY / cell)
+        reach = math.ceil(0.6 / cell)  # a path begins at an open cell this near to the robot, m
         top, left = max(row - reach, 0), max(column - reach, 0)
         rows, columns = np.nonzero(cell_cost[top : max(row + reach + 1, 0), left : max(column + reach + 1, 0)])
         if not len(rows):
@@ -238,16 +214,18 @@ class ExplorationView:
         seen: dict[bytes, Viewpoints] = {}
         reached = to_go.cost < UNREACHED
         for frontier in self._frontiers():
-            if any(math.dist(frontier.middle, place) < BANNED for place in self.banned):
+            # 0.5: frontiers whose centre is this near to a banned place are skipped, m
+            if any(math.dist(frontier.middle, place) < 0.5 for place in self.banned):
                 self.left_alone += 1
                 continue
             key = (frontier.points + self.known.resolution / 4).round(2).tobytes()
             near = self._reached_near(reached, frontier)
             look = self.memory.looks.get(key)
+            # 1.0: a result is valid until something changes within this distance of such places, m
             if (
                 look is None
                 or look.reached != len(near)
-                or self.known.changed_within(frontier.middle, AROUND + MARGIN) > look.change
+                or self.known.changed_within(frontier.middle, AROUND + 1.0) > look.change
             ):
                 look = self._look(frontier, near)
             seen[key] = look
@@ -279,7 +257,7 @@ class ExplorationView:
         result = []
         order = np.argsort(of, kind="stable")
         for group in np.split(order, np.flatnonzero(np.diff(of[order])) + 1):
-            for part in _divided(centres[group], LONGEST):
+            for part in _divided(centres[group], 2.5):  # frontiers longer than this are divided, m
                 members = group[part]
                 if len(members) < least or not roomy[members].any():
                     continue
@@ -316,17 +294,19 @@ class ExplorationView:
         places, bearings, headings = self._with_room(places, frontier)
         if not len(places):
             return Viewpoints(change, reached)
-        some = _spread(len(places), COMPARED)
+        some = _spread(len(places), 160)  # viewpoints compared for each frontier by how much of it is visible
         places, bearings, headings = places[some], bearings[some], headings[some]
-        sample = frontier.points[_spread(len(frontier.points), SAMPLES)]
+        sample = frontier.points[_spread(len(frontier.points), 12)]  # cells of a frontier whose visibility is tested
         here, there = ((v - corner) / resolution for v in (places, sample))
-        share = shares_seen(self.known.cells, here, there, (config.reach - SHORT) / resolution)
+        # 0.5: margin on the sensor's range for visibility, m
+        share = shares_seen(self.known.cells, here, there, (config.reach - 0.5) / resolution)
         if share.max(initial=0.0) == 0.0:
             return Viewpoints(change, reached)
-        good = np.flatnonzero(share >= min(SEEN, float(share.max())))
-        good = good[_spread(len(good), PLACES)]
+        good = np.flatnonzero(share >= min(0.6, float(share.max())))  # least share of a frontier that must be visible
+        good = good[_spread(len(good), 32)]  # the best of these that are compared by the new area seen
         gains = self.gains(np.column_stack((places[good], headings[good])))
-        worth = gains >= max(WORTH * float(gains.max()), LEAST)
+        # 0.6: places that show less than this share of what the best one shows are passed over
+        worth = gains >= max(0.6 * float(gains.max()), LEAST)
         good = good[worth]
         return Viewpoints(change, reached, places[good], bearings[good], headings[good], gains[worth])
 
@@ -351,7 +331,8 @@ class ExplorationView:
             if cost[i] >= UNREACHED:
                 break
             x, y = look.places[i].tolist()
-            if any(math.dist((x, y), place) <= AVOIDED for place in self.avoided):
+            # 0.25: metres round an avoided place without viewpoints
+            if any(math.dist((x, y), place) <= 0.25 for place in self.avoided):
                 continue
             at = int(rows[i]), int(columns[i])
             yaw = self._heading(to_go, at, float(look.bearings[i]))
@@ -368,7 +349,7 @@ class ExplorationView:
         c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
         sensor = np.column_stack((poses[:, 0] + c * mx - s * my, poses[:, 1] + s * mx + c * my, poses[:, 2] + turn))
         sensor[:, :2] = (sensor[:, :2] - self.known.origin[:2]) / resolution
-        depth = getattr(config, "depth", DEPTH)
+        depth = getattr(config, "depth", 1.0)  # see ``new_area``, m
         cells = new_areas(self.known.cells, sensor, config.view, config.reach / resolution, depth / resolution, BEAMS)
         area: Array = cells * resolution**2
         return area

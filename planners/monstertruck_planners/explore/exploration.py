@@ -21,18 +21,12 @@ SETTLE: Final = 1.5
 """Seconds after a goal until the map contains what is seen there."""
 CONFIRM: Final = 2
 """Evaluations in a row without a frontier after which the exploration ends."""
-PATIENCE: Final = 30.0
-"""Seconds to wait for a first map."""
 RETURNS: Final = 6
 """Attempts to drive home."""
 NEAR_START: Final = 1.0
 """Distance from a blocked start, as at a wall, within which the robot counts as back, m."""
 SPACING: Final = 0.25
 """Distance between the places beside the start that are kept, m."""
-PLACES: Final = 3
-"""How many of them."""
-SAVE: Final = 30.0
-"""Seconds to wait for the map to be saved."""
 AGAIN: Final = 2.0
 """Seconds from a refused goal to the next one; while driving home twice as many after each failure."""
 STANDS: Final = 5.0
@@ -50,16 +44,12 @@ REMEMBERED: Final = 8
 """Poses kept for driving back."""
 COUNTED: Final = 0.03
 """Motion that counts, m: the pose of a standing robot moves by some millimetres with every scan."""
-LEAST_USED: Final = 0.05
-"""Share of the charge used from which on the use per metre counts as measured."""
 PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
 """Outcomes of a goal that do not depend on its place."""
 BROKEN: Final = frozenset({Reason.WORKER_DIED, Reason.WORKER_TIMEOUT})
 """Refusals of any goal, by a planner that does not start; of a goal that was planned they may be its place's."""
 HOPELESS: Final = frozenset({Reason.DISARMED, Reason.ESTOPPED, Reason.BUSY})
 """Outcomes of a goal that would be the same at any other place."""
-SAME: Final = 0.5
-"""Places this near to each other count as one, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +77,8 @@ class Attempts:
 
     def failed(self, place: Point, now: float, *, ignore_first: bool = False) -> "Attempts":
         """With one more failed attempt at a place; ``ignore_first``: the first has no effect yet."""
-        before = next((attempt for attempt in self.places if math.dist(attempt.place, place) < SAME), None)
+        # 0.5: places this near to each other count as one, m
+        before = next((attempt for attempt in self.places if math.dist(attempt.place, place) < 0.5), None)
         count = 1 if before is None else before.count + 1
         until = math.inf if count >= self.most else now if ignore_first and count == 1 else now + self.period
         others = tuple(attempt for attempt in self.places if attempt is not before)
@@ -331,7 +322,7 @@ def _moved(run: Exploration, seen: Observed) -> Exploration:
 def _near_home(run: Exploration, pose: Pose2 | None) -> tuple[Pose2, ...]:
     """Where a robot that set out has been: what it could not see behind itself at its start, it passed over there."""
     places = run.near_home
-    if pose is None or len(places) == PLACES or math.dist(pose[:2], run.home[:2]) > NEAR_START:
+    if pose is None or len(places) == 3 or math.dist(pose[:2], run.home[:2]) > NEAR_START:  # how many of them
         return places
     apart = min(math.dist(pose[:2], place[:2]) for place in (run.home, *places))
     return (*places, pose) if apart >= SPACING else places
@@ -364,7 +355,8 @@ def _enough(run: Exploration, seen: Observed, config: ExplorerConfig) -> tuple[R
 def charge_per_metre(run: Exploration, charge: float, config: ExplorerConfig) -> float:
     """Share of the charge that a metre takes: as measured, once enough was used; until then as configured."""
     used = (run.charge or 0.0) - charge
-    measured = used >= LEAST_USED and run.travelled > 0.0
+    # 0.05: share of the charge used from which on the use per metre counts as measured
+    measured = used >= 0.05 and run.travelled > 0.0
     return used / run.travelled if measured else 1.0 / config.full_range
 
 
@@ -377,7 +369,7 @@ def _looking(run: Exploration, seen: Observed) -> Step:
     if answer.target is not None:
         return _go(run, answer.target)
     if answer.known == 0.0:
-        if run.now - run.since > PATIENCE:
+        if run.now - run.since > 30.0:  # seconds to wait for a first map
             return _finish(run, answer.failure or Reason.NO_MAP, answer.text or "no map to explore")
         return replace(run, not_before=run.now + 1.0), ()
     if run.nothing + 1 < CONFIRM:
@@ -541,7 +533,7 @@ def _back_home(run: Exploration, pose: Pose2) -> Step:
 
 
 def _saving(run: Exploration, seen: Observed) -> Step:
-    if seen.saved is None and run.now - run.since < SAVE:
+    if seen.saved is None and run.now - run.since < 30.0:  # seconds to wait for the map to be saved
         return run, ()
     kept = f"map in {seen.saved}" if seen.saved else f"map not saved{seen.save_failure and ': '}{seen.save_failure}"
     severity = Severity.INFO if run.final.exit_code == 0 else Severity.WARNING

@@ -1,7 +1,6 @@
 """The exploring step: changes of the map in, frontiers and the next place to look from out. For workers."""
 
 import math
-from typing import Final
 
 import numpy as np
 
@@ -14,9 +13,6 @@ from monstertruck_planners.explore.look import WallLooks
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import Grid
-
-SAME: Final = 1.0
-"""A frontier this near to the one that is pursued is what became of it, m."""
 
 
 class ExploringStep:
@@ -76,7 +72,8 @@ class ExploringStep:
         """The option that the pursued target is by now; None if little new would be seen there."""
         if current is None or float(view.gains(np.array([current.pose]))[0]) < max(LEAST, current.gain / 4):
             return None
-        near = [option for option in view.options if math.dist(option.frontier.middle, current.frontier) < SAME]
+        # 1.0: a frontier this near to the one that is pursued is what became of it, m
+        near = [option for option in view.options if math.dist(option.frontier.middle, current.frontier) < 1.0]
         return min(near, key=lambda option: math.dist(option.frontier.middle, current.frontier), default=None)
 
 

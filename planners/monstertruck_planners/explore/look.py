@@ -21,14 +21,8 @@ from monstertruck_planners.explore.kernels import shares_seen
 
 FACE: Final = 0.2
 """Faces of walls are counted by squares of this side, m, and eight directions."""
-AWAY: Final = (0.8, 1.0, 0.65)
-"""Distances from which a face is viewed, m; the first that is free is used."""
-ASIDE: Final = (0.0, 0.5, -0.5)
-"""Angles off the normal of a face from which it is viewed, rad."""
 WORTH: Final = 1.5
 """Metres that a look costs besides its path."""
-COMPARED: Final = 60
-"""Faces for which a place is looked for, spread over all."""
 NEAR_BANNED: Final = 0.3
 """A face this near to a banned place is skipped, m."""
 
@@ -74,7 +68,8 @@ class WallLooks:
         if current is not None and np.hypot(*(faces.points[left] - current.frontier).T).min() < FACE / 2:
             return current
         best, least = None, math.inf
-        for i in left[np.unique(np.linspace(0, len(left) - 1, COMPARED).astype(np.intp))]:
+        # 60: faces for which a place is looked for, spread over all
+        for i in left[np.unique(np.linspace(0, len(left) - 1, 60).astype(np.intp))]:
             pose = self._place(view, faces.points[i], faces.normals[i])
             length = None if pose is None else view.path_length_to(pose[:2])
             if pose is None or length is None:
@@ -88,10 +83,10 @@ class WallLooks:
     def _place(self, view: ExplorationView, point: Array, normal: Array) -> Pose2 | None:
         """Where the robot can stand with the face before its camera."""
         mx, my, turn = self._camera.mount
-        for aside in ASIDE:
+        for aside in (0.0, 0.5, -0.5):  # angles off the normal of a face from which it is viewed, rad
             c, s = math.cos(aside), math.sin(aside)
             ahead = np.array((c * normal[0] - s * normal[1], s * normal[0] + c * normal[1]))
-            for away in AWAY:
+            for away in (0.8, 1.0, 0.65):  # distances from which a face is viewed, m; the first that is free is used
                 yaw = math.atan2(-ahead[1], -ahead[0]) - turn
                 c0, s0 = math.cos(yaw), math.sin(yaw)
                 x, y = (point + away * ahead - (c0 * mx - s0 * my, s0 * mx + c0 * my)).tolist()

@@ -35,14 +35,8 @@ from monstertruck_schemas.topics import BATTERY, POSE, SLAM
 
 SOURCE: Final = ServiceName.EXPLORER.value
 """Source of the goals."""
-RATE: Final = 5.0
-"""Checks per second."""
-REPORT: Final = SECOND // 2
-"""Period of reports without a change, ns."""
 CHANGES: Final = ("number", "phase", "outcome", "goals", "failures")
 """Fields of the report whose change is reported at once."""
-LOST_FOR: Final = 1.0
-"""Seconds without a place in the map after which it counts as lost."""
 LOW: Final = frozenset({BatteryLevel.LOW, BatteryLevel.CRITICAL})
 TILES: Final = 4096
 """Tiles kept since the newest whole map."""
@@ -99,8 +93,9 @@ class ExplorerService:
         self._setup, self._config, self._clock, self._place = setup, setup.config, clock, actor
         self._goals, self._save = goals, save
         self._in, self._events = inputs, events
+        # SECOND // 2: period of reports without a change, ns
         self.tasks = TaskServer[ExploreRequest, Pose2, ExplorationState](
-            self, clock, inputs.gate, max_age, state, changes=CHANGES, period=REPORT, others=(inputs.goal,)
+            self, clock, inputs.gate, max_age, state, changes=CHANGES, period=SECOND // 2, others=(inputs.goal,)
         )
         self._run: Exploration | None = None
         self._tiles: deque[Grid] = deque(maxlen=TILES)
@@ -127,7 +122,7 @@ class ExplorerService:
             self._actor, self._tasks, self._fresh = actor, tasks, True
             self.tasks.report()
             ready()
-            schedule = Schedule(self._clock, RATE)
+            schedule = Schedule(self._clock, 5.0)  # checks per second
             try:
                 while True:
                     await schedule.next()
@@ -291,7 +286,8 @@ class ExplorerService:
             return None
         if slam is None or slam.standing not in NO_PLACE or now - slam.received > SLAM.fresh_for() * SECOND:
             self._placed = now
-        return pose if now - self._placed <= LOST_FOR * SECOND else None
+        # 1.0: seconds without a place in the map after which it counts as lost
+        return pose if now - self._placed <= 1.0 * SECOND else None
 
     # Decisions
 

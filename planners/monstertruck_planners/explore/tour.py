@@ -10,11 +10,6 @@ from monstertruck_planners.explore.config import TourConfig
 from monstertruck_planners.explore.exchange import Viewpoint
 from monstertruck_planners.explore.kernels import short_tour, tour_length
 
-FAR = 1e4
-"""Stands for a path that is not known, m."""
-BEGINNINGS = 6
-"""Frontiers that are compared as the first one."""
-
 
 class Tour:
     """The first place of the best tour.
@@ -42,7 +37,7 @@ class Tour:
         chosen = options[0]
         if self._config.rest > 0.0 and len(options) > 2:
             first = np.array([self._first(option, option is still) for option in options])
-            distance = np.minimum(view.path_lengths_between(options), FAR)
+            distance = np.minimum(view.path_lengths_between(options), 1e4)  # stands for a path that is not known, m
             chosen = options[best_beginning(first, distance, self._config.rest)]
         return pursued if chosen is still else chosen.target
 
@@ -61,7 +56,7 @@ def best_beginning(first: Array, distance: Array, rest: float) -> int:
         rest: weight of the tour over the others.
     """
     costs = []
-    for k in range(min(len(first), BEGINNINGS)):
+    for k in range(min(len(first), 6)):  # frontiers that are compared as the first one
         others = np.delete(np.arange(len(first)), k)
         between, begin = distance[np.ix_(others, others)], distance[k, others]
         costs.append(first[k] + rest * tour_length(between, begin, short_tour(between, begin)))

@@ -35,9 +35,6 @@ from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 
 log = logging.getLogger(__name__)
 
-_NEWEST_DECIDES = (2, -2, 1)
-"""Steps of a hit and of a pass, and the limit: one scan changes any cell to either."""
-
 
 class WindowConfig(Schema):
     """The obstacle window."""
@@ -105,7 +102,8 @@ class Window:
         if self._mark == 1:
             self._marks[:] = 0
         odds, marks = self._odds.reshape(-1), self._marks.reshape(-1)
-        trace(odds, marks, count, cells, np.zeros(2, np.int64), self._mark, _NEWEST_DECIDES, np.count_nonzero(near))
+        # (2, -2, 1): steps of a hit and of a pass, and the limit: one scan changes any cell to either
+        trace(odds, marks, count, cells, np.zeros(2, np.int64), self._mark, (2, -2, 1), np.count_nonzero(near))
 
     @property
     def cells(self) -> NDArray[np.bool_]:
@@ -168,8 +166,6 @@ def _moved(cells: NDArray[np.int16], rows: int, columns: int) -> NDArray[np.int1
     return fresh
 
 
-LOOK_BACK: Final = 0.5
-"""Metres of route behind the truck that still count as near."""
 SHORTEST: Final = 0.02
 """A deformed path shorter than this is none, m."""
 
@@ -254,7 +250,8 @@ class DeformStep:
     def _advance(self, here: Array) -> None:
         """Find the truck's place on the route: near the last one, not beyond a cusp that it has not reached."""
         guide, travelled, at = self._guide, self._travelled, self._place
-        reach = np.array([-LOOK_BACK, self._window.config.size / 2])
+        # 0.5: metres of route behind the truck that still count as near
+        reach = np.array([-0.5, self._window.config.size / 2])
         first, last = np.searchsorted(travelled, travelled[at] + reach).tolist()
         cusps = np.flatnonzero(np.diff(guide.directions[first : at + 2]))
         first += int(cusps[-1]) if len(cusps) else 0

@@ -29,8 +29,6 @@ from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY
 
-ONWARD: Final = 0.05
-"""Metres along the route that are progress."""
 RETRY: Final = 10.0
 """Seconds after which a deforming step that did not start is started again."""
 
@@ -211,7 +209,7 @@ class RouteDeformation:
         if answer.finding == "blocked" and not self.held_up:
             self._since = now
         along = float(self._travelled[answer.place])
-        if answer.finding == "free" or along > self._furthest + ONWARD:
+        if answer.finding == "free" or along > self._furthest + 0.05:  # metres along the route that are progress
             self._furthest, self._onward = max(along, self._furthest), now
         self._answer = answer
 

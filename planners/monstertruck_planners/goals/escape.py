@@ -18,8 +18,6 @@ from monstertruck_schemas.plan import Steering
 
 STEP = 0.02
 """Metres between two poses of the path."""
-SHORTEST = 0.04
-"""Least length of an escape motion, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,4 +106,5 @@ def _motion(
 def _before(motion: Escape, contact: int | None) -> Escape | None:
     """A motion up to the pose before a contact; None if that is too short."""
     poses = motion.poses[:contact]
-    return replace(motion, poses=poses) if (len(poses) - 1) * STEP >= SHORTEST else None
+    # 0.04: least length of an escape motion, m
+    return replace(motion, poses=poses) if (len(poses) - 1) * STEP >= 0.04 else None

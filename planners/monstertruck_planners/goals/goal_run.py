@@ -36,8 +36,6 @@ ENDED: Final = frozenset({Reason.GOAL_REACHED, Reason.GOAL_MISSED})
 LEFT: Final = frozenset({Reason.PATH_LOST, Reason.CUSP_MISSED, Reason.UNSEEN_STOP})
 """What it says where it leaves a path, to be planned again from there."""
 
-SHORTEST: Final = 0.01
-"""A route shorter than this is none, m: the truck stands at the goal."""
 
 MISSES: Final = 5
 """Routes that may end short of the goal's tolerance."""
@@ -234,7 +232,8 @@ def _planned(run: GoalRun, observed: Observations, answer: PlanAnswer, config: P
         if run.routes == 0 and answer.reason in REFUSED:
             return _end(run, answer.reason, answer.text)
         return _recover(run, answer.reason, answer.text, config)
-    if answer.length < SHORTEST and not run.via and observed.pose is not None:
+    # 0.01: a route shorter than this is none, m: the truck stands at the goal
+    if answer.length < 0.01 and not run.via and observed.pose is not None:
         return _arrived(replace(run, routes=run.routes + 1), observed, config)
     kind = "the rest of the route before" if answer.kept else "a new route"
     text = f"goal {run.number}: {kind}, {answer.text or f'{answer.length:.2f} m'}"

@@ -26,8 +26,6 @@ from monstertruck_schemas.state import GateState, Grid, Ground, Odometry
 SOURCE: Final = ServiceName.GOALS.value
 AT_REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
-LEASE: Final = 0.25
-"""Lease of the request to stand still, s."""
 STANDSTILL_PATH: Final = 0.01
 """Length of a path that leads nowhere, m."""
 CHECK_STEP: Final = 0.05
@@ -167,7 +165,8 @@ class PathPublisher:
         if self.driving or gate is None or not gate.mode.active:
             return
         requests = self._out.planner_request
-        requests.put(planner_request(requests.next_seq(), gate, now, SOURCE, LEASE, speed=0.0, front=0.0, rear=0.0))
+        # 0.25: lease of the request to stand still, s
+        requests.put(planner_request(requests.next_seq(), gate, now, SOURCE, 0.25, speed=0.0, front=0.0, rear=0.0))
 
     def _publish(
         self,

@@ -40,16 +40,8 @@ log = logging.getLogger(__name__)
 
 Cells = NDArray[np.int8]
 
-SAMPLE: Final = 0.05
-"""Metres between two poses of an answer."""
 SQUARE: Final = 0.05
 """Side of the squares by which obstacles that are not in the map are remembered, m."""
-UNSEEN_ROUNDS: Final = 2
-"""Routes planned around unseen ground, at most; each closes more of it."""
-LOOKOUTS: Final = 4
-"""Places to look at it from to which a route is planned, at most."""
-BACKWARD: Final = 5.0
-"""Weight of a metre backward where those are chosen: the robot comes to them forward."""
 NEARBY: Final = 1.5
 """Distance within which obstacles count when backing out, and are kept, m."""
 
@@ -58,10 +50,6 @@ OVERLAPPING: Final = frozenset({Reason.START_BLOCKED, Reason.GOAL_UNREACHABLE})
 """Why there is no route for a truck that overlaps an obstacle where it stands."""
 ASSUMED_FREE: Final = 0.15
 """Unknown ground within this distance of the truck counts as free, m."""
-MAP_OVERLAP: Final = 1.5
-"""Cells by which the truck may overlap an obstacle of the map where it stands."""
-CLEARANCE: Final = 0.2
-"""Clearance of the poses of an answer is measured up to this, m."""
 
 BEAM_WIDTH: Final = 0.012
 """Difference in bearing up to which a beam shows a place, rad: two steps of a URG-04LX."""
@@ -225,7 +213,8 @@ def standing_free(
     centres = np.column_stack((column + 0.5, row + 0.5)) * resolution
     gap = rectangle_distance(footprint, np.array([pose]), points_placed(centres, origin))[0]
     unknown, touched = cells[row, column] < 0, resolution * math.sqrt(0.5)
-    freed = np.where(unknown, gap < touched + beside, (gap < touched) & (gap > -MAP_OVERLAP * resolution))
+    # 1.5: cells by which the truck may overlap an obstacle of the map where it stands
+    freed = np.where(unknown, gap < touched + beside, (gap < touched) & (gap > -1.5 * resolution))
     kept = cells.copy()
     kept[row[freed], column[freed]] = 0
     return kept
@@ -359,7 +348,7 @@ class PlanningStep:
         if unseen is None or not answer.drivable or not len(met := self._met(unseen, answer)):
             return answer
         x, y = met.mean(axis=0).tolist()
-        for _ in range(UNSEEN_ROUNDS):
+        for _ in range(2):  # routes planned around unseen ground, at most; each closes more of it
             self._closed, self._route = np.vstack((self._closed, met)), None
             answer = self._plan_known(static_map, task)
             if answer.poses is None:
@@ -378,10 +367,11 @@ class PlanningStep:
         lookouts = unseen.lookouts(self._closed, self._route_map.field, self._planner.config.margin)
         if not len(lookouts):
             return None
-        ahead = replace(self._vehicle.reeds_shepp(), reverse_cost=BACKWARD)
+        # 5.0: weight of a metre backward where those are chosen: the robot comes to them forward
+        ahead = replace(self._vehicle.reeds_shepp(), reverse_cost=5.0)
         there = np.array([self._vehicle.reference_pose(pose) for pose in lookouts])
         far = ahead.distance(np.tile(self._vehicle.reference_pose(task.pose), (len(there), 1)), there)
-        for index in np.argsort(far)[:LOOKOUTS].tolist():
+        for index in np.argsort(far)[:4].tolist():  # places to look at it from to which a route is planned, at most
             x, y, yaw = lookouts[index].tolist()
             answer = self._plan_known(static_map, replace(task, goal=(x, y, yaw), via=()))
             self._route = None
@@ -516,7 +506,8 @@ class PlanningStep:
     def _clearance(self, route_map: RouteMap, answer: PlanAnswer) -> Array:
         assert self._setup is not None
         assert answer.poses is not None
-        return route_map.field.clearance(self._setup.footprint, answer.poses, CLEARANCE)
+        # 0.2: clearance of the poses of an answer is measured up to this, m
+        return route_map.field.clearance(self._setup.footprint, answer.poses, 0.2)
 
     def _cusp_clearance(self, route_map: RouteMap, result: RouteResult) -> float:
         """Least clearance of the cusps, m; +inf of a route without any, -inf without a route."""
@@ -557,7 +548,7 @@ class PlanningStep:
 
 def answer_of(path: MotionPath, cost: float, *, kept: bool = False) -> PlanAnswer:
     """A drivable path as an answer: poses of the base every few centimetres."""
-    message = path.message(stamp=0, step=SAMPLE)
+    message = path.message(stamp=0, step=0.05)  # metres between two poses of an answer
     poses, directions = np.array(message.poses).reshape(-1, 3), np.array(message.directions)
     return PlanAnswer(Reason.OK, "", poses, directions, message.steering, path.length, cost, kept=kept)
 

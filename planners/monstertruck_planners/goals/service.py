@@ -57,16 +57,6 @@ REPORT: Final = SECOND // 2
 """Period of reports without a change, ns."""
 CHANGES: Final = ("phase", "outcome", "number", "routes", "recoveries")
 """Fields of the report whose change is reported at once."""
-FIRST_ROUTE: Final = 4.0
-"""Seconds a remote call waits for the first route; the goal goes on after that."""
-SEEN: Final = 40
-"""Scans kept for the next plan, the newest."""
-SEEN_STEP: Final = 0.25
-"""Distance between two of them, m."""
-SEEN_TURN: Final = 0.4
-"""Turn between two of them, rad."""
-TRAIL: Final = 4 * SECOND
-"""Time for which poses are kept, to place the ground seen, which is surveyed for a second, ns."""
 JUMP: Final = 0.5
 """Distance between the poses of two ticks that counts as a jump, m: the kept scans are dropped."""
 
@@ -135,7 +125,7 @@ class GoalService:
         self._sent_ground: Ground | None = None
         self._scanned: tuple[LaserScan, Odometry] | None = None
         self._points: Array = np.empty((0, 2))
-        self._seen: deque[tuple[Pose2, Array]] = deque(maxlen=SEEN)
+        self._seen: deque[tuple[Pose2, Array]] = deque(maxlen=40)  # scans kept for the next plan, the newest
         """Poses and returns in base of scans since the last plan."""
         self._trail: deque[tuple[int, Pose2]] = deque()
         """Times (ns) and poses of the last ticks."""
@@ -332,7 +322,8 @@ class GoalService:
         pose = None if odometry is None else pose_of(odometry)
         if odometry is not None and pose is not None:
             self._keep_pose(odometry.stamp, pose)
-        while self._trail and now - self._trail[0][0] > TRAIL:
+        # 4 * SECOND: time for which poses are kept, to place the ground seen, which is surveyed for a second, ns
+        while self._trail and now - self._trail[0][0] > 4 * SECOND:
             self._trail.popleft()
         if pose is None or self._before is None or math.dist(pose[:2], self._before[:2]) > JUMP:
             self._seen.clear()
@@ -479,7 +470,8 @@ class GoalService:
         async def goal(payload: dict[str, Any]) -> dict[str, Any]:
             number = self.tasks.take(parse_request(GoalRequest, payload))
             try:
-                async with self._clock.deadline(FIRST_ROUTE):
+                # 4.0: seconds a remote call waits for the first route; the goal goes on after that
+                async with self._clock.deadline(4.0):
                     state = await self.settled(number)
             except TimeoutError:
                 return {"number": number, "planned": False}
@@ -499,7 +491,9 @@ def _estopped(gate: GateState | None) -> bool:
 
 def _moved_on(before: Pose2, pose: Pose2) -> bool:
     turned = abs(math.remainder(pose[2] - before[2], math.tau))
-    return math.dist(before[:2], pose[:2]) > SEEN_STEP or turned > SEEN_TURN
+    # 0.25: distance between two of them, m
+    # 0.4: turn between two of them, rad
+    return math.dist(before[:2], pose[:2]) > 0.25 or turned > 0.4
 
 
 async def _known(answer: PlanAnswer) -> PlanAnswer:

@@ -17,17 +17,10 @@ from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_rel
 from monstertruck_planners.collision import DistanceField, Footprint, rectangle_distance
 from monstertruck_planners.goals.exchange import PlanAnswer, SeenGround
 
-NEAR: Final = 0.6
-"""Unseen ground within this distance of what a route would cover in reverse is closed to the next one, m: a truck's
-length, as a route beside it is no better."""
 SOON: Final = 5.0
 """Time before a route begins, s."""
 PACE: Final = 0.1
 """Mean speed along a route by which it is estimated when it comes to some ground, m/s."""
-STRIDE: Final = 0.1
-"""Distance (m) and turn (rad) together between two poses from which a route looks round."""
-RADII: Final = (0.7, 1.1, 1.5)
-"""Distances from unseen ground at which places to look at it are tried, m."""
 DIRECTIONS: Final = 12
 """Directions in which they lie, and into which the robot faces there."""
 SHOWN: Final = 0.6
@@ -81,9 +74,12 @@ class Unseen:
             gaps = rectangle_distance(self.footprint, pose[None], places)[0]
             unseen = left < SOON + along / PACE
             if direction < 0 and (unseen & (gaps < -self.footprint.padding)).any():
-                return np.asarray(places[unseen & (gaps < NEAR)])
+                # 0.6: unseen ground within this distance of what a route would cover in reverse is closed to the next
+                # one, m: a truck's length, as a route beside it is no better
+                return np.asarray(places[unseen & (gaps < 0.6)])
             known = gaps < (BESIDE if direction > 0 else 0.0)
-            if change - looked >= STRIDE:
+            # 0.1: distance (m) and turn (rad) together between two poses from which a route looks round
+            if change - looked >= 0.1:
                 looked = change
                 known |= self._visible(places, pose, obstacles)
             places, left = places[~known], left[~known]
@@ -99,8 +95,9 @@ class Unseen:
         """
         around = np.arange(DIRECTIONS) * (math.tau / DIRECTIONS)
         x, y = places.mean(axis=0).tolist()
+        # (0.7, 1.1, 1.5): distances from unseen ground at which places to look at it are tried, m
         poses = np.array(
-            [(x + r * math.cos(a), y + r * math.sin(a), yaw) for r in RADII for a in around for yaw in around]
+            [(x + r * math.cos(a), y + r * math.sin(a), yaw) for r in (0.7, 1.1, 1.5) for a in around for yaw in around]
         )
         poses = poses[obstacles.free(self.footprint, poses, margin)]
         shown = [self._visible(places, pose, obstacles).mean() >= SHOWN for pose in poses]

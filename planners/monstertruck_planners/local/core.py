@@ -36,15 +36,6 @@ from monstertruck_schemas.reasons import Reason
 ESCAPE_STEP = 0.01
 """Distance between two checks of an escape motion, m."""
 
-MAX_ESCAPE = 0.3
-"""Longest escape motion, m."""
-
-MIN_CLEARANCE = -0.05
-"""A truck that overlaps an obstacle by more has no escape motion, m."""
-
-CLEARANCE_ERROR = 2e-3
-"""Clearances that differ by less are equal, m."""
-
 
 PATH_CUSP_REACHED = 0.02
 """The same for a cusp of its path, m."""
@@ -54,12 +45,6 @@ STANDOFF = 0.5
 
 GOAL_HEADINGS = (0.0, 1.0, -1.0)
 """Headings tried at the goal of a local search, relative to that of the route, rad."""
-
-MAX_FAILURES = 5
-"""Searches without a result before another heading is tried."""
-
-PATH_STEP = 0.05
-"""Sampling of a path to find the nearest pose on it, m."""
 
 
 @njit(cache=True)
@@ -81,15 +66,15 @@ def escape_motion(
         A motion segment, shape (1, 3), or none, shape (0, 3).
     """
     least = clearance(field, cover, pose[0], pose[1], pose[2])
-    best, shortest = -1, MAX_ESCAPE + ESCAPE_STEP
-    if least >= MIN_CLEARANCE:
+    best, shortest = -1, 0.3 + ESCAPE_STEP  # longest escape motion, m
+    if least >= -0.05:  # a truck that overlaps an obstacle by more has no escape motion, m
         for i in range(len(primitives)):
             sign = 1.0 if primitives[i, 0] > 0.0 else -1.0
             known, travelled = least, ESCAPE_STEP
             while travelled < shortest - 0.5 * ESCAPE_STEP:
                 x, y, yaw = advance(pose[0], pose[1], pose[2], sign * travelled, primitives[i, 1], primitives[i, 2])
                 present = clearance(field, cover, x, y, yaw)
-                if present < known - CLEARANCE_ERROR:
+                if present < known - 2e-3:  # clearances that differ by less are equal, m
                     break
                 known = max(known, present)
                 if safe_distance(field, footprint, margin, x, y, yaw) >= 0.0:
@@ -237,7 +222,8 @@ class LocalPlannerCore:
         last = int(inside[-1]) if len(inside) else len(band.poses) - 1
         goal = band.poses[last].copy()
         if last < len(band.poses) - 1 or not local.final:
-            goal[2] += GOAL_HEADINGS[failed // MAX_FAILURES % len(GOAL_HEADINGS)]
+            # 5: searches without a result before another heading is tried
+            goal[2] += GOAL_HEADINGS[failed // 5 % len(GOAL_HEADINGS)]
         path, reason = self._search_to(obstacles, pose, goal)
         if path is None:
             return None, None, reason
@@ -335,7 +321,7 @@ def remaining_band(band: PosePath, pose: Array) -> PosePath:
 
 def remaining_path(path: MotionPath, pose: Array) -> tuple[MotionPath, float]:
     """The rest of a path from its pose nearest to the truck on, and the distance of both, see ``pose_distance``."""
-    samples = path.sample(PATH_STEP)
+    samples = path.sample(0.05)  # sampling of a path to find the nearest pose on it, m
     best, begin, far = math.inf, 0.0, math.inf
     first = 0
     for cut in [*np.flatnonzero(np.diff(samples.direction)).tolist(), len(samples.travelled) - 1]:

@@ -26,9 +26,6 @@ from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import MotionPath, joined, moved
 from monstertruck_schemas.reasons import Reason
 
-INSCRIBED = 0.17
-"""Half the truck's width, m."""
-
 AUTHORS = BandConfig(overlap=0.3, significant=0.1, largest=0.276)
 """Parameters of the author's robot."""
 
@@ -54,7 +51,8 @@ class PublishedPlanner:
         states = Vehicle(DiscFootprint((0.0,), self.config.inflation), self.config.radius, 0.0, vehicle.steering)
         self._states = LocalPlannerCore(states, config, search)
         self._reeds_shepp = states.reeds_shepp()
-        self._band = LocalPlannerCore(replace(states, footprint=DiscFootprint((0.0,), INSCRIBED)), config)
+        # 0.17: half the truck's width, m
+        self._band = LocalPlannerCore(replace(states, footprint=DiscFootprint((0.0,), 0.17)), config)
         self._band_parameters = band_parameters(AUTHORS, self._band.cover)._replace(
             scale=0.5, reach=0.0, spacing=math.inf, published=True
         )

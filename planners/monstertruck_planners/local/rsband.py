@@ -36,15 +36,6 @@ from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath, joined
 from monstertruck_schemas.reasons import Reason
 
-SUB_GOAL_FACTORS = (1.0, 1.5, 2.0, 3.0)
-"""Sub-goals tried, as factors on their distance."""
-
-MIN_CUSP_REST = 0.05
-"""A path to a cusp is replaced when no more than this is left of it, m."""
-
-MAX_DETOUR = 1.6
-"""A motion between two band poses is a detour if it is longer than this factor on their distance."""
-
 
 class RsbandPlanner:
     """The local planner of kind ``rsband``.
@@ -87,7 +78,8 @@ class RsbandPlanner:
         if far > self.config.off_path or not len(rest.segments):
             return False
         if to_end or to_cusp:
-            return rest.length > (PATH_CUSP_REACHED if to_end else MIN_CUSP_REST)
+            # 0.05: a path to a cusp is replaced when no more than this is left of it, m
+            return rest.length > (PATH_CUSP_REACHED if to_end else 0.05)
         return rest.length > self.config.renew * self.config.sub_goal
 
     def _new_path(
@@ -140,7 +132,7 @@ class RsbandPlanner:
         )
         found = None
         tried = -1
-        for factor in SUB_GOAL_FACTORS:
+        for factor in (1.0, 1.5, 2.0, 3.0):  # sub-goals tried, as factors on their distance
             last = min(int(np.searchsorted(travelled, factor * self.config.sub_goal)), end - 1)
             if last == tried:
                 break
@@ -183,7 +175,8 @@ class RsbandPlanner:
 
     @staticmethod
     def _is_detour(path: MotionPath, at: Array) -> bool:
-        return path.length > MAX_DETOUR * float(pose_distance(path.end, at))
+        # 1.6: a motion between two band poses is a detour if it is longer than this factor on their distance
+        return path.length > 1.6 * float(pose_distance(path.end, at))
 
     def _via_indices(self, band: PosePath) -> Iterator[int]:
         """Indices of the poses to be joined: one every ``spacing`` metres, all cusps, and the last one."""

@@ -48,9 +48,6 @@ LEAST_STEP = 0.01
 LEAST_TIME = 0.02
 """Shortest time of an interval, s."""
 
-FIXED = 1.0e9
-"""Added to the diagonal for fixed unknowns."""
-
 
 class TebParameters(NamedTuple):
     """Vehicle, limits and weights."""
@@ -306,7 +303,7 @@ def optimise(
             matrix[i, 0] += damping * (matrix[i, 0] + 1.0)
         for i in range(size):
             if i < 4 or size - 4 <= i < size - 1:
-                matrix[i, 0] += FIXED
+                matrix[i, 0] += 1.0e9  # added to the diagonal for fixed unknowns
                 step[i] = 0.0
         if not _solve(matrix, step):
             damping *= 10.0
@@ -328,15 +325,6 @@ def optimise(
             _assemble(field, cover, parameters, band, direction, system)
     return 0.5 * total, gained
 
-
-AXLE_LIMIT = 0.4
-"""Axle angle at the least turning radius, for the steering rate of trucks that cannot crab, rad."""
-
-BEFORE_CUSP = 0.25
-"""Nearer than this to a cusp the path stays as it is, m: a band could move its cusp away forever."""
-
-BAND_END_REACHED = 0.05
-"""A path that ends further from its band's end is only a part of it, m."""
 
 STEERING_SHARE = 0.9
 """Share of the steering that the least squares may use, as a reserve for their remaining violations."""
@@ -381,7 +369,8 @@ class TebPlanner:
             local = replace(local, band=way or local.band)
         done = local.final and ends_at(path, route.poses[-1])
         end = local.band.poses[-1]
-        whole = math.hypot(*(path.end - end)[:2]) < BAND_END_REACHED
+        # 0.05: a path that ends further from its band's end is only a part of it, m
+        whole = math.hypot(*(path.end - end)[:2]) < 0.05
         band = PosePath.from_motion(path, self.config.spacing) if whole else local.band
         after = replace(state, band=band, path=path, failed=0)
         return LocalPlan(Reason.OK, after, path, done, statistics=statistics)
@@ -440,7 +429,8 @@ def teb_parameters(vehicle: Vehicle, config: TebConfig) -> TebParameters:
         rate = config.steering_rate
     else:
         l_f, l_r, front, rear = vehicle.radius, 0.0, 1.0, 0.0
-        rate = config.steering_rate / math.tan(AXLE_LIMIT)
+        # 0.4: axle angle at the least turning radius, for the steering rate of trucks that cannot crab, rad
+        rate = config.steering_rate / math.tan(0.4)
     return TebParameters(
         l_f, l_r, STEERING_SHARE * front, STEERING_SHARE * rear, rate,
         config.speed, config.reverse_speed, config.acceleration,
@@ -483,7 +473,8 @@ def turns_soon(path: MotionPath) -> bool:
     """Whether the path changes direction soon."""
     signs = np.sign(path.segments[:, 0])
     change = np.flatnonzero(np.diff(signs))
-    return bool(len(change)) and float(np.abs(path.segments[: change[0] + 1, 0]).sum()) < BEFORE_CUSP
+    # 0.25: nearer than this to a cusp the path stays as it is, m: a band could move its cusp away forever
+    return bool(len(change)) and float(np.abs(path.segments[: change[0] + 1, 0]).sum()) < 0.25
 
 
 def resampled(path: PosePath, spacing: float) -> PosePath:

@@ -73,23 +73,13 @@ OWN: Final = frozenset({SOURCE, ServiceName.EXPLORER.value})
 """Sources of the goals that are pursued for a mission, or for an exploration."""
 RATE: Final = 5.0
 """Checks per second."""
-REPORT: Final = SECOND // 2
-"""Period of reports without a change, ns."""
 CHANGES: Final = ("number", "running", "step", "attempt", "outcome", "resumable")
 """Fields of the report whose change is reported at once."""
-STEP: Final = 0.5
-"""Metres after which it is noted again where the robot is."""
-MOVED: Final = 1.0
-"""Metres from where it was interrupted at which a robot counts as moved, or its odometry as begun again."""
-MOST_BYTES: Final = 1_000_000
-"""Size of the saved progress at most."""
 PASSING: Final = frozenset(
     {Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.POSE_LOST, Reason.LEASE_EXPIRED, Reason.BUSY}
 )
 """Refusals that pass: it is requested again. Busy is the robot with the step before: after a goal it brakes along a
 path, after an exploration the map is saved."""
-AGAIN: Final = 1.0
-"""Seconds until it is requested again."""
 PATIENCE: Final = 180.0
 """Seconds for which it is requested again; a planner compiles for a minute or two after an installation."""
 SILENT: Final = 10.0
@@ -160,7 +150,7 @@ class MissionService:
             max_age,
             state,
             changes=CHANGES,
-            period=REPORT,
+            period=SECOND // 2,  # period of reports without a change, ns
             others=(inputs.goal, inputs.behaviour, inputs.explore),
             own=OWN,
         )
@@ -284,7 +274,8 @@ class MissionService:
             raise RequestRefusedError(Reason.NO_MAP, "no pose in a map yet")
         require_place(None if self._in.slam is None else self._in.slam.latest)
         if resumed is not None:
-            if not self._localised and not request.moved and (away := resumed.away(pose)) > MOVED:
+            # 1.0: metres from where it was interrupted at which a robot counts as moved, or its odometry as begun again
+            if not self._localised and not request.moved and (away := resumed.away(pose)) > 1.0:
                 text = f"its pose is {away:.1f} m from where {resumed.mission.name} was interrupted"
                 hint = "if it was put there, `--moved` goes on; else its odometry began anew (`odometry.start`)"
                 raise RequestRefusedError(Reason.POSE_LOST, f"{text}: {hint}")
@@ -537,7 +528,7 @@ class MissionService:
                 if refused:  # the first time it may only brake, which is nothing to tell
                     self._waits = str(error)
                 refused = True
-            await self._clock.sleep(AGAIN)
+            await self._clock.sleep(1.0)  # seconds until it is requested again
 
     def _wait_for_resume(self) -> None:
         """Have the step's limit not run while its goal is paused; called with every check."""
@@ -570,7 +561,8 @@ class MissionService:
         with reading(str(file), expected):
             if file is None or not file.exists():
                 return None
-            return SavedProgress.model_validate_json(contents(file, expected, MOST_BYTES))
+            # 1_000_000: size of the saved progress at most
+            return SavedProgress.model_validate_json(contents(file, expected, 1_000_000))
 
     async def _say_damaged(self, why: str) -> None:
         if (file := self._file) is not None:
@@ -587,7 +579,8 @@ class MissionService:
         """Keep where the robot is while a mission runs."""
         pose, noted, progress = self._pose(), self._noted, self._progress
         running = progress is not None and self._end is None
-        if progress is None or not running or pose is None or noted is None or math.dist(pose[:2], noted[:2]) < STEP:
+        # 0.5: metres after which it is noted again where the robot is
+        if progress is None or not running or pose is None or noted is None or math.dist(pose[:2], noted[:2]) < 0.5:
             return
         await self._save(progress)
 

@@ -224,9 +224,6 @@ class Vehicle:
 WARM_UP_CLEARANCE = 0.02
 """Distance from the start of the last route of ``warm_up`` to the edge of the map, m: less than the margin."""
 
-WARM_UP_EFFORT = 6000
-"""See ``GoalConfig.effort``."""
-
 
 class Budget:
     """Limit of a planner: seconds, or an amount of work.
@@ -385,7 +382,7 @@ def warm_up(planner: RoutePlanner) -> None:
     The second one is the first with a wall whose gap is too narrow. The last route leaves the edge of the map.
     """
     margin = max(planner.config.margin, 2 * WARM_UP_CLEARANCE)
-    config = planner.config.model_copy(update={"effort": WARM_UP_EFFORT, "margin": margin})
+    config = planner.config.model_copy(update={"effort": 6000, "margin": margin})  # see ``GoalConfig.effort``
     planner = make_planner(planner.vehicle, config)
     ends = (2.0, 4.0, 0.0), (6.0, 4.0, 1.0)
     cells = np.zeros((80, 80), np.int8)

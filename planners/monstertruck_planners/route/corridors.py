@@ -20,12 +20,6 @@ from monstertruck_planners.route.heuristic import NEIGHBOURS, UNREACHED
 HEADINGS = 72
 """Checked in half a turn."""
 
-STRIDE = 29
-"""Step between two headings tried in turn: neighbouring headings fit or do not fit alike."""
-
-SAMPLE = 0.0125
-"""Distance between two positions checked, m; middles and borders of the grid's cells are among them."""
-
 
 @njit(cache=True)
 def footprint_fits(field: FieldData, footprint: FootprintData, margin: float, x: float, y: float) -> bool:
@@ -33,7 +27,8 @@ def footprint_fits(field: FieldData, footprint: FootprintData, margin: float, x:
     symmetric = abs(footprint.centre) < 1e-9 and abs(footprint.discs.sum()) < 1e-9
     count = (1 if symmetric else 2) * HEADINGS
     for k in range(count):
-        if safe_distance(field, footprint, margin, x, y, (k * STRIDE % count) * pi / HEADINGS) >= 0.0:
+        # 29: step between two headings tried in turn: neighbouring headings fit or do not fit alike
+        if safe_distance(field, footprint, margin, x, y, (k * 29 % count) * pi / HEADINGS) >= 0.0:
             return True
     return False
 
@@ -50,7 +45,8 @@ def _fits_in_cell(
         for c in range(column * factor, last_column):
             if field.distance[r, c] >= wide:
                 return True
-    pieces = 2 * ceil(0.5 * field.resolution / SAMPLE)
+    # 0.0125: distance between two positions checked, m; middles and borders of the grid's cells are among them
+    pieces = 2 * ceil(0.5 * field.resolution / 0.0125)
     places = pieces + 1
     for r in range(row * factor, last_row):
         for c in range(column * factor, last_column):

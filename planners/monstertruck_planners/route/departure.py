@@ -44,41 +44,14 @@ LEVEL: Final = 0.0005
 """Clearances are compared in whole steps of this, m."""
 SPARE: Final = 0.002
 """Kept beyond the margin where a departure ends, m: the first motion of a search may come a little nearer."""
-CONFINED: Final = 0.03
-"""A start with less than this beyond the margin may be left by no motion of a search, m: the end of a body that turns
-comes that much nearer to a wall at its side."""
 CHECK: Final = 0.004
 """Distance between two poses checked, m."""
 BRANCH: Final = 0.2
 """Distance between two poses of an arc from which further arcs are tried, m."""
 SHORTEST: Final = 0.02
 """Least length of an arc, m: less is not driven exactly."""
-LONGEST: Final = 1.0
-"""Greatest length of an arc, m."""
-FURTHEST: Final = 3.0
-"""Greatest length of a departure, m."""
 CURVATURES: Final = (0.0, *(0.5**k for k in range(7)))
 """Of the arcs tried, as shares of the greatest one: the wider a body turns, the less near its end comes to a wall."""
-TRANSLATIONS: Final = (1.0, 0.5)
-"""Angles of the translations tried, as shares of the greatest one."""
-CUSP: Final = 0.1
-"""Cost of a change of direction, m."""
-SET_OFF: Final = 0.15
-"""Length for which one of the arcs from the end of a departure must be free, m: else a search would end there."""
-GAIN: Final = 3.0
-"""Metres to drive for a metre of clearance, about: translations of 0.33 rad."""
-DIPS: Final = (0.0, 0.125, 0.5, 1.0)
-"""Shares by which the clearance may fall again during a departure, tried in turn, each with half of the budget left."""
-ARC: Final = 8
-"""Work per arc of a departure, in checked poses."""
-NODE: Final = 60
-"""Checked poses that take as long as a node of a search, the unit of a planner's budget."""
-ENOUGH: Final = 20
-"""Departures from whose ends a route is searched, at most."""
-DEARER: Final = 0.5
-"""A departure is of no use if it costs so much more than the cheapest, m."""
-TRIES: Final = 3
-"""Departures from which a route is looked for."""
 PLACE: Final = np.array([0.01, 0.01, 0.03])
 """Poses nearer than this to each other are one, m, m, rad."""
 
@@ -122,7 +95,7 @@ def _drive_off(
     """
     sign = 1.0 if segment[0] > 0.0 else -1.0
     free, known = 0.0, level
-    for k in range(1, int(LONGEST / CHECK) + 1):
+    for k in range(1, int(1.0 / CHECK) + 1):  # greatest length of an arc, m
         x, y, yaw = advance(pose[0], pose[1], pose[2], sign * k * CHECK, segment[1], segment[2])
         now = _level(field, footprint, x, y, yaw, known, max(best - dip, 0), wanted)
         if now < 0 or (sign < 0.0 and unseen_distance(field, footprint, x, y, yaw) < 0.0):
@@ -227,7 +200,9 @@ def departures(
     if level < 0:
         return Departures([], exhausted=True)
     straight, exhausted, end = list[Departure](), True, 0.5 * (budget.remaining() + reserve)
-    dips = list(dict.fromkeys(math.ceil(level * share) for share in DIPS))
+    # (0.0, 0.125, 0.5, 1.0): shares by which the clearance may fall again during a departure, tried in turn, each with
+    # half of the budget left
+    dips = list(dict.fromkeys(math.ceil(level * share) for share in (0.0, 0.125, 0.5, 1.0)))
     for dip in dips:
         until = end if dip == dips[-1] else 0.5 * (budget.remaining() + end)
         result = _search(field, footprint, vehicle, _Node(start, level, level, 0.0, ()), dip, config, budget, until)
@@ -246,7 +221,8 @@ def _arcs(vehicle: Vehicle) -> list[Array]:
     """Segments of one metre, forward and backward: lines, arcs to both sides, translations to both sides."""
     shapes = [(share * side / vehicle.radius, 0.0) for share in CURVATURES for side in ((1, -1) if share else (1,))]
     if vehicle.crab_angle > 0.0:
-        shapes += [(0.0, share * side * vehicle.crab_angle) for share in TRANSLATIONS for side in (1, -1)]
+        # (1.0, 0.5): angles of the translations tried, as shares of the greatest one
+        shapes += [(0.0, share * side * vehicle.crab_angle) for share in (1.0, 0.5) for side in (1, -1)]
     return [np.array([sign, *shape]) for shape in shapes for sign in (1.0, -1.0)]
 
 
@@ -263,12 +239,13 @@ def _search(
     number = count()
 
     def wait(node: _Node) -> None:
-        heappush(waiting, (node.cost + GAIN * LEVEL * (wanted - node.level), next(number), node))
+        # 3.0: metres to drive for a metre of clearance, about: translations of 0.33 rad
+        heappush(waiting, (node.cost + 3.0 * LEVEL * (wanted - node.level), next(number), node))
 
     wait(start)
     seen: set[tuple[int, ...]] = set()
     found: list[Departure] = []
-    enough, exhausted = ENOUGH, True
+    enough, exhausted = 20, True  # departures from whose ends a route is searched, at most
     while waiting and enough > 0:
         _, _, node = heappop(waiting)
         place = tuple(np.round(node.pose / PLACE).astype(int).tolist())
@@ -281,7 +258,7 @@ def _search(
         checked = 0
         for arc in arcs:
             length, level, best = _drive_off(field, footprint, node.pose, arc, node.level, node.best, dip, wanted)
-            checked += ARC + round(length / CHECK)
+            checked += 8 + round(length / CHECK)  # work per arc of a departure, in checked poses
             if length < SHORTEST:
                 continue
             for travelled in np.arange(BRANCH, length - CHECK / 2, BRANCH).tolist():
@@ -292,10 +269,12 @@ def _search(
                 found.append(Departure(np.array(after.segments), after.pose, after.cost, turns))
             if turns:
                 enough -= 1
-                most = min(most, after.cost + DEARER)
+                # 0.5: a departure is of no use if it costs so much more than the cheapest, m
+                most = min(most, after.cost + 0.5)
             else:
                 wait(after)
-        budget.work += checked // NODE
+        # 60: checked poses that take as long as a node of a search, the unit of a planner's budget
+        budget.work += checked // 60
     order = sorted(found, key=lambda departure: (not departure.turns, departure.cost))
     return Departures(order, exhausted=exhausted)
 
@@ -304,8 +283,9 @@ def _sets_off(field: FieldData, footprint: FootprintData, arcs: list[Array], pos
     """Whether a search with that margin may begin with one of some arcs."""
     x, y, yaw = pose.tolist()
     keep = margin + CHECK_MARGIN
+    # 0.15: length for which one of the arcs from the end of a departure must be free, m: else a search would end there
     return any(
-        segment_free(field, footprint, keep, CHECK_STEP, x, y, yaw, SET_OFF * sign, curvature, sideslip)
+        segment_free(field, footprint, keep, CHECK_STEP, x, y, yaw, 0.15 * sign, curvature, sideslip)
         for sign, curvature, sideslip in (arc.tolist() for arc in arcs)
     )
 
@@ -314,7 +294,7 @@ def _after(node: _Node, arc: Array, travelled: float, level: int, best: int, rev
     """The node at the end of an arc of so many metres."""
     segment = (float(arc[0]) * travelled, float(arc[1]), float(arc[2]))
     cusp = bool(node.segments) and node.segments[-1][0] * segment[0] < 0.0
-    cost = node.cost + travelled * (1.0 if arc[0] > 0.0 else reverse) + CUSP * cusp
+    cost = node.cost + travelled * (1.0 if arc[0] > 0.0 else reverse) + 0.1 * cusp  # cost of a change of direction, m
     x, y, yaw = node.pose.tolist()
     pose = np.array(advance(x, y, yaw, segment[0], segment[1], segment[2]))
     return _Node(pose, level, best, cost, (*node.segments, segment))
@@ -383,7 +363,9 @@ def _ends(
 
 def needs_departure(route_map: RouteMap, vehicle: Vehicle, start: Array, margin: float) -> bool:
     """Whether routes from a start may begin with a departure: elsewhere they keep the margin all the way."""
-    return not _room(route_map, vehicle, start, margin + CONFINED)
+    # 0.03: a start with less than this beyond the margin may be left by no motion of a search, m: the end of a body
+    # that turns comes that much nearer to a wall at its side
+    return not _room(route_map, vehicle, start, margin + 0.03)
 
 
 @dataclass(frozen=True, slots=True)
@@ -411,7 +393,7 @@ def leaving(
     field, footprint = route_map.field.data(), vehicle.footprint.data()
     start, segments = path.copied()
     kept, length = math.ceil((margin + CHECK_MARGIN) / LEVEL), 0.0
-    while length < FURTHEST:
+    while length < 3.0:  # greatest length of a departure, m
         length, fall = _to_room(field, footprint, start, segments, length, kept)
         if length < 0.0:
             break
@@ -445,4 +427,4 @@ def _best(
     for departure in sorted(found, key=lambda departure: (not departure.turns, total(departure))):
         if all((np.abs(departure.end - other.end) > 2 * PLACE).any() for other in chosen):
             chosen.append(departure)
-    return chosen[:TRIES]
+    return chosen[:3]  # departures from which a route is looked for

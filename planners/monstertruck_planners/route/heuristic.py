@@ -32,8 +32,6 @@ BUCKETS = 2048
 NEIGHBOURS = np.array([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]], dtype=np.int64)
 """Column and row of each neighbour, counter-clockwise."""
 
-MAX_CELL_COST = 7.0
-"""Greatest cost of a cell as a factor on UNIT: keeps within the buckets."""
 
 COARSE_CELL = 0.1
 """Cells are joined up to about this size, m."""
@@ -48,8 +46,6 @@ TABLE_HEADINGS = 36
 OVERRUN = 1.3
 """The cost to go is computed where the path from start to goal over a cell costs at most this times the shortest."""
 
-OVERRUN_CELLS = 80
-"""Added to that, in cells."""
 
 USED, WAITING, LEVEL, LIMIT = 0, 1, 2, 3
 """Fields of a spread's state: entries used, entries waiting, estimate it has come to, greatest estimate regarded."""
@@ -129,7 +125,8 @@ def fill_cell_costs(
             cost = 4.0
             if best >= rule.side:
                 cost = 1.0 + 0.5 * max(rule.wide - float(best), 0.0) / (rule.wide - rule.side)
-            result[row, column] = int(UNIT * min(cost * (1.0 + extra), MAX_CELL_COST))
+            # 7.0: greatest cost of a cell as a factor on UNIT: keeps within the buckets
+            result[row, column] = int(UNIT * min(cost * (1.0 + extra), 7.0))
 
 
 def cost_to_go(
@@ -159,7 +156,7 @@ def cost_to_go(
     to_go.cell_of[0], to_go.following[0], to_go.head[bucket] = goal[0] * columns + goal[1], -1, 0
     shortest = cost_at(to_go, *start)
     if shortest < UNREACHED and overrun < inf:
-        to_go.state[LIMIT] = int(overrun * shortest) + OVERRUN_CELLS * UNIT
+        to_go.state[LIMIT] = int(overrun * shortest) + 80 * UNIT  # added to that, in cells
     return to_go
 
 

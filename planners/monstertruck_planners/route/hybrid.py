@@ -72,8 +72,6 @@ EXPANSION = -1
 """Action of a node reached by an analytic expansion; others are numbers of primitives, and after these of the arcs of
 least radius among them, driven as far as they are free."""
 
-LONGEST_STROKE = 1.0
-"""See ``VehicleMotions.strokes``, turning radii."""
 
 MAX_NODES = 400_000
 """Nodes of one search at most."""
@@ -84,63 +82,19 @@ MAX_TABLE_CELLS = 1 << 26
 BATCH = 1000
 """Smoothing trials between two checks of the budget."""
 
-PROMISING = 1.1
-"""Factor on the cost of the best route up to which another route is smoothed further."""
-
-MAX_IDLE_ROUNDS = 12
-"""Rounds of improvement without gain after which smoothing ends."""
-
-FINE_SHIFTS = (0.25, 0.1, 0.03, 0.01)
-"""Shares of a stretch by which poses move in the final smoothing."""
-
-FINAL_SHARE = 0.2
-"""Share of the budget for the final smoothing without and then with translations."""
-
-CUSPS_SHARE = 0.3
-"""Share of the budget kept when routes with fewer cusps are searched."""
-
-PLAIN_SHARE = 0.5
-"""Share of the budget kept when a route without translations is searched and one with them is known."""
-
-ALTERNATIVE_DISTANCE = 2.5
-"""Least distance of an alternative from all known routes, at one place at least, turning radii."""
-
-ALTERNATIVE_LENGTH = 1.15
-"""Factor on the length of the shortest path up to which alternatives are tried."""
 
 FIRST_NODES = 512
 """Nodes of the coarse search before gaps are measured and the fine search alternates with it."""
 
-GROWTH = 2
-"""Growth of the nodes expanded per turn, from one round to the next."""
-
-NARROW = 0.06
-"""A cell nearer to obstacles than this plus half the footprint's width may belong to a narrow gap, m."""
 
 GAP_ERROR = 0.01
 """Error of the positions and headings checked against the best ones, m."""
 
-GAP_PLAY = 0.005
-"""Width needed in a gap beyond the margin on both sides, m: with less no search finds a path through it."""
-
-GAP_ROUNDS = 30
-"""Paths checked for narrow gaps, at most."""
-
-GAP_CORRIDOR = 0.15
-"""Width checked on both sides of a path with a narrow gap, m."""
 
 NO_SEGMENTS = np.empty((0, 3))
 
 NO_COSTS = CostLayer(np.zeros((0, 0), np.float32), 0.0, 1.0, 0.0)
 
-MARGIN_STEP = 0.005
-"""Step from one margin tried to the next, m."""
-
-MARGIN_SHARE = 0.5
-"""Share of the remaining budget for the searches with narrower margins."""
-
-NARROW_COST = 1.0
-"""Clearance cost of routes with a narrower margin: they use it only where they have to, m."""
 
 TRY_NARROWER = (Reason.START_BLOCKED, Reason.GOAL_BLOCKED, Reason.GOAL_UNREACHABLE, Reason.ROUTE_TIMEOUT)
 
@@ -303,7 +257,8 @@ def _write_primitive(
     if action >= count:
         length = 0.0
         if abs(out[1]) * model.radius > 0.99:
-            length = free_length(field, footprint, model, pose, out, LONGEST_STROKE * model.radius)
+            # 1.0: see ``VehicleMotions.strokes``, turning radii
+            length = free_length(field, footprint, model, pose, out, 1.0 * model.radius)
         out[0] = length if out[0] > 0.0 else -length
 
 
@@ -475,7 +430,7 @@ class HybridPlanner:
         budget = Budget(self.config.budget, now, self.config.effort)
         planners, share = [self, *self._narrower], 1.0
         for planner in planners:
-            share *= MARGIN_SHARE
+            share *= 0.5  # share of the remaining budget for the searches with narrower margins
             attempt = MarginAttempt(0.0 if planner is planners[-1] else share, planner is self)
             result = planner.plan_with_margin(budget, route_map, start, goal, attempt)
             if result.reason not in TRY_NARROWER:
@@ -555,8 +510,10 @@ def narrower_configs(config: HybridConfig) -> list[HybridConfig]:
     spare = config.margin - config.narrow_margin
     if spare <= 0.0:
         return []
-    margins = np.linspace(config.margin, config.narrow_margin, math.ceil(spare / MARGIN_STEP - 1e-6) + 1)[1:].tolist()
-    cost = max(config.clearance_cost, NARROW_COST)
+    # 0.005: step from one margin tried to the next, m
+    margins = np.linspace(config.margin, config.narrow_margin, math.ceil(spare / 0.005 - 1e-6) + 1)[1:].tolist()
+    # 1.0: clearance cost of routes with a narrower margin: they use it only where they have to, m
+    cost = max(config.clearance_cost, 1.0)
     return [config.model_copy(update={"margin": m, "narrow_margin": m, "clearance_cost": cost}) for m in margins]
 
 
@@ -692,7 +649,7 @@ class _PlanningRun:
                     segments = run.run(count, reserve)
                     if segments is not None:
                         return segments
-            count *= GROWTH
+            count *= 2  # growth of the nodes expanded per turn, from one round to the next
         return None
 
     def _reachable(self, to_go: CostToGo) -> bool:
@@ -701,15 +658,17 @@ class _PlanningRun:
     @property
     def _gap_margin(self) -> float:
         """Needed on both sides of a gap, m; without a margin, those just wide enough are left to the search."""
-        return self.config.margin + (GAP_PLAY if self.config.margin >= GAP_ERROR else -GAP_ERROR)
+        # 0.005: width needed in a gap beyond the margin on both sides, m: with less no search finds a path through it
+        return self.config.margin + (0.005 if self.config.margin >= GAP_ERROR else -GAP_ERROR)
 
     def _close_narrow_gaps(self, to_go: CostToGo) -> bool:
         """Close the narrow gaps on the shortest path, then on the next one around them, and so on; False: none."""
         checked = np.zeros(self.cell_cost.shape, np.bool_)
-        wide = self.planner.costs.side + self.config.margin + NARROW
+        # 0.06: a cell nearer to obstacles than this plus half the footprint's width may belong to a narrow gap, m
+        wide = self.planner.costs.side + self.config.margin + 0.06
         any_closed = False
-        for _ in range(GAP_ROUNDS):
-            for width in (0.0, GAP_CORRIDOR / self.cell):
+        for _ in range(30):  # paths checked for narrow gaps, at most
+            for width in (0.0, 0.15 / self.cell):  # width checked on both sides of a path with a narrow gap, m
                 closed = close_narrow_gaps(
                     self.field, self.footprint, self._gap_margin, self.cell_cost, self.factor, wide, to_go.step,
                     *self._cell_of(self.start), width, checked,
@@ -730,7 +689,8 @@ class _PlanningRun:
         """
         segments = first
         if holds_translations(first):
-            plain, _, _ = self._first_route((0.0,), PLAIN_SHARE)
+            # 0.5: share of the budget kept when a route without translations is searched and one with them is known
+            plain, _, _ = self._first_route((0.0,), 0.5)
             segments = first if plain is None else plain
         segments = self._with_fewer_cusps(segments)
         segments = self._improve_in_rounds(segments)
@@ -759,7 +719,8 @@ class _PlanningRun:
                 [self._search_run(to_go, RESOLUTIONS[k], crab, max_cusps=cusps - 1, strokes=True) for crab in crabs]
                 for k in (1, 0)
             )
-            other = self._run_in_turns(fine, coarse, CUSPS_SHARE)
+            # 0.3: share of the budget kept when routes with fewer cusps are searched
+            other = self._run_in_turns(fine, coarse, 0.3)
             if other is None:
                 break
             segments = other
@@ -775,10 +736,13 @@ class _PlanningRun:
             others = chain([cheapest], others)
         best, cost = self._smoothed(segments, NO_SEGMENTS, np.inf)
         idle = 0
-        while self.budget.remaining() > FINAL_SHARE and idle < MAX_IDLE_ROUNDS:
+        # 0.2: share of the budget for the final smoothing without and then with translations
+        # 12: rounds of improvement without gain after which smoothing ends
+        while self.budget.remaining() > 0.2 and idle < 12:
             segments = next(others)
             mate = best if len(segments) else NO_SEGMENTS
-            segments, other = self._smoothed(segments if len(segments) else best, mate, PROMISING * cost)
+            # 1.1: factor on the cost of the best route up to which another route is smoothed further
+            segments, other = self._smoothed(segments if len(segments) else best, mate, 1.1 * cost)
             idle = 0 if other < 0.9995 * cost else idle + 1
             if other < cost:
                 best, cost = segments, other
@@ -799,7 +763,7 @@ class _PlanningRun:
     def _polished(self, segments: Array) -> Array:
         """The route smoothed in ever smaller steps."""
         path = editable(self.start, segments)
-        for shift in FINE_SHIFTS:
+        for shift in (0.25, 0.1, 0.03, 0.01):  # shares of a stretch by which poses move in the final smoothing
             self._shortcut(path, 1e-4, shift)
         return current_segments(path).copy()
 
@@ -857,8 +821,10 @@ class _PlanningRun:
         for ways in (to_go, from_start):
             complete(ways)
         known = np.zeros(self.cell_cost.shape, np.bool_)
-        width = ALTERNATIVE_DISTANCE * self.vehicle.radius / self.cell
-        limit = int(ALTERNATIVE_LENGTH * to_go.cost[start])
+        # 2.5: least distance of an alternative from all known routes, at one place at least, turning radii
+        width = 2.5 * self.vehicle.radius / self.cell
+        # 1.15: factor on the length of the shortest path up to which alternatives are tried
+        limit = int(1.15 * to_go.cost[start])
         while (cell := cheapest_unmarked(to_go.cost, from_start.cost, known, limit)) >= 0:
             corridor = np.zeros(self.cell_cost.shape, np.bool_)
             for step in (to_go.step, from_start.step):

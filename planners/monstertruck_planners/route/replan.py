@@ -16,9 +16,6 @@ from monstertruck_planners.route.motion import MotionPath, joined
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 
-SAME_GOAL = 1e-3
-"""Goals nearer than this are the same, m and rad."""
-
 PASSING = 0.1
 """A route passes a waypoint if it comes this near, m."""
 
@@ -187,7 +184,8 @@ def remaining_route(
         fall: by which the clearance may fall on a departure, m; None: the path has to keep the margin all the way.
     """
     here, there = np.asarray(pose, dtype=np.float64), np.asarray(goal, dtype=np.float64)
-    if not np.isfinite(here).all() or not len(path.segments) or _apart(path.end, there) > planner.tolerance + SAME_GOAL:
+    # 1e-3: goals nearer than this are the same, m and rad
+    if not np.isfinite(here).all() or not len(path.segments) or _apart(path.end, there) > planner.tolerance + 1e-3:
         return None
     samples = path.sample(0.01)
     away = np.hypot(samples.poses[:, 0] - here[0], samples.poses[:, 1] - here[1])

@@ -138,10 +138,6 @@ def mean(fired: list[tuple[float, float]]) -> float | None:
     return sum(weight * value for value, weight in weights.items()) / total if total > 0.0 else None
 
 
-BEHIND: Final = 120.0
-"""Sub-goals at a greater bearing are driven to backward, as published, deg."""
-
-
 class Fuzzy(PathTracker[FuzzyConfig]):
     """See the module."""
 
@@ -194,6 +190,7 @@ class Fuzzy(PathTracker[FuzzyConfig]):
         ahead, aside = math.cos(yaw) * dx + math.sin(yaw) * dy, math.cos(yaw) * dy - math.sin(yaw) * dx
         bearing = math.degrees(math.atan2(aside, ahead))
         orientation = math.degrees(math.remainder(state.reference.state(s).yaw - yaw, math.tau))
-        direction = (1.0 if abs(bearing) < BEHIND else -1.0) if self._published else segment.direction
+        # 120.0: sub-goals at a greater bearing are driven to backward, as published, deg
+        direction = (1.0 if abs(bearing) < 120.0 else -1.0) if self._published else segment.direction
         inputs = FuzzyInputs(bearing, orientation, math.hypot(dx, dy), aside, direction)
         return self._rules.infer(inputs), direction

@@ -19,10 +19,6 @@ from monstertruck_schemas.plan import Steering
 
 SPEED_STEP: Final = 0.05
 """Speeds this near to each other (relatively) share their gains."""
-APPROACH: Final = 0.6
-"""Steepest angle at which the path is approached, rad."""
-JUST_BEFORE: Final = 0.03
-"""A change of steering, m: more than the spacing of the reference."""
 BETWEEN: Final = 4
 """Samples per period whose mean is the reference."""
 
@@ -67,7 +63,8 @@ class Lqr(PathTracker[LqrConfig]):
     def _reference(self, state: TrackingState) -> Array:
         """Slip and turn of the coming periods, shape (2 k,)."""
         # What comes after a change of steering is not for these axles: as if the path went on as it is.
-        end = state.reference.section_end(state.s) - JUST_BEFORE
+        # 0.03: a change of steering, m: more than the spacing of the reference
+        end = state.reference.section_end(state.s) - 0.03
         ahead = state.reference.at(np.minimum(state.distances(self._times), end))
         if state.steering == "crab":
             slip = np.remainder(ahead.heading - state.pose[2] + math.pi, math.tau) - math.pi
@@ -124,6 +121,7 @@ class GainTable:
             preview.append(-inverse @ b.T @ ahead)
             ahead = closed.T @ ahead
         single = m == 1 and steering != "crab"
-        furthest = APPROACH * abs(feedback[0, 1] / feedback[0, 0]) if single else math.inf
+        # 0.6: steepest angle at which the path is approached, rad
+        furthest = 0.6 * abs(feedback[0, 1] / feedback[0, 0]) if single else math.inf
         least = cost[:2, :2] - cost[:2, 2:] @ np.linalg.solve(cost[2:, 2:], cost[2:, :2])
         return Gains(feedback, np.hstack(preview), furthest, least)

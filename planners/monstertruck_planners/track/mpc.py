@@ -34,10 +34,6 @@ APPROACH: Final = 0.3
 """Distance from the path that counts, as a share of the distance to be driven."""
 GENTLE: Final = 1e-6
 """Weight that keeps inputs without effect where they are."""
-OPTIMAL: Final = 1
-"""Outcome of DAQP: the solution."""
-MOST_LAYOUTS: Final = 64
-"""Sequences of ways of steering kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +120,7 @@ class Mpc(PathTracker[MpcConfig]):
     def _layout(self, modes: tuple[Steering, ...]) -> Layout:
         known = self._layouts.get(modes)
         if known is None:
-            if len(self._layouts) >= MOST_LAYOUTS:
+            if len(self._layouts) >= 64:  # sequences of ways of steering kept
                 self._layouts.clear()
             m = max(BASES[mode].shape[1] for mode in modes)
             padded = {mode: np.pad(BASES[mode], ((0, 0), (0, m - BASES[mode].shape[1]))) for mode in set(modes)}
@@ -251,4 +247,4 @@ class Solver:
         plan, _, outcome, _ = daqp.solve(
             quadratic + self._smooth, q, self._change, high, low, iter_limit=self._iterations
         )
-        return np.asarray(plan) if outcome == OPTIMAL and np.isfinite(plan).all() else None
+        return np.asarray(plan) if outcome == 1 and np.isfinite(plan).all() else None  # outcome of DAQP: the solution

@@ -35,8 +35,6 @@ from monstertruck_schemas.reasons import Reason
 
 Angles = tuple[float, float]
 
-LONGEST: Final = 0.05
-"""Greatest time step of the prediction, s."""
 FORGET: Final = 1.0
 """Pause after which the state of the axles is not known, s; older requests no longer act."""
 
@@ -110,7 +108,7 @@ class AxleModel:
         angles = self.angles
         begin = self._t or 0.0
         for _, duration, target in self._pieces(begin, begin + seconds):
-            count = max(math.ceil(duration / LONGEST), 1)
+            count = max(math.ceil(duration / 0.05), 1)  # greatest time step of the prediction, s
             for _ in range(count):
                 middle = self._turned(angles, target, 0.5 * duration / count)
                 pose = geometry.integrate(pose, *geometry.body_twist(speed, *middle), duration / count)
@@ -239,14 +237,8 @@ C = TypeVar("C", bound=TrackerConfig)
 
 REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
-CUSP_SHARE: Final = 0.5
-"""Share of the clearance at a cusp that the truck may be off there: the rest is for the motion after it."""
-LEAST_CUSP_TOLERANCE: Final = 0.01
-"""However narrow it is, m."""
 STEEPEST: Final = 1.4
 """Angles are cut to this before their curvature is kept, rad."""
-TURNED: Final = 0.03
-"""Axles this near to what is requested count as turned, rad."""
 
 
 class TrackingState(NamedTuple):
@@ -413,7 +405,9 @@ class PathTracker(ABC, Generic[C]):
         if last:
             reached = away <= config.goal_tolerance and turned <= config.goal_yaw_tolerance
             return Reason.GOAL_REACHED if reached else Reason.GOAL_MISSED
-        tolerance = max(CUSP_SHARE * segment.clearance, LEAST_CUSP_TOLERANCE)
+        # 0.5: share of the clearance at a cusp that the truck may be off there: the rest is for the motion after it
+        # 0.01: however narrow it is, m
+        tolerance = max(0.5 * segment.clearance, 0.01)
         # A corner moves by about the wheelbase for each radian.
         off = away + self.geometry.wheelbase * turned
         return Reason.OK if off <= tolerance else Reason.CUSP_MISSED
@@ -490,4 +484,5 @@ class PathTracker(ABC, Generic[C]):
         if abs(truck.speed) > REST:
             return False
         now = self.axles.angles
-        return max(abs(angles[0] - now[0]), abs(angles[1] - now[1])) > TURNED
+        # 0.03: axles this near to what is requested count as turned, rad
+        return max(abs(angles[0] - now[0]), abs(angles[1] - now[1])) > 0.03

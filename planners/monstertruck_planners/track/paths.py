@@ -1,7 +1,7 @@
 """Paths drawn beforehand or sent from outside, published for the trackers."""
 
 from pathlib import Path as FilePath
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +20,6 @@ from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateState
 
 HEADER = ["x", "y", "yaw", "direction"]
-MOST_BYTES: Final = 10_000_000
-"""Size of a file of poses at most: a hundred thousand and more."""
 
 
 def load_path(file: FilePath, *, closed: bool, frame: str = "odom") -> Path:
@@ -32,7 +30,8 @@ def load_path(file: FilePath, *, closed: bool, frame: str = "odom") -> Path:
     Raises:
         InputError: naming file and line, and what was expected.
     """
-    rows = read_table(file, f"a table {','.join(HEADER)}", MOST_BYTES)
+    # 10_000_000: size of a file of poses at most: a hundred thousand and more
+    rows = read_table(file, f"a table {','.join(HEADER)}", 10_000_000)
     if not rows or rows[0][1] != HEADER:
         line, met = rows[0] if rows else (1, [])
         found = f"found {','.join(met)[:LONGEST]}" if rows else "the file is empty"

@@ -6,8 +6,6 @@ from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
 from monstertruck_planners.track.segments import Projection
 
-LEAST_WAY = 1e-6
-"""Distance before a change of the steering mode at which the path still has the old one, m."""
 LEAST_SQUARE = 1e-6
 """Goals nearer than the root of this are not divided by, m^2."""
 
@@ -55,7 +53,8 @@ class PurePursuit(PathTracker[PurePursuitConfig]):
         end = state.reference.section_end(state.s)
         if s <= end or end >= state.segment.end:
             return state.segment.at(s)
-        last = state.segment.at(end - LEAST_WAY)
+        # 1e-6: distance before a change of the steering mode at which the path still has the old one, m
+        last = state.segment.at(end - 1e-6)
         x, y, more = *last.point, s - end
         return Projection(s, (x + more * math.cos(last.tangent), y + more * math.sin(last.tangent)), last.tangent)
 

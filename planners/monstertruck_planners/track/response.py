@@ -26,24 +26,12 @@ KEPT: Final = 100
 """Cells of history that are needed before the newest: the longest dead time and the longest pause between poses."""
 EARLY: Final = 1e-6
 """Cells by which rounding may make an instant early."""
-PAUSE: Final = 0.5
-"""Poses further apart in time than this are not compared, s."""
 EXPECTED: Final = (0.05, 0.08)
 """Mean and standard deviation of dead time and lag together of a truck that was not measured, s."""
-GAIN: Final = 0.15
-"""Standard deviation of the share by which the truck may turn more or less than requested."""
-TRIM: Final = 0.1
-"""Standard deviation of the curvature that is there without being requested, 1/m."""
 NOISE: Final = 0.003
 """Standard deviation of a measured turn before any was compared, rad."""
 BELIEVED: Final = 5.0
 """Turns that this is worth."""
-CORRELATED: Final = 3.0
-"""Turns that say as much as one independent turn: what the model does not know lasts longer than a step."""
-TELLING: Final = 0.001
-"""Turns whose predictions differ by less than this say nothing, rad."""
-MEMORY: Final = 150.0
-"""Telling turns after which the older ones count for a third."""
 
 
 class Response(NamedTuple):
@@ -139,14 +127,15 @@ class ResponseEstimator:
             measured: the yaw is a sensor's; turns are taken between yaws of one kind only.
         """
         before, self._seen = self._seen, (t, yaw, speed, measured)
-        if before is None or before[3] is not measured or not 0.0 < t - before[0] <= PAUSE or math.isnan(self._begin):
+        # 0.5: poses further apart in time than this are not compared, s
+        if before is None or before[3] is not measured or not 0.0 < t - before[0] <= 0.5 or math.isnan(self._begin):
             return False
         self._fill(t)
         first, last = self._at(before[0]), self._at(t)
         if first is None or last is None:
             return False
         x = 0.5 * (before[2] + speed) * (last - first)
-        if float(x.max() - x.min()) < TELLING:
+        if float(x.max() - x.min()) < 0.001:  # turns whose predictions differ by less than this say nothing, rad
             return False
         self._learn(x, wrap_angle(yaw - before[1]), 0.5 * (before[2] + speed) * (t - before[0]))
         self.estimate = self._judged()
@@ -181,7 +170,7 @@ class ResponseEstimator:
         return np.ravel(low + (cells - i) * (high - low))
 
     def _learn(self, x: Array, y: float, way: float) -> None:
-        fade, products = 1.0 - 1.0 / MEMORY, self._products
+        fade, products = 1.0 - 1.0 / 150.0, self._products  # telling turns after which the older ones count for a third
         np.multiply(x, x, out=products[0])
         np.multiply(x, y, out=products[1])
         np.multiply(x, way, out=products[2])
@@ -194,13 +183,16 @@ class ResponseEstimator:
         self._samples += 1
 
     def _judged(self) -> ResponseEstimate:
-        by_gain, by_trim = self._variance / GAIN**2, self._variance / TRIM**2
+        # 0.15: standard deviation of the share by which the truck may turn more or less than requested
+        # 0.1: standard deviation of the curvature that is there without being requested, 1/m
+        by_gain, by_trim = self._variance / 0.15**2, self._variance / 0.1**2
         (xx, xy, xd), dd = self._by_x, self._dd + by_trim
         xx, xy = xx + by_gain, xy + by_gain
         explained = (xy * (dd * xy - 2 * self._yd * xd) + self._yd**2 * xx) / (xx * dd - xd * xd)
         most = float(explained.max())
         self._variance = (self._yy + by_gain - most + BELIEVED * NOISE**2) / (self._count + BELIEVED)
-        cost = (most - explained) / (2 * self._variance * CORRELATED) + self._prior
+        # 3.0: turns that say as much as one independent turn: what the model does not know lasts longer than a step
+        cost = (most - explained) / (2 * self._variance * 3.0) + self._prior
         moments = (self._powers @ np.exp(float(cost.min()) - cost)).tolist()
         dead_time, lag, dead_time_squared, total_squared = (moment / moments[0] for moment in moments[1:])
         response = Response(dead_time, lag)
@@ -211,16 +203,6 @@ class ResponseEstimator:
 
 STEP: Final = 0.05
 """Estimated lags are rounded to multiples of this, s: every lag needs gains of its own."""
-MOVED: Final = 0.01
-"""An estimate that differs by less than this from the one in use changes nothing, s."""
-SURE: Final = 3.0
-"""Standard deviations by which the estimate must differ from the configured response to contradict it."""
-SURE_AGAIN: Final = 1.0
-"""Standard deviations within which it must come back for the configured response to count again."""
-DIFFERENT: Final = 0.03
-"""Least difference from the configured delay, s: effects that are not modelled look like a delay of this size."""
-DIVIDED: Final = 0.05
-"""Least difference from the configured dead time alone, s."""
 
 
 def rounded(estimate: ResponseEstimate) -> Response:
@@ -237,11 +219,17 @@ def choose(used: Response, configured: Response | None, estimate: ResponseEstima
     """
     found = estimate.response
     if configured is not None:
-        sure, share = (SURE, 1.0) if used == configured else (SURE_AGAIN, 0.5)
-        near = abs(found.total - configured.total) <= sure * estimate.deviation + share * DIFFERENT
-        alike = abs(found.dead_time - configured.dead_time) <= sure * estimate.shape_deviation + share * DIVIDED
+        # 3.0: standard deviations by which the estimate must differ from the configured response to contradict it
+        # 1.0: standard deviations within which it must come back for the configured response to count again
+        sure, share = (3.0, 1.0) if used == configured else (1.0, 0.5)
+        # 0.03: least difference from the configured delay, s: effects that are not modelled look like a delay of this
+        # size
+        near = abs(found.total - configured.total) <= sure * estimate.deviation + share * 0.03
+        # 0.05: least difference from the configured dead time alone, s
+        alike = abs(found.dead_time - configured.dead_time) <= sure * estimate.shape_deviation + share * 0.05
         if near and alike:
             return configured
     new = rounded(estimate)
-    same = used != configured and used.lag == new.lag and abs(new.total - used.total) < MOVED
+    # 0.01: an estimate that differs by less than this from the one in use changes nothing, s
+    same = used != configured and used.lag == new.lag and abs(new.total - used.total) < 0.01
     return used if same else new

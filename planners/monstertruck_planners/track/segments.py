@@ -17,12 +17,6 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import MAX_COORDINATE, MAX_POSES, MAX_RUNS, Path, Steering
 from monstertruck_schemas.reasons import Reason
 
-NEAREST: Final = 0.1
-"""Vertices this much further than the nearest one count as equally near when a start is chosen, m."""
-
-SAME_HEADING: Final = 0.3
-"""Headings this close count as equal when a start is chosen, rad."""
-
 LEAST_STEP: Final = 1e-6
 """Shorter steps between two poses are left out, m."""
 
@@ -283,9 +277,10 @@ def _nearest(points: Array, directions: Array, start: tuple[float, float, float]
     distance = np.hypot(points[:, 0] - start[0], points[:, 1] - start[1])
     headings = tangents if closed else np.append(tangents, tangents[-1])
     distance = distance[: len(headings)]
-    near = np.flatnonzero(distance <= distance.min() + NEAREST)
+    # 0.1: vertices this much further than the nearest one count as equally near when a start is chosen, m
+    near = np.flatnonzero(distance <= distance.min() + 0.1)
     turned = np.abs(np.remainder(headings[near] - start[2] + math.pi, math.tau) - math.pi)
-    headed = near[turned <= turned.min() + SAME_HEADING]
+    headed = near[turned <= turned.min() + 0.3]  # headings this close count as equal when a start is chosen, rad
     # Neighbours of the nearest vertex are near, too: of each such group the nearest one counts.
     groups = np.split(headed, np.flatnonzero(np.diff(headed) > 1) + 1)
     return int(groups[0][np.argmin(distance[groups[0]])])
@@ -350,8 +345,6 @@ def _reach(points: Array, beyond: float) -> int:
 
 STEP: Final = 0.025
 """Spacing of the reference and half the chord a heading is taken from, m."""
-MOST: Final = 5000
-"""Greatest number of reference points of a segment."""
 QUANTILES: Final = -np.log1p(-(np.arange(16) + 0.5) / 16)
 """Quantiles of the exponential distribution: a mean over them is a first-order lag."""
 
@@ -393,7 +386,7 @@ class Reference:
     def __init__(self, segment: Segment, geometry: FourWheelSteering, steering: Steering) -> None:
         self._segment = segment
         self._default: Steering = steering
-        count = min(max(math.ceil(segment.end / STEP), 4), MOST) + 1
+        count = min(max(math.ceil(segment.end / STEP), 4), 5000) + 1  # greatest number of reference points of a segment
         self._s = np.linspace(0.0, segment.end, count)
         tangent, curvature = _tangents(segment, self._s)
         heading = tangent if segment.direction > 0 else tangent + math.pi

@@ -33,21 +33,6 @@ from monstertruck_schemas.topics import COMPASS, ODOMETRY, SCAN
 SOURCE: Final = ServiceName.TRACKER.value
 """Source of the drive requests."""
 
-ROUGHNESS_WINDOW: Final = 2.0
-"""Time constant of the roughness that slows the truck down, s."""
-LOOKS: Final = 8
-"""Poses ahead whose clearance counts."""
-
-LONG: Final = 3 * 500
-"""Length of a path's array (3 numbers a pose) from which on it is prepared in several iterations of the event loop."""
-
-AT_REST: Final = 0.01
-"""Speed of a truck at rest, m/s."""
-
-MOVED: Final = 0.01
-"""A disarmed truck that was moved by more than this joins its path again, m."""
-TURNED: Final = 0.02
-"""The same for a turn, rad."""
 
 UNSEEN_AFTER: Final = SECOND
 """Time before unseen ground after which a path is left, ns: no waiting changes what was seen there."""
@@ -155,7 +140,7 @@ class TrackingStep:
         self._footprint = setup.footprint
         self._points = points or ScanPoints(setup.lidar)
         self._near = setup.footprint.circumscribed_radius + setup.config.slow_clearance
-        self._terrain = TerrainEstimator(ROUGHNESS_WINDOW)
+        self._terrain = TerrainEstimator(2.0)  # time constant of the roughness that slows the truck down, s
         self._acceleration = BodyAcceleration()
         self._seen: tuple[LaserScan, SegmentedPath] | None = None
         self._clearance_ahead = math.inf
@@ -191,7 +176,9 @@ class TrackingStep:
         if pose is None or path is None or gate is None or now - pose.received > ODOMETRY.fresh_for() * SECOND:
             yield TrackOutput()
             return
-        long = len(path.poses) > LONG
+        # 3 * 500: length of a path's array (3 numbers a pose) from which on it is prepared in several iterations of the
+        # event loop
+        long = len(path.poses) > 3 * 500
         if self._choose_path(path, pose, armed=gate.mode.active) and long:
             yield None
         if self._path is None:
@@ -237,7 +224,8 @@ class TrackingStep:
             severity = Severity.INFO if command.outcome in (Reason.DRIVING, Reason.GOAL_REACHED) else Severity.WARNING
             self._report(command.outcome, severity, text, path=path.name, cross_track=command.cross_track)
         axles = self._axles()
-        drive = active and (command.outcome is Reason.DRIVING or abs(pose.twist.vx) > AT_REST)
+        # 0.01: speed of a truck at rest, m/s
+        drive = active and (command.outcome is Reason.DRIVING or abs(pose.twist.vx) > 0.01)
         return TrackOutput(command, drive, path.frame, path.name, along, path.length, axles, self._drain())
 
     def _before_unseen(self, now: int, gate: GateState, *, driving: bool) -> bool:
@@ -312,7 +300,9 @@ class TrackingStep:
         if self._begun is None:
             return True
         x, y, yaw = self._begun
-        return math.hypot(here[0] - x, here[1] - y) > MOVED or abs(math.remainder(here[2] - yaw, math.tau)) > TURNED
+        # 0.01: a disarmed truck that was moved by more than this joins its path again, m
+        # 0.02: the same for a turn, rad
+        return math.hypot(here[0] - x, here[1] - y) > 0.01 or abs(math.remainder(here[2] - yaw, math.tau)) > 0.02
 
     def _clearance(self, scan: LaserScan | None, path: SegmentedPath, pose: Odometry, now: int) -> float:
         """Least clearance of the poses ahead on the path, in the newest scan; +inf if nothing near slows the truck."""
@@ -323,7 +313,7 @@ class TrackingStep:
         return self._clearance_ahead
 
     def _measure_clearance(self, scan: LaserScan, path: SegmentedPath, pose: Odometry) -> float:
-        ahead = path.ahead(self._progress, self._config.reach, LOOKS)
+        ahead = path.ahead(self._progress, self._config.reach, 8)  # poses ahead whose clearance counts
         poses = poses_relative(ahead, (pose.pose.x, pose.pose.y, pose.pose.yaw))
         near = points_near(self._points.of(scan), poses, self._near)
         return float(clearance_to_points(self._footprint, poses, near).min())

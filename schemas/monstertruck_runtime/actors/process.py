@@ -22,8 +22,6 @@ from typing import Any
 from monstertruck_runtime.errors import WorkerError
 
 NICE = 5
-ENDING = 1.0
-"""Seconds in which a process that has closed its connection ends."""
 _TIMEVAL = struct.Struct("@ll")
 """Seconds and microseconds, see socket(7)."""
 _SINGLE_THREADED = {
@@ -117,7 +115,7 @@ class WorkerProcess:
         if self._killed:
             return text
         try:
-            code = self._process.wait(ENDING)
+            code = self._process.wait(1.0)  # seconds in which a process that has closed its connection ends
         except subprocess.TimeoutExpired:
             return f"{text}: it closed its connection"
         if code >= 0:

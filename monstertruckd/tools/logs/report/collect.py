@@ -26,8 +26,6 @@ from monstertruckd.tools.logs.report.scan_map import ScanMap
 from monstertruckd.tools.logs.report.signals import FIGURES, Curve, DrivenPath, Trace
 from monstertruckd.tools.logs.report.states import StateTimeline
 
-_SILENT_PERIODS: Final = 5
-"""Nominal periods without a message that count as a silence, if the topic names no staleness limit."""
 _SEQUENCES: Final = 1 << 32
 
 
@@ -85,7 +83,8 @@ class Traffic:
     def _watch(self, now: int, nominal: float) -> None:
         silence = (now - self.last) / SECOND
         self.longest_silence = max(self.longest_silence, silence)
-        limit = BY_NAME[self.name].stale_after or _SILENT_PERIODS / nominal
+        # 5: nominal periods without a message that count as a silence, if the topic names no staleness limit
+        limit = BY_NAME[self.name].stale_after or 5 / nominal
         self.silences += silence > limit
         self.count_to(now)
         self._in_second += 1
@@ -103,8 +102,6 @@ _PERIODS: Final = {t.ODOMETRY.name: SECOND // 20, t.POSE.name: SECOND // 20, t.T
 """Topics of high rate that are decoded no more often than this, ns."""
 _EVENTS: Final = 400
 """Events kept of each severity."""
-_JOURNAL: Final = 400
-"""Warnings and worse kept of the journal."""
 
 
 @dataclass(slots=True)
@@ -237,7 +234,7 @@ class Collector:
         if record.level in {LogLevel.DEBUG, LogLevel.INFO}:
             return
         self._run.journal_count += 1
-        if len(self._run.journal) < _JOURNAL:
+        if len(self._run.journal) < 400:  # warnings and worse kept of the journal
             self._run.journal.append(record)
 
     def _stop(self, _: int, stop: Stop) -> None:

@@ -172,10 +172,6 @@ def time_labels(seconds: float) -> str:
 
 
 SEVERITY_TONE = {Severity.INFO: Tone.CALM, Severity.WARNING: Tone.WARNING, Severity.ERROR: Tone.BAD}
-_BARS = 1000
-"""Greatest number of bars in a row of the timeline, about."""
-_LABELLED = 0.055
-"""Bars at least this share of the row carry their text."""
 _MARGIN = 0.35
 """Metres shown round everything on the map."""
 
@@ -243,11 +239,12 @@ def _share(run: RunSummary, time: int) -> float:
 
 def _bars(run: RunSummary, track: StateTrack) -> str:
     bars = []
-    for span in merged_spans(track.spans, (run.end - run.start) // _BARS):
+    # 1000: greatest number of bars in a row of the timeline, about
+    for span in merged_spans(track.spans, (run.end - run.start) // 1000):
         left, width = _share(run, span.start), _share(run, span.end) - _share(run, span.start)
         when = f"{clock_text((span.start - run.start) / SECOND, 1)}, {span.seconds:.1f} s"
         title = ": ".join(filter(None, (f"{span.text} at {when}", span.detail)))
-        wide = width > _LABELLED
+        wide = width > 0.055  # bars at least this share of the row carry their text
         bars.append(
             f'<i class="{span.tone.name.lower()}{"" if wide else " thin"}" style="left:{100 * left:.3f}%;'
             f'width:{100 * width:.3f}%" title="{escape(title)}">{escape(span.text) if wide else ""}</i>'

@@ -18,8 +18,6 @@ from monstertruck_schemas.topics import Topic
 
 _SHORTEST_GAP = SECOND
 """Shorter intervals without samples are never drawn as gaps, ns."""
-_GAP_PERIODS = 5
-"""Mean periods without a sample that count as a gap."""
 
 
 @dataclass(slots=True)
@@ -86,7 +84,7 @@ class Trace:
         if not self.buckets:
             return []
         period = (self.buckets[-1].last - self.buckets[0].first) / max(self.count - 1, 1)
-        gap = max(_SHORTEST_GAP, _GAP_PERIODS * period)
+        gap = max(_SHORTEST_GAP, 5 * period)  # mean periods without a sample that count as a gap
         pieces = [[self.buckets[0]]]
         for bucket in self.buckets[1:]:
             if bucket.first - pieces[-1][-1].last > gap:

@@ -14,19 +14,9 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
 
-NOISE: Final = 0.005
-"""Standard deviation of a range, m, to which ``NOISE_SHARE`` of the range is added in quadrature."""
 NOISE_SHARE: Final = 0.01
-UNHEARD: Final = 0.5
-"""What an echo from where none is expected counts like, m."""
-ROBUST: Final = 2.0
-"""Residual, in standard deviations, from which on an echo counts for less (Cauchy's weights)."""
 TIGHT: Final = 3.0
 """Residual, in standard deviations, up to which a line explains an echo."""
-SPARE: Final = 0.05
-"""Error of the critical angle of a wall, rad."""
-INERTIA: Final = (0.05, 0.03)
-"""Standard deviations of the estimate before: rad, m."""
 GUESSES: Final = 24, 5
 """Start directions of a line fit without an earlier estimate, and the best of these that are fitted to the end."""
 DISTINCT: Final = 0.05
@@ -37,8 +27,6 @@ SAMPLED: Final = 40
 """Echoes to which all guesses are fitted, taken evenly out of more."""
 LONGEST: Final = 0.3
 """Greatest step of a fit, rad and m."""
-SETTLED: Final = 1e-4
-"""A step of all fits below this, rad and m, is the last one."""
 FREE: Final = (math.inf, math.inf)
 """Inertia without an estimate before."""
 
@@ -89,7 +77,7 @@ class Cone:
         slope = np.abs(off)
         slope -= self.half
         np.maximum(slope, 0.0, out=slope)
-        heard = slope <= self.critical + SPARE
+        heard = slope <= self.critical + 0.05  # error of the critical angle of a wall, rad
         slope *= heard
         np.tan(slope, out=slope)
         share = slope * slope
@@ -118,7 +106,8 @@ class EstimateFit(NamedTuple):
 
 def deviation(ranges: Array) -> Array:
     """Standard deviation of ranges, m."""
-    return np.asarray(np.hypot(NOISE, NOISE_SHARE * ranges))
+    # 0.005: standard deviation of a range, m, to which ``NOISE_SHARE`` of the range is added in quadrature
+    return np.asarray(np.hypot(0.005, NOISE_SHARE * ranges))
 
 
 def residuals(echoes: Array, line: WallEstimate, cone: Cone) -> Array:
@@ -137,8 +126,9 @@ def refine(echoes: Array, before: WallEstimate, at: tuple[float, float], cone: C
         at: point whose distance to the line is estimated, m: the robot.
         cone: how the sonars hear.
     """
+    # (0.05, 0.03): standard deviations of the estimate before: rad, m
     normals, distances, cost, information = _fitted(
-        echoes, np.array([before.normal]), np.array([before.distance(*at)]), at, cone, INERTIA, STEPS[0]
+        echoes, np.array([before.normal]), np.array([before.distance(*at)]), at, cone, (0.05, 0.03), STEPS[0]
     )
     return _best(echoes, normals, distances, cost, information, at, cone)
 
@@ -193,7 +183,8 @@ def _fitted(
     x, y, axis, ranges = np.ascontiguousarray(echoes[:, :4].T)
     x, y = x - at[0], y - at[1]
     weight = 1.0 / deviation(ranges) ** 2
-    damping = weight / ROBUST**2
+    # 2.0: residual, in standard deviations, from which on an echo counts for less (Cauchy's weights)
+    damping = weight / 2.0**2
     first = np.stack([normals, distances])
     lines = first
     held_a, held_d = 1.0 / inertia[0] ** 2, 1.0 / inertia[1] ** 2
@@ -214,7 +205,7 @@ def _fitted(
         np.multiply(across, share, out=terms[:, 0])
         terms[:, 1] = share
         far *= share
-        missing = np.where(heard, ranges - far, UNHEARD)
+        missing = np.where(heard, ranges - far, 0.5)  # what an echo from where none is expected counts like, m
         terms[:, 2] = missing
         doubt = missing * missing
         doubt *= damping
@@ -234,7 +225,7 @@ def _fitted(
         np.maximum(step, -LONGEST, out=step)
         np.minimum(step, LONGEST, out=step)
         lines = lines + step
-        if np.abs(step).max() < SETTLED:
+        if np.abs(step).max() < 1e-4:  # a step of all fits below this, rad and m, is the last one
             break
     cost = np.log1p(missing * missing * damping).sum(1)
     return lines[0], lines[1], cost, np.stack([aa, ad, dd], axis=1)

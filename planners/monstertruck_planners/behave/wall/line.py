@@ -39,10 +39,6 @@ from monstertruck_schemas.topics import IMU, ODOMETRY, SONAR, TRANSFORMS, Topic
 
 SIDE, DIAGONAL, FRONT, FAR = range(4)
 """Sonars by number, as in ``NAMES``."""
-OWN: Final = -1
-"""Number of an echo of another sonar that came from the wall beside, when that was ahead."""
-SETTLE: Final = 0.5
-"""Seconds at rest at the beginning, over which the gyroscope's bias is measured."""
 KEPT: Final = 1.0
 """Seconds for which poses are kept: an echo is placed where the robot was then."""
 NEAR: Final = 1.2
@@ -50,58 +46,30 @@ NEAR: Final = 1.2
 AHEAD: Final = 1.5, 0.8
 """Distance over which echoes count for the wall ahead, m: on free ground, and along a wall, behind which the foot of
 the perpendicular on the next one may lie."""
-UNSURE: Final = 0.008
-"""Standard deviation of the wall's direction above which the robot drives along it slowly, rad."""
-FRESH: Final = 0.35
-"""Seconds for which an echo shows what is before the robot."""
-FACING: Final = 1.1
-"""Greatest angle between the direction of travel and the normal of a wall that is ahead, rad."""
-LATE: Final = 0.6
-"""Share of the distance of gentle braking that is left, below which it brakes as hard as a ramp may."""
 NEARER: Final = 5.0
 """Standard deviations by which an echo of the diagonal sonar is nearer than the wall beside: of something ahead."""
 LEAST: Final = 6
 """Echoes that make a wall."""
-CLEAR: Final = 0.2
-"""Range of every sonar that looks ahead at which the robot stands at the latest, m: what it hears there may not be the
-wall to which it drives."""
 FITS: Final = 2
 """Lines fitted for a round of echoes: one in a step where there are as many steps: the event loop waits for them."""
-GONE: Final = 0.1
-"""Distance left at standstill beside a wall, m, from which on what the robot braked for has gone: it was no corner."""
 TOUCHING: Final = 0.16
 """A range from which on the robot stops at once, m."""
-OPENING: Final = 0.3
-"""Range of the side sonar beyond the wall from which on it looks through an opening, m."""
-STARTED: Final = 0.05
-"""Angle up to which a turn begins, rad."""
-BEAM_CRITICAL: Final = 1.3
-"""Greatest angle from the normal at which a beam comes back, rad."""
 CATCH_UP: Final = 1.5
 """Speed by which a lag is made up for, of the lag, 1/s."""
 LAG: Final = (0.05, 0.15)
 """Greatest lag that is made up for: distance, m, and angle, rad."""
 TURNS: Final = 0.5
 """Greatest yaw rate along the wall, rad/s."""
-FASTEST: Final = 0.3
-"""m/s."""
 STRAY: Final = (0.3, 0.4)
 """Yaw rate that is not the one requested, rad/s, and the seconds after which a motor counts as stalled."""
-STALL: Final = 1.0
-"""Seconds without the requested motion, after which the robot counts as stuck."""
 SLOW: Final = 0.2
 """Share of the requested speed below which the robot does not move."""
 EQUAL: Final = 12, 0.1
 """Equal echoes in a row, and the distance over which they came, m, from which on a sonar counts as stuck."""
-JUDGED: Final = 20, 1.2
-"""Least number of echoes of a sonar, over this distance along a wall, m, that tell whether it agrees with the wall: the
-diagonal one looks through a door, or past the end of a pillar, before the other one."""
 DISAGREES, AGREES = 0.2, 0.7
 """Share of them on the wall below which a sonar contradicts another one, whose share is above the second figure."""
 PLACED: Final = 0.5
 """Distance between two places at which a lap may be complete, m."""
-FOLLOWED: Final = 0.5
-"""A lap does not begin where the robot followed a wall for less, m."""
 
 STANDSTILL: Final = TimedRamp(0.0, CubicRamp(0.0, 0.0, 1.0))
 
@@ -218,7 +186,7 @@ class WallLine:
         v, w = state.v.at(due), state.w.at(due)
         state = state._replace(sent=(*(entry for entry in state.sent if entry[0] > t - KEPT), (due, v, w)))
         v, w = v + CATCH_UP * state.lag[0], w + CATCH_UP * state.lag[1]
-        motion = RequestedMotion(min(max(v, 0.0), FASTEST), w * self._mirror)
+        motion = RequestedMotion(min(max(v, 0.0), 0.3), w * self._mirror)  # m/s
         error = None if state.wall is None else self.error(state)
         return BehaviourStep(motion, state, state.phase, values=_values(state, error))
 
@@ -239,7 +207,8 @@ class WallLine:
 
     def _cone(self, sonars: SonarRanges) -> Cone:
         config = self._config
-        return Cone(0.0, BEAM_CRITICAL) if config.beam else Cone(sonars.field_of_view / 2, config.critical_angle)
+        # 1.3: greatest angle from the normal at which a beam comes back, rad
+        return Cone(0.0, 1.3) if config.beam else Cone(sonars.field_of_view / 2, config.critical_angle)
 
     def _moved(self, state: LineState, odometry: Odometry, rate: float, t: float) -> LineState:
         """Take in odometry and gyroscope."""
@@ -328,7 +297,8 @@ class WallLine:
             return state
         if not self._opening(state, wall, cone):
             fit = refine(beside, wall, state.pose[:2], cone)
-            wall, state = fit.line, state._replace(wall=fit.line, sure=fit.sigma[0] < UNSURE)
+            # 0.008: standard deviation of the wall's direction above which the robot drives along it slowly, rad
+            wall, state = fit.line, state._replace(wall=fit.line, sure=fit.sigma[0] < 0.008)
         fresh = beside[beside[:, 6] == echoes[-1, 6]]
         on_wall = fresh[np.abs(residuals(fresh, wall, cone)) < TIGHT]
         return state._replace(seen=float(on_wall[-1, 5])) if len(on_wall) else state
@@ -338,7 +308,8 @@ class WallLine:
         if not cone.hears(state.pose[2] + state.mounts[SIDE].yaw, wall.normal):
             return False
         fresh = _fresh(state.echoes[state.echoes[:, 4] == SIDE], state)
-        return not len(fresh) or bool((residuals(fresh, wall, cone) * deviation(fresh[:, 3])).min() > OPENING)
+        # 0.3: range of the side sonar beyond the wall from which on it looks through an opening, m
+        return not len(fresh) or bool((residuals(fresh, wall, cone) * deviation(fresh[:, 3])).min() > 0.3)
 
     def _nearer(self, state: LineState, faced: tuple[WallEstimate | None, WallEstimate | None]) -> LineState:
         """With the nearer one of the walls ahead by the sonars of either side."""
@@ -356,7 +327,8 @@ class WallLine:
         if len(rows) < LEAST or not len(fresh) or fresh[:, 3].min() > NEAR:
             return None
         fit = search(rows, pose[:2], cone)
-        facing = abs(math.remainder(fit.line.normal - pose[2], math.tau)) < FACING
+        # 1.1: greatest angle between the direction of travel and the normal of a wall that is ahead, rad
+        facing = abs(math.remainder(fit.line.normal - pose[2], math.tau)) < 1.1
         present = np.count_nonzero(np.abs(residuals(fresh, fit.line, cone)) < TIGHT) > 0.5 * len(fresh)
         return fit.line if facing and present and fit.explained >= max(LEAST, 0.5 * len(rows)) else None
 
@@ -384,7 +356,9 @@ class WallLine:
             if len(rows) < 2:
                 continue
             range_now = median((rows[:, 3] - (state.travelled - rows[:, 5])).tolist())
-            left = min(left, range_now - CLEAR)
+            # 0.2: range of every sonar that looks ahead at which the robot stands at the latest, m: what it hears there
+            # may not be the wall to which it drives
+            left = min(left, range_now - 0.2)
             if ahead is None and (number != FAR or state.wall is None):  # what is ahead makes no line
                 left = min(left, range_now + state.mounts[number].reach - self._keep(state))
         near = fresh[fresh[:, 4] >= DIAGONAL][-6:, 3]
@@ -414,9 +388,10 @@ class WallLine:
         if turns is not None and t - turns > STRAY[1]:
             text = f"{state.w.at(t) * self._mirror:.2f} rad/s asked for and not turned: does a motor stall?"
             return Reason.STUCK, text
-        if stands is not None and t - stands > STALL:
+        # 1.0: seconds without the requested motion, after which the robot counts as stuck
+        if stands is not None and t - stands > 1.0:
             return Reason.STUCK, f"{state.v.at(t):.2f} m/s asked for, {odometry.twist.vx:.2f} m/s driven"
-        if state.phase == "turn" and state.turned - state.marks[1] < STARTED:
+        if state.phase == "turn" and state.turned - state.marks[1] < 0.05:  # angle up to which a turn begins, rad
             for number in (DIAGONAL, FRONT, FAR):
                 if 0.0 < (near := state.equal[number][0]) < TOUCHING:
                     return Reason.STUCK, f"sonar {self._names[number]} measures {near:.2f} m: too near to turn away"
@@ -428,7 +403,9 @@ class WallLine:
 
     def _disagreement(self, state: LineState, wall: WallEstimate, cone: Cone) -> tuple[Reason, str] | None:
         """A sonar that does not hear the wall that the other one hears."""
-        least, distance = JUDGED
+        # (20, 1.2): least number of echoes of a sonar, over this distance along a wall, m, that tell whether it agrees
+        # with the wall: the diagonal one looks through a door, or past the end of a pillar, before the other one
+        least, distance = (20, 1.2)
         if state.travelled - state.marks[0] < distance:
             return None
         recent, shares = state.echoes[state.echoes[:, 5] > state.travelled - distance], []
@@ -450,7 +427,8 @@ class WallLine:
         config = self._config
         match state.phase:
             case "settle":
-                return self._to(state, "search") if t >= SETTLE else state
+                # 0.5: seconds at rest at the beginning, over which the gyroscope's bias is measured
+                return self._to(state, "search") if t >= 0.5 else state
             case "search" | "follow":
                 return self._drive(state, cone, t)
             case "brake":
@@ -472,7 +450,9 @@ class WallLine:
 
         The echoes of those two may be the corner, although there are none from where the robot stands.
         """
-        if self._left(state, cone, t) <= GONE:
+        # 0.1: distance left at standstill beside a wall, m, from which on what the robot braked for has gone: it was no
+        # corner
+        if self._left(state, cone, t) <= 0.1:
             return False
         lately = state.echoes[state.echoes[:, 5] > state.travelled - AHEAD[1]]
         diagonal, front = lately[:, 4] == DIAGONAL, lately[:, 4] == FRONT
@@ -498,7 +478,8 @@ class WallLine:
         brake = shortest_ramp(speed, state.v.acceleration(t), 0.0, config.braking, config.jerk)
         if left - speed / config.rate > brake.distance:
             return state
-        if left < LATE * brake.distance:
+        # 0.6: share of the distance of gentle braking that is left, below which it brakes as hard as a ramp may
+        if left < 0.6 * brake.distance:
             brake = shortest_ramp(speed, state.v.acceleration(t), 0.0, config.acceleration, config.jerk)
         return self._to(state._replace(v=self._stopping(TimedRamp(t, brake), left, t)), "brake")
 
@@ -540,8 +521,10 @@ class WallLine:
         if wall is None:
             return state
         kept = state.echoes[np.abs(residuals(state.echoes, wall, cone)) < TIGHT].copy()
-        kept[:, 4] = np.where(kept[:, 4] <= DIAGONAL, kept[:, 4], OWN)
-        if not len(state.places) or state.travelled - state.places[0, 0] < FOLLOWED:
+        # -1: number of an echo of another sonar that came from the wall beside, when that was ahead
+        kept[:, 4] = np.where(kept[:, 4] <= DIAGONAL, kept[:, 4], -1)
+        # 0.5: a lap does not begin where the robot followed a wall for less, m
+        if not len(state.places) or state.travelled - state.places[0, 0] < 0.5:
             state = state._replace(places=np.array([[state.travelled, *state.pose]]))
         return self._to(state, "follow")._replace(
             wall=wall, ahead=None, faced=(None, None), echoes=kept, seen=state.travelled
@@ -629,7 +612,8 @@ def _reach(state: LineState) -> float:
 
 def _fresh(echoes: Array, state: LineState) -> Array:
     """The echoes that came lately."""
-    return echoes[echoes[:, 6] > (state.before or 0.0) - FRESH]
+    # 0.35: seconds for which an echo shows what is before the robot
+    return echoes[echoes[:, 6] > (state.before or 0.0) - 0.35]
 
 
 def _at(poses: tuple[tuple[int, Pose2, float], ...], stamp: int, play: float) -> tuple[Pose2, float]:

@@ -7,11 +7,6 @@ from typing import Final
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import SonarRanges
 
-SILENT: Final = 0.5
-"""Seconds without any answer of a sonar after which it counts as dead."""
-FROZEN: Final = 0.6
-"""Angle, rad, over which a sonar's range cannot stay the same to the last digit."""
-
 NAMES: Final = {"left": ("l", "fl", "f", "fr"), "right": ("r", "fr", "f", "fl")}
 """Side, diagonal, front and far diagonal sonar by the side where the wall is."""
 
@@ -47,10 +42,10 @@ class SonarMonitor:
     def fault(self, turned: float, t: float) -> tuple[Reason, str] | None:
         """What is wrong with the sonars at t."""
         for name, at in self.answered.items():
-            if t - at >= SILENT:
+            if t - at >= 0.5:  # seconds without any answer of a sonar after which it counts as dead
                 return Reason.INPUT_STALE, f"sonar {name} has not answered for {t - at:.1f} s"
         for name, (value, at) in self.changed.items():
-            if turned - at > FROZEN:
+            if turned - at > 0.6:  # angle, rad, over which a sonar's range cannot stay the same to the last digit
                 degrees = math.degrees(turned - at)
                 return (
                     Reason.INPUT_CONTRADICTORY,

@@ -23,10 +23,6 @@ from monstertruck_schemas.topics import ODOMETRY, SONAR, Topic
 
 DIAGONAL: Final = math.radians(45)
 """Angle between the side sonar and the diagonal one."""
-STALL: Final = 1.0
-"""Seconds of requested but not measured motion after which a motor counts as stalled."""
-SAME_HEADING: Final = 1.2
-"""Greatest difference of the heading from that at the lap's beginning, rad: the robot weaves."""
 FOLLOWING: Final = ("follow", "free")
 """Phases in which a lap may begin: the robot drives along the wall."""
 JUMP: Final = 0.06, 0.15
@@ -34,16 +30,8 @@ JUMP: Final = 0.06, 0.15
 into a gap, m."""
 EDGE: Final = 0.1
 """Distance behind the edge of a gap over which the side sonar may measure the gap's own side wall, m."""
-BACK: Final = 0.05
-"""Diagonal range times cos 45 degrees less side range below which it ends, m."""
-WALL_LENGTH: Final = 0.8
-"""Distance over which echoes make the line of a wall past whose gap it drives, m."""
-LEAST_ECHOES: Final = 4
-"""Least number of echoes of such a line."""
 LINE_GAINS: Final = 5.0, 2.0
 """Yaw rate per distance error from it, rad/s/m, and per heading error, 1/s: critically damped at 0.2 m/s."""
-TIGHT: Final = 4.0
-"""Curvature that no body with steered axles reaches, 1/m."""
 AT_REST: Final = 0.01
 """m/s."""
 
@@ -86,7 +74,7 @@ def tightest_curvature(body: BehaviourBody) -> float:
     try:
         chassis.possible((0.0, 0.0, 1.0))
     except KinematicsError:
-        twist = chassis.possible((1.0, 0.0, TIGHT))
+        twist = chassis.possible((1.0, 0.0, 4.0))  # curvature that no body with steered axles reaches, 1/m
     else:
         return math.inf
     angles, _ = chassis.limited_steering(chassis.steering_for(twist, chassis.straight), body.max_angle)
@@ -163,7 +151,8 @@ class _Wall(ABC):
         state = replace(state, sonars=state.sonars.observe(sonars, self._names, state.turned, t))
         fault = state.sonars.fault(state.turned, t)
         state = _stall_timed(state, odometry.twist.vx, t)
-        if fault is None and state.moving_since is not None and t - state.moving_since >= STALL:
+        # 1.0: seconds of requested but not measured motion after which a motor counts as stalled
+        if fault is None and state.moving_since is not None and t - state.moving_since >= 1.0:
             fault = Reason.STUCK, f"{state.asked:.2f} m/s asked for, {odometry.twist.vx:.2f} m/s driven"
         if fault is None and state.phase == "turn_away" and state.turned - state.turned_before > math.tau:
             fault = Reason.STUCK, "turned once around and found no wall to follow"
@@ -219,7 +208,8 @@ class _Wall(ABC):
             return state
         if math.dist(begun[:2], pose[:2]) > config.lap_radius:
             return state
-        if math.cos(begun[2] - pose[2]) < math.cos(SAME_HEADING):
+        # 1.2: greatest difference of the heading from that at the lap's beginning, rad: the robot weaves
+        if math.cos(begun[2] - pose[2]) < math.cos(1.2):
             return state
         state = replace(state, laps=state.laps + 1, since=0.0)
         if state.laps < config.laps:
@@ -282,7 +272,8 @@ class WallPd(_Wall):
         if state.pose is None or not self._config.gap:
             return state
         x, y, yaw, now = state.pose[0], state.pose[1] * self._mirror, state.pose[2] * self._mirror, state.travelled
-        echoes = [echo for echo in state.echoes if now - echo[2] < WALL_LENGTH]
+        # 0.8: distance over which echoes make the line of a wall past whose gap it drives, m
+        echoes = [echo for echo in state.echoes if now - echo[2] < 0.8]
         reach, offset = ranges.diagonal * math.cos(DIAGONAL), self._config.offset
         for gap, ahead, aside in zip(state.gaps, (0.0, offset + reach), (ranges.side, reach), strict=True):
             if gap is None:
@@ -292,7 +283,7 @@ class WallPd(_Wall):
 
     def _along_line(self, state: WallState) -> float:
         """Yaw rate along the line through the newest echoes, rad/s; straight on if there are too few."""
-        if state.pose is None or len(state.echoes) < LEAST_ECHOES:
+        if state.pose is None or len(state.echoes) < 4:  # least number of echoes of such a line
             return 0.0
         x, y, yaw = state.pose[0], state.pose[1] * self._mirror, state.pose[2] * self._mirror
         points = np.array(state.echoes)[:, :2]
@@ -318,7 +309,8 @@ class WallPd(_Wall):
         known = before[-1].diagonal if before else ranges.side / math.cos(DIAGONAL)
         if ranges.diagonal - known > JUMP[1]:
             diagonal = now
-        elif ranges.diagonal * math.cos(DIAGONAL) - ranges.side < BACK:
+        # 0.05: diagonal range times cos 45 degrees less side range below which it ends, m
+        elif ranges.diagonal * math.cos(DIAGONAL) - ranges.side < 0.05:
             diagonal = None
         gaps = tuple(
             since if since is not None and now - since < self._config.gap else None for since in (side, diagonal)
