@@ -19,8 +19,6 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
 
 LINE_HIGH: Final = 8000
-LINE_LOW: Final = 4000
-"""Targets of a digital output, quarter microseconds: on either side of the device's threshold."""
 
 
 class MaestroDriver:
@@ -147,7 +145,8 @@ class MaestroDriver:
 
     def _line(self, session: MaestroSession, *, high: bool) -> list[bytes]:
         channel = self._config.deadman_channel
-        return [] if channel is None else [session.encode.set_target(channel, LINE_HIGH if high else LINE_LOW)]
+        # 4000: targets of a digital output, quarter microseconds: on either side of the device's threshold
+        return [] if channel is None else [session.encode.set_target(channel, LINE_HIGH if high else 4000)]
 
     def _restore(self, session: MaestroSession) -> None:
         """Send everything a Maestro forgets at power-up or loses by an error."""

@@ -1,6 +1,6 @@
 """IMU driver: what the unit streams becomes angular velocities and specific forces."""
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from monstertruck_drivers.link import Link, Port
 from monstertruck_drivers.wt61.config import ImuCorrection, Wt61Config
@@ -9,9 +9,6 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.sensor import Imu, Vector3
-
-LISTEN: Final = 0.6
-"""Seconds to receive a packet of a streaming unit; it needs half of one after power-up."""
 
 
 class ImuSample(NamedTuple):
@@ -81,7 +78,8 @@ class Wt61Session:
             if remedy:
                 self._link.write(remedy)
             try:
-                return await self.receive(LISTEN)
+                # 0.6: seconds to receive a packet of a streaming unit; it needs half of one after power-up
+                return await self.receive(0.6)
             except DeviceTimeoutError:
                 continue
             except ProtocolError as error:

@@ -12,12 +12,6 @@ from monstertruck_drivers.wt61.protocol import BAUD, RATE, TOGGLE_SLEEP, Wt61Kin
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-BOOT: Final = 300_000_000
-"""Nanoseconds from power-up to the first packet."""
-_COUNT_NOISE: Final = 2.0
-"""Standard deviation of the converters, in their own counts."""
-
-
 REPORTED: Final = (
     *(f"{kind.name.lower()}_{axis}" for kind in (Wt61Kind.ACCELERATION, Wt61Kind.ANGULAR_VELOCITY) for axis in "xyz"),
     "temperature",
@@ -73,7 +67,7 @@ class Wt61Emulator:
         """Supply off and on: it is awake again."""
         self._faults["asleep"] = False
         self._torn = True
-        self._awake_at = self._clock.now() + BOOT
+        self._awake_at = self._clock.now() + 300_000_000  # nanoseconds from power-up to the first packet
 
     def inject(self, fault: str, *values: str) -> None:
         """Start or end a fault.
@@ -122,7 +116,8 @@ class Wt61Emulator:
         return b"".join(map(build, (self._noisy(force), self._noisy(rate), angle)))
 
     def _noisy(self, packet: Wt61Packet) -> Wt61Packet:
-        noise = np.rint(_COUNT_NOISE * self._rng.standard_normal(3)).astype(int).tolist()
+        # 2.0: standard deviation of the converters, in their own counts
+        noise = np.rint(2.0 * self._rng.standard_normal(3)).astype(int).tolist()
         report, name = self.signals.report, packet.kind.name.lower()
         x, y, z = (
             _count(report(f"{name}_{axis}", value + error))

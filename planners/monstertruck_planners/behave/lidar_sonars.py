@@ -22,10 +22,6 @@ from monstertruck_schemas.body import Mount
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan, SonarEcho, SonarRanges
 
-OPENING: Final = 0.01
-"""Opening angle that the messages state, rad: that of a beam."""
-JOINED: Final = 0.15
-"""Greatest distance of neighbouring points of one surface, m, and its share of their range, where that is more."""
 JOINED_SHARE: Final = 0.1
 
 
@@ -74,7 +70,8 @@ def sonars_of(scan: LaserScan, mount: tuple[float, float, float], config: LidarS
     ])  # fmt: skip
     around = np.resize(np.arange(len(ranges)), len(ranges) + bool(len(ranges)))  # to the first beam again
     apart = np.hypot(*np.diff(points[around], axis=0).T)
-    joined = valid & valid[around[1:]] & (apart <= np.maximum(JOINED, JOINED_SHARE * ranges[around[1:]]))
+    # 0.15: greatest distance of neighbouring points of one surface, m, and its share of their range, where that is more
+    joined = valid & valid[around[1:]] & (apart <= np.maximum(0.15, JOINED_SHARE * ranges[around[1:]]))
     if not is_full_turn(len(ranges), scan.angle_increment):
         joined[-1:] = False
     known = valid | (scan.codes <= NO_ECHO)
@@ -146,7 +143,7 @@ class LidarSonars:
                     received=self._clock.now(),
                     seq=self._out.next_seq(),
                     sonars=sonars_of(scan, self._mount, self._config),
-                    field_of_view=OPENING,
+                    field_of_view=0.01,  # opening angle that the messages state, rad: that of a beam
                     range_min=self._config.range_min,
                     range_max=self._config.range_max,
                 )
