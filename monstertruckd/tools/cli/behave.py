@@ -35,7 +35,7 @@ def list_command(
                 return {}
             raise
 
-    found = with_robot(main, robot, endpoint)
+    found = with_robot(main, robot, endpoint, named=False)
     if json_output:
         print_json(found)
     elif found:
@@ -61,7 +61,7 @@ def start_command(
             raise NotFoundError(f"no behaviour {name!r}: expected one of {', '.join(known)}")
         return await run_behaviour(client, name, arm=arm)
 
-    end = with_robot(main, robot, endpoint, orders=True)
+    end = with_robot(main, robot, endpoint)
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 
@@ -74,4 +74,4 @@ def stop_command(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAUL
         await require_section(client, "behaviours", WITHOUT)
         await client.behave(BehaviourOrder.STOP)
 
-    with_robot(main, robot, endpoint, orders=True)
+    with_robot(main, robot, endpoint)

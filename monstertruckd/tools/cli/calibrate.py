@@ -212,7 +212,7 @@ def show(
         left = [] if file is None else unused(loaded, file.results.values())
         state: dict[str, Any] = {"folder": str(store.folder), "newest": newest, "content": file, "unused": left}
     else:
-        state = with_robot(lambda client, _: client.call(SHOW), robot, endpoint, TIMEOUT)
+        state = with_robot(lambda client, _: client.call(SHOW), robot, endpoint, TIMEOUT, named=False)
         file = _file(state)
     if json_output:
         print_json(state)

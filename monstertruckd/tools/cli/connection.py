@@ -26,7 +26,7 @@ def with_robot(
     endpoint: str,
     timeout: float = 2.5,
     *,
-    orders: bool = False,
+    named: bool = True,
 ) -> T:
     """Connect, run ``main(client, clock)``, and return what it returns; a link that takes long is said to be awaited.
 
@@ -35,7 +35,7 @@ def with_robot(
         robot: its name.
         endpoint: where it listens.
         timeout: seconds to wait for the link and for answers.
-        orders: ``main`` gives an order; print the name and host of the robot first.
+        named: print the robot's name and host first; False for commands that only read, or print it themselves.
 
     Raises:
         NotFoundError: no robot answers there.
@@ -50,7 +50,7 @@ def with_robot(
         try:
             async with TruckClient(robot, endpoint, clock=clock, timeout=timeout) as client:
                 waiting.cancel()
-                if orders:
+                if named:
                     remark(f"robot: {robot_on_host(robot, endpoint)}")
                 return await main(client, clock)
         finally:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, robot_on_host
 from monstertruckd.tools.cli.connection import robot_config
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_config
 from monstertruckd.tools.cli.output import JsonOption, console, finish, print_json, remark
@@ -60,6 +60,8 @@ def doctor(
         found = await examine(context)
         return found + (await _drive(robot, endpoint, clock, context.command) if drive else [])
 
+    if drive:
+        remark(f"robot: {robot_on_host(robot, endpoint)}")
     if drive and not (yes or typer.confirm(CLEAR, err=True)):
         drive = False
     findings = run_wall(all_findings)

@@ -69,7 +69,7 @@ def explore(
         report = None if json_output else print_words
         return await run_exploration(client, home=home, budget=seconds, find=find, arm=arm, report=report)
 
-    end = with_robot(main, robot, endpoint, orders=True)
+    end = with_robot(main, robot, endpoint)
     if end is None:
         return
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)

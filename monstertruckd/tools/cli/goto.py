@@ -46,7 +46,7 @@ def goto(
         with on_the_terminal() as report:
             return await drive_to(client, clock, (x, y, yaw), places, arm=arm, report=report)
 
-    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT, orders=True)
+    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT)
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 
@@ -75,7 +75,7 @@ def track(
         with on_the_terminal() as report:
             return await follow(client, clock, there, arm=arm, report=report)
 
-    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT, orders=True)
+    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT)
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 
@@ -103,7 +103,7 @@ def path(
         with on_the_terminal() as report:
             return await drive_configured(client, clock, name, arm=arm, report=report)
 
-    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT, orders=True)
+    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT)
     if isinstance(end, str):
         print_json({"path": end}) if json_output else typer.echo(end)
     else:

@@ -143,14 +143,14 @@ def fetch_command(
     from monstertruck_runtime.recordings import fetch_recording
 
     if name is None:
-        answer = with_robot(lambda client, _: client.call("recordings"), robot, endpoint)
+        answer = with_robot(lambda client, _: client.call("recordings"), robot, endpoint, named=False)
         _show_recordings(answer["recordings"], json_output=json_output)
         if left_out := answer.get("left_out"):
             remark(f"{left_out} older ones are not listed")
         return
     to = output or Path(Path(name).name)
     with progress(f"fetching {name}", 1.0) as shown:
-        size = with_robot(lambda client, _: fetch_recording(client, name, to, shown), robot, endpoint, 5.0)
+        size = with_robot(lambda client, _: fetch_recording(client, name, to, shown), robot, endpoint, 5.0, named=False)
     if json_output:
         print_json({"name": name, "file": str(to), "bytes": size})
     else:

@@ -257,7 +257,7 @@ def save(
                     text += ": its configuration has no section `slam`, as configs/slam.yaml has"
                 raise NoAnswerError(text + await not_ready(client)) from None
 
-    grid = with_robot(newest, robot, endpoint)
+    grid = with_robot(newest, robot, endpoint, named=False)
     cells = grid.cells.reshape(grid.height, grid.width)
     save_map(trinary(GridPatch(cells, (grid.origin.x, grid.origin.y), grid.resolution)), output.with_suffix(".yaml"))
     remark(f"wrote {output.with_suffix('.yaml')}")

@@ -48,7 +48,7 @@ def run_command(
         await require_section(client, "planner", WITHOUT)
         return await run_mission(client, mission, arm=arm, moved=moved, report=None if json_output else print_words)
 
-    end = with_robot(main, robot, endpoint, orders=True)
+    end = with_robot(main, robot, endpoint)
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 
@@ -112,7 +112,7 @@ def stop_command(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAUL
         await require_section(client, "planner", WITHOUT)
         await client.mission(MissionOrder.STOP)
 
-    with_robot(main, robot, endpoint, orders=True)
+    with_robot(main, robot, endpoint)
 
 
 def load(file: Path) -> "Mission":

@@ -69,7 +69,7 @@ def move(
     async def main(client: "TruckClient", _: "Clock") -> "RunEnd":
         return await run_behaviour(client, "move", arm=arm, settings=settings)
 
-    end = with_robot(main, robot, endpoint, orders=True)
+    end = with_robot(main, robot, endpoint)
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 

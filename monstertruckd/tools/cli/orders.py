@@ -120,7 +120,7 @@ def _run(name: str, robot: str, endpoint: str, *, json_output: bool, hold: bool 
             await _announce(client, hold=hold)
         return await give(client, order, hold=hold)
 
-    outcome = with_robot(main, robot, endpoint)
+    outcome = with_robot(main, robot, endpoint, named=False)
     place = robot_on_host(robot, endpoint)
     if json_output:
         print_json(outcome.as_json() | {"robot": place})

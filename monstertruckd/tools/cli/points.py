@@ -93,7 +93,7 @@ def goto_command(
         with on_the_terminal() as report:
             return await drive_to(client, clock, (pose.x, pose.y, pose.yaw), [], arm=arm, report=report)
 
-    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT, orders=True)
+    end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT)
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)
 
 
@@ -135,7 +135,7 @@ def _points(folder: Path | None, robot: str, endpoint: str) -> "list[PointOfInte
         if not (points := [point for point, _ in load(folder)]):
             raise NotFoundError(f"{folder}: no {FILE} in it")
         return points
-    return with_robot(_newest, robot, endpoint)
+    return with_robot(_newest, robot, endpoint, named=False)
 
 
 def _order(order: "PointOrder", robot: str, endpoint: str, *what: Any) -> dict[str, Any]:
@@ -143,7 +143,7 @@ def _order(order: "PointOrder", robot: str, endpoint: str, *what: Any) -> dict[s
         await require_section(client, "points", WITHOUT)
         return await client.point(order, *what)
 
-    return with_robot(main, robot, endpoint, orders=True)
+    return with_robot(main, robot, endpoint)
 
 
 async def _newest(client: "TruckClient", clock: "Clock") -> "list[PointOfInterest]":

@@ -26,7 +26,7 @@ def get(
     """
     rows = [
         row
-        for row in with_robot(lambda client, _: client.call("settings"), robot, endpoint)["settings"]
+        for row in with_robot(lambda client, _: client.call("settings"), robot, endpoint, named=False)["settings"]
         if _below(row["key"], key)
     ]
     if not rows:
@@ -57,7 +57,7 @@ def set_value(
     it is forgotten when the daemon ends.
     """
     change = {"values": {key: _parsed(key, value)}, "save": save}
-    answer = with_robot(lambda client, _: client.call("set", change), robot, endpoint, orders=True)
+    answer = with_robot(lambda client, _: client.call("set", change), robot, endpoint)
     if json_output:
         print_json(answer)
     else:

@@ -22,7 +22,11 @@ def usb(
     from monstertruck_runtime.clock import run_wall
     from monstertruckd.tools.cli.usb_tree import draw, local_tree, plain, robot_tree
 
-    nodes = run_wall(local_tree) if local else with_robot(lambda client, _: robot_tree(client), robot, endpoint)
+    nodes = (
+        run_wall(local_tree)
+        if local
+        else with_robot(lambda client, _: robot_tree(client), robot, endpoint, named=False)
+    )
     if json_output:
         print_json(nodes)
     elif not nodes:

@@ -72,7 +72,7 @@ def test_a_robot_that_is_awaited_is_named_before_the_wait_ends(
     async def main(client: object, clock: object) -> None:
         await asyncio.sleep(0.1)
 
-    connection.with_robot(main, "truck", "tcp/there:1")
+    connection.with_robot(main, "truck", "tcp/there:1", named=False)
     assert capsys.readouterr().err == "", "one that is there is not awaited"
 
 

@@ -121,7 +121,7 @@ def test_no_answer_is_no_outcome(error: TruckError):
 def shown(
     monkeypatch: pytest.MonkeyPatch, command: Callable[..., None], outcome: OrderOutcome, *, json_output: bool = False
 ) -> int:
-    monkeypatch.setattr(orders, "with_robot", lambda *_: outcome)
+    monkeypatch.setattr(orders, "with_robot", lambda *_, **__: outcome)
     try:
         command("truck", "tcp/127.0.0.1:1", json_output)
     except typer.Exit as ended:
