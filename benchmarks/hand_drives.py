@@ -4,10 +4,10 @@
 
 Each drive lasts a minute and begins at a random place, the truck put down by hand. The operator asks for a random speed
 forward or in reverse, with a random steering mode and angle, and changes all of them every 0.5 to 4 s, whatever is in
-the way. With a share of --confirm of these motions the operator holds the second action that lets the truck drive into
-unseen ground; contacts then are counted apart, with the time until the gate moves the truck away from the obstacle. A
-contact that the gate does not notice while the operator goes on, or from which it does not back off, is counted as
-unnoticed.
+the way; one whose truck has been kept standing for 1 s asks for the other direction. With a share of --confirm of these
+motions the operator holds the second action that lets the truck drive into unseen ground; contacts then are counted
+apart, with the time until the gate moves the truck away from the obstacle. A contact that the gate does not notice
+while the operator goes on, or from which it does not back off, is counted as unnoticed.
 
 Drives are kept in ``runs/hand_drives.jsonl``, so that a run that ended early (``--minutes``) goes on where it was; one
 of other sources begins anew.
@@ -55,6 +55,8 @@ SPEEDS = (0.03, 0.25)
 """Speeds asked for, m/s: up to more than the gate allows."""
 CHANGES = (0.5, 4.0)
 """Seconds between two changes of the operator's mind."""
+GIVES_UP = 1.0
+"""Seconds of standing after which the operator asks for the other direction."""
 PERIOD = 0.05
 """Seconds between two requests."""
 DRIVE = 60.0
@@ -65,15 +67,13 @@ BACKED_WITHIN = 2.5
 """Seconds after which the truck has backed off, if the operator goes on for so long."""
 BACKED = 0.02
 """Distance from the place of a contact, m."""
-PER_TRUCK = 5
-"""Drives of one daemon, with a carry in between."""
 OUTPUT = ROOT / "runs" / "hand_drives.jsonl"
 SOURCES = ("monstertruckd", "drivers", "planners", "schemas", "configs", "benchmarks/hand_drives.py")
 """A drive is kept for as long as these stay as they are."""
 
 
-Leg = tuple[str, int, int]
-"""World, first number and count of drives."""
+Place = tuple[str, int]
+"""World, and number of the drive in it."""
 
 
 @dataclass
@@ -157,19 +157,20 @@ async def drive(
 ) -> None:
     """Drive for a minute; counts what happens."""
     gate = rig.bus.subscribe(topics.GATE, latest())
-    change, speed, front, rear, unseen, name = 0, 0.0, 0.0, 0.0, False, ""
+    change, speed, front, rear, unseen, name, stood = 0, 0.0, 0.0, 0.0, False, "", 0.0
     end = clock.now() + round(DRIVE * SECOND)
     touched: _Touch | None = None
     last = rig.world.truth(clock.now())
     stuck = last.stuck
     while clock.now() < end:
         now = clock.now()
-        if now >= change:
+        if now >= change or stood >= GIVES_UP:
             end_touch(touched, now, out)
             touched = None
             name, (of_front, of_rear) = rng.choice(list(MODES.items()))
             angle = rng.uniform(-ANGLE, ANGLE)
-            speed = rng.choice((-1, 1)) * rng.uniform(*SPEEDS)
+            sign = rng.choice((-1, 1)) if stood < GIVES_UP else -math.copysign(1.0, speed)
+            speed, stood = sign * rng.uniform(*SPEEDS), 0.0
             front, rear = angle * of_front, angle * of_rear
             unseen = rng.random() < confirm
             change = now + round(rng.uniform(*CHANGES) * SECOND)
@@ -191,8 +192,11 @@ async def drive(
         state = gate.latest
         if state is not None and way < 0.005 * PERIOD:
             out.kept += PERIOD
+            stood += PERIOD
             direction = "forward" if speed > 0 else "in reverse"
             out.reasons.update(f"{direction}: {reason}" for reason in (state.reasons or ("no reason",)))
+        else:
+            stood = 0.0
         if true.stuck and not stuck:
             why = f"{out.world} {out.number}: {name} at {speed:.2f} m/s, truly {last.v:.3f}"
             backs_off = state is not None and Reason.CONTACT in state.reasons
@@ -207,37 +211,27 @@ async def drive(
     rig.bus.inject(topics.REQ_DRIVE, DriveRequest(**await hand.header(0.25), speed=0.0, front=0.0, rear=0.0))
 
 
-def leg(world: str, first: int, count: int, seed: int, confirm: float) -> list[Drive]:
-    """Some drives of one truck."""
+def driven(world: str, number: int, seed: int, confirm: float) -> Drive:
+    """Drive once with a truck and a daemon of its own."""
 
-    async def main(clock: VirtualClock) -> list[Drive]:
-        drives = []
-        rng = random.Random(f"{seed} {world} {first}")
-        rig = VirtualRig(truck(world, seed + first), clock)
+    async def main(clock: VirtualClock) -> Drive:
+        out = Drive(world, number)
+        rng = random.Random(f"{seed} {world} {number}")
+        rig = VirtualRig(truck(world, seed + number), clock)
         async with rig.running():
             await clock.sleep(3.0)
-            hand = LocalOperator(rig.daemon, clock, "hand", Role.GAMEPAD)
-            for number in range(first, first + count):
-                drives.append(Drive(world, number))
-                await put(rig, clock, rng)
-                await clock.sleep(1.0)
-                await drive(rig, clock, hand, rng, confirm, drives[-1])
-                await clock.sleep(1.0)
-                await hand.order(Order.DISARM)
-                await clock.sleep(1.0)
-        return drives
+            await put(rig, clock, rng)
+            await clock.sleep(1.0)
+            await drive(rig, clock, LocalOperator(rig.daemon, clock, "hand", Role.GAMEPAD), rng, confirm, out)
+        return out
 
     return run_virtual(main, start=SECOND)
 
 
-def legs(worlds: Iterable[str], count: int) -> Iterable[Leg]:
-    """Every leg: evenly over the worlds, and so from the start."""
+def places(worlds: Iterable[str], count: int) -> Iterable[Place]:
+    """Every drive: evenly over the worlds, and so from the start."""
     worlds = tuple(worlds)
-    totals = {world: count // len(worlds) + (index < count % len(worlds)) for index, world in enumerate(worlds)}
-    for first in range(0, count, PER_TRUCK):
-        for world, total in totals.items():
-            if first < total:
-                yield world, first, min(PER_TRUCK, total - first)
+    return ((worlds[index % len(worlds)], index // len(worlds)) for index in range(count))
 
 
 def digest(options: argparse.Namespace) -> str:
@@ -250,34 +244,27 @@ def digest(options: argparse.Namespace) -> str:
     return made.hexdigest()
 
 
-def kept(name: str) -> dict[Leg, list[Drive]]:
+def kept(name: str) -> dict[Place, Drive]:
     """Drives of earlier runs with this digest."""
     lines = OUTPUT.read_text(encoding="utf-8").splitlines() if OUTPUT.exists() else []
-    return {
-        (entry["world"], entry["first"], len(entry["drives"])): [
-            Drive(**{**one, "reasons": Counter(one["reasons"])}) for one in entry["drives"]
-        ]
-        for entry in map(json.loads, lines)
-        if entry["digest"] == name
-    }
+    entries = [entry for entry in map(json.loads, lines) if entry.pop("digest") == name]
+    return {(e["world"], e["number"]): Drive(**{**e, "reasons": Counter(e["reasons"])}) for e in entries}
 
 
-def driven(options: argparse.Namespace) -> list[Drive]:
+def drives(options: argparse.Namespace) -> list[Drive]:
     """All drives that the time allows, those of earlier runs included."""
     end, name = perf_counter() + 60 * options.minutes, digest(options)
-    found = kept(name)
-    work = list(legs(options.worlds, options.count))
-    todo = [one for one in work if one not in found]
+    found, every = kept(name), list(places(options.worlds, options.count))
+    todo = [place for place in every if place not in found]
     OUTPUT.parent.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(options.jobs) as pool, OUTPUT.open("a", encoding="utf-8") as out:
         while todo and perf_counter() < end:
             some, todo = todo[: options.jobs], todo[options.jobs :]
-            running = [pool.submit(leg, *one, options.seed, options.confirm) for one in some]
-            for one, done in zip(some, running, strict=True):
-                found[one] = done.result()
-                entry = {"digest": name, "world": one[0], "first": one[1], "drives": list(map(asdict, found[one]))}
-                print(json.dumps(entry), file=out, flush=True)
-    return [drive for one in work if one in found for drive in found[one]]
+            running = [pool.submit(driven, *place, options.seed, options.confirm) for place in some]
+            for place, done in zip(some, running, strict=True):
+                found[place] = done.result()
+                print(json.dumps({"digest": name, **asdict(found[place])}), file=out, flush=True)
+    return [found[place] for place in every if place in found]
 
 
 def main() -> int:
@@ -291,11 +278,11 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=math.inf, help="begin no drive after this time")
     arguments = parser.parse_args()
     began = perf_counter()
-    drives = driven(arguments)
+    done = drives(arguments)
     print("| world | drives | forward m | reverse m | kept standing | contacts | confirmed contacts |")
     print("|---|---:|---:|---:|---:|---:|---:|")
     by_world: dict[str, list[Drive]] = defaultdict(list)
-    for one in drives:
+    for one in done:
         by_world[one.world].append(one)
     for world, ones in by_world.items():
         kept = sum(one.kept for one in ones) / (len(ones) * DRIVE)
@@ -303,21 +290,21 @@ def main() -> int:
             f"| {world} | {len(ones)} | {sum(o.forward for o in ones):.1f} | {sum(o.reverse for o in ones):.1f} | "
             f"{kept:.0%} | {sum(len(o.contacts) for o in ones)} | {sum(len(o.confirmed + o.unnoticed) for o in ones)} |"
         )
-    for one in drives:
+    for one in done:
         for contact in (*one.contacts, *(f"unnoticed: {why}" for why in one.unnoticed)):
             print(contact)
-    reasons: Counter[str] = sum((one.reasons for one in drives), Counter())
+    reasons: Counter[str] = sum((one.reasons for one in done), Counter())
     print("kept standing by:", ", ".join(f"{name} {count * PERIOD:.0f} s" for name, count in reasons.most_common(8)))
-    noticed = [seconds for one in drives for seconds in one.confirmed]
-    backed = [metres for one in drives for metres in one.backed]
+    noticed = [seconds for one in done for seconds in one.confirmed]
+    backed = [metres for one in done for metres in one.backed]
     figures = {
-        "drives": len(drives),
-        "contacts": sum(len(one.contacts) for one in drives),
-        "forward_m": round(sum(one.forward for one in drives), 1),
-        "reverse_m": round(sum(one.reverse for one in drives), 1),
-        "kept_standing": round(sum(one.kept for one in drives) / (len(drives) * DRIVE), 3),
-        "confirmed_contacts": len(noticed) + sum(len(one.unnoticed) for one in drives),
-        "unnoticed": sum(len(one.unnoticed) for one in drives),
+        "drives": len(done),
+        "contacts": sum(len(one.contacts) for one in done),
+        "forward_m": round(sum(one.forward for one in done), 1),
+        "reverse_m": round(sum(one.reverse for one in done), 1),
+        "kept_standing": round(sum(one.kept for one in done) / (len(done) * DRIVE), 3),
+        "confirmed_contacts": len(noticed) + sum(len(one.unnoticed) for one in done),
+        "unnoticed": sum(len(one.unnoticed) for one in done),
         "noticed_max_s": round(max(noticed), 2) if noticed else None,
         "backed_off_least_m": round(min(backed), 3) if backed else None,
         "real_s": round(perf_counter() - began, 1),
