@@ -24,7 +24,6 @@ export class Drive {
     this.last = "stick";
     this.grace = 0;
     this.unseen = 0; // until then, or while the hand then drives on, the button counts
-    this.unseenKey = false;
     this.byId = (id) => document.getElementById(id);
     this.steering = this.byId("steering");
     this.speed = this.byId("speed");
@@ -85,12 +84,11 @@ export class Drive {
   key(event, down) {
     const name = ARROWS[event.key] && document.activeElement?.id === "stick" ? ARROWS[event.key] : event.key.toLowerCase();
     // By its place: with Shift or AltGr a key that is released has another name than when it was pressed.
-    if (name === UNSEEN) this.unseenKey = down && !typing(event) && !event.ctrlKey && !event.altKey && !event.metaKey;
     if (!down) return void this.held.delete(event.code);
     // While Meta is held, no release of another key is seen.
     if (event.ctrlKey || event.altKey || event.metaKey) return void this.held.clear();
     if (typing(event)) return;
-    if (name in KEYS) {
+    if (name in KEYS || name === UNSEEN) {
       this.held.set(event.code, name);
       event.preventDefault();
     } else if (MODES[Number(name) - 1] && !event.repeat) {
@@ -103,7 +101,6 @@ export class Drive {
     this.held.clear();
     this.stick = this.pointer = null;
     this.grace = this.unseen = 0;
-    this.unseenKey = false;
   }
 
   /** Keep a truck armed while the hand moves to the stick. */
@@ -114,8 +111,9 @@ export class Drive {
   /** What the hand says now: [input, sideways, ahead], each -1..1; null = no hand. */
   input() {
     if (this.stick) return ["stick", ...this.stick];
-    if (this.held.size) {
-      const sum = [...new Set(this.held.values())].map((key) => KEYS[key]).reduce(([x, y], [kx, ky]) => [x + kx, y + ky], [0, 0]);
+    const keys = [...new Set(this.held.values())].filter((name) => name in KEYS);
+    if (keys.length) {
+      const sum = keys.map((key) => KEYS[key]).reduce(([x, y], [kx, ky]) => [x + kx, y + ky], [0, 0]);
       return ["keys", ...sum];
     }
     // A gamepad is read by every page that is in view: it drives the robot of the one that has the focus.
@@ -131,7 +129,7 @@ export class Drive {
 
   /** Whether the operator confirms, by button, key or gamepad, that the truck drives into unseen ground. */
   confirms() {
-    return this.unseen > 0 || this.unseenKey || Boolean(this.pad?.buttons[4]?.pressed);
+    return this.unseen > 0 || [...this.held.values()].includes(UNSEEN) || Boolean(this.pad?.buttons[4]?.pressed);
   }
 
   /** Speed allowed by the slider and by the delay: lease and round trip together cost BLIND metres at most. */

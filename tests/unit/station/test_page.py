@@ -9,7 +9,7 @@ from playwright.async_api import Page
 
 from monstertruck_schemas.event import Cause, Stop
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.state import GateMode
+from monstertruck_schemas.state import GateMode, GateState
 from tests.daemon.browser_kit import NEEDS_CHROMIUM, chromium
 from tests.unit.station.test_server import serving
 
@@ -46,6 +46,11 @@ FACTS = {
 
 async def say(page: Page, *messages: dict[str, Any]) -> None:
     await page.evaluate("(messages) => say(...messages)", list(messages))
+
+
+def gate_says(mode: GateMode, **fields: Any) -> dict[str, Any]:
+    state = GateState(stamp=10**9, received=10**9, seq=1, mode=mode, nonce="n", speed_limit=0.0, **fields)
+    return {"kind": "gate", "m": state.model_dump(mode="json")}
 
 
 async def beats(page: Page, seconds: float = 0.12) -> list[dict[str, Any]]:
@@ -89,6 +94,57 @@ async def nothing_drives_once_the_hand_is_gone(page: Page) -> None:
     await page.evaluate(f"document.querySelector('#stick').dispatchEvent({loose})")
     assert not await beats(page), "a mouse without a button pressed holds no stick"
     await page.mouse.up()
+
+
+async def unseen_ground_is_confirmed_only_while_the_hand_says_so(page: Page) -> None:
+    async def confirmed() -> set[bool]:
+        sent = {beat["unseen"] for beat in await beats(page)}
+        assert (await page.get_attribute("#unseen", "aria-pressed") == "true") is (True in sent)
+        return sent
+
+    await page.focus("#stick")
+    await page.keyboard.down("v")
+    assert not await beats(page), "this key alone moves nothing"
+    await page.keyboard.down("s")
+    assert await confirmed() == {True}
+    await page.keyboard.up("v")
+    assert await confirmed() == {False}
+    key = "new KeyboardEvent('{}', {{ key: '{}', code: 'KeyV', bubbles: true }})"
+    for release in (key.format("keyup", "√"), "new FocusEvent('blur')"):
+        await page.evaluate(f"window.dispatchEvent({key.format('keydown', 'v')})")
+        await page.keyboard.down("s")
+        assert await confirmed() == {True}, release
+        await page.evaluate(f"window.dispatchEvent({release})")
+        await page.keyboard.down("s")
+        assert await confirmed() == {False}, release
+    await page.keyboard.up("s")
+
+    await page.click("#unseen")
+    await page.wait_for_selector("#unseen[aria-pressed=true]")  # it waits for the hand
+    for expected in (True, False):  # the second hand has not said so
+        await page.keyboard.down("s")
+        assert await confirmed() == {expected}
+        await page.keyboard.up("s")
+        assert not await beats(page, 0.4)
+    await page.click("#unseen")
+    await page.click("#unseen")
+    await page.keyboard.down("s")
+    assert await confirmed() == {False}, "pressed twice"
+    await page.keyboard.up("s")
+
+    await say(page, gate_says(GateMode.DRIVING, holder="ann", reasons=(Reason.UNSEEN_DRIVE,)))
+    await page.locator("#reasons", has_text="unseen ground").wait_for()
+
+
+async def a_robot_that_has_yet_to_stand_is_shown_stopping_and_cannot_be_armed(page: Page) -> None:
+    for mode, name in ((GateMode.DISARMED, "Disarmed"), (GateMode.ESTOPPED, "Emergency stop")):
+        await say(page, gate_says(mode, stopping=True))
+        await page.wait_for_selector(f"#mode-name:text-is('{name}, stopping')")
+        assert await page.text_content("#chip-mode") == f"{name}, stopping"
+        assert await page.is_disabled("#arm")
+        await say(page, gate_says(mode))
+        await page.wait_for_selector(f"#mode-name:text-is('{name}')")
+        assert await page.is_disabled("#arm") is (mode is GateMode.ESTOPPED)
 
 
 async def a_gamepad_drives_the_robot_of_the_page_that_has_the_focus(page: Page) -> None:
@@ -264,6 +320,8 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await say(page, {"kind": "robots", "names": ["truck"]}, {"kind": "robot", "name": "truck"}, FACTS)
         await say(page, {"kind": "link", "alive": True, "round_trip": 0.02, "text": ""})
         await nothing_drives_once_the_hand_is_gone(page)
+        await unseen_ground_is_confirmed_only_while_the_hand_says_so(page)
+        await a_robot_that_has_yet_to_stand_is_shown_stopping_and_cannot_be_armed(page)
         await a_gamepad_drives_the_robot_of_the_page_that_has_the_focus(page)
         await an_unknown_way_is_taken_to_be_slow(page)
         await parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page)
