@@ -12,6 +12,7 @@ from enum import StrEnum
 from typing import Any, Final, Literal, NamedTuple, cast
 
 from monstertruck_drivers.ax12.protocol import BAUD as AX12_BAUD
+from monstertruck_drivers.bno085.protocol import BAUD as BNO085_BAUD
 from monstertruck_drivers.emulation import EmulatorFactory
 from monstertruck_drivers.epos.protocol import BAUD as EPOS_BAUD
 from monstertruck_drivers.os4000.protocol import FACTORY_BAUD as OS4000_BAUD
@@ -234,6 +235,9 @@ class DeviceKind(Plugin):
     """Place ``module:function`` of its ``EmulatorFactory``."""
     probe: str
     """Place ``module:function`` of its ``Probe``."""
+    also: Mapping[str, Topic[Any]] = field(default_factory=dict)
+    """Topics that it writes besides those of its role, by the driver's parameter. The driver gets None where another
+    device that is configured has the topic as its own."""
     opens: Literal["serial", "video", "computer"] = "serial"
     """What driver and probe get: a serial ``Port``, a ``FrameSource`` (the probe: a path), or the ``Computer``."""
     baud: int | None = None
@@ -281,9 +285,10 @@ class DeviceCatalog(Catalog[DeviceKind]):
                 return f"role {role.name}: actuators are this repository's alone"
             if self._roles.get(role.name, role) != role:
                 return f"role {role.name}: there is another one of that name"
-            if not_its := [t.name for t in role.writes.values() if t.writer is not Writer.DRIVER]:
+            written = (*role.writes.values(), *row.also.values())
+            if not_its := [t.name for t in written if t.writer is not Writer.DRIVER]:
                 return f"role {role.name}: drivers do not write {', '.join(not_its)}"
-            if unknown := [t.name for t in role.writes.values() if topics.BY_NAME.get(t.name) != t]:
+            if unknown := [t.name for t in written if topics.BY_NAME.get(t.name) != t]:
                 return f"role {role.name}: {', '.join(unknown)} is no entry point of monstertruck.topics"
         self._roles.update({role.name: role for role in row.roles})
         return None
@@ -407,6 +412,18 @@ DEVICES: Final = DeviceCatalog(
         probe="monstertruck_drivers.wt61.probe:probe",
         baud=WT61_BAUD,
         usb=UsbIdentity("1a86:7523", "USB2.0-Serial", "ttyUSB"),
+    ),
+    DeviceKind(
+        name="bno085",
+        doc="CEVA BNO085 in UART-RVC mode: turn rate, specific force, tilt",
+        roles=(IMU,),
+        also={"attitude": topics.COMPASS},
+        settings="monstertruck_drivers.bno085.config:Bno085Config",
+        implementation="monstertruck_drivers.bno085.driver:Bno085Driver",
+        emulator="monstertruck_drivers.bno085.emulator:emulated",
+        probe="monstertruck_drivers.bno085.probe:probe",
+        baud=BNO085_BAUD,
+        usb=UsbIdentity("10c4:ea60", "CP2102 USB to UART Bridge Controller", "ttyUSB"),
     ),
     DeviceKind(
         name="roboclaw",

@@ -6,7 +6,7 @@ from typing import Any
 
 from monstertruck_drivers.catalog import DEVICES, Duty, RoleSpec
 from monstertruck_drivers.computer import Computer, Machine
-from monstertruck_drivers.config import AnyPort, kind_of
+from monstertruck_drivers.config import AnyPort, Device, kind_of
 from monstertruck_drivers.link import BAUD, Port
 from monstertruck_drivers.tty import SerialPort
 from monstertruck_drivers.usb.config import UsbPortConfig
@@ -25,7 +25,7 @@ from monstertruck_schemas.base import Schema
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.topics import Writer
+from monstertruck_schemas.topics import Topic, Writer
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.device_safety import packs
 from monstertruckd.config.truck import TruckConfig
@@ -143,7 +143,8 @@ def build_drivers(
             case "computer":
                 where = computer
         ends: dict[str, Any] = {name: bus.subscribe(topic, latest()) for name, topic in role.reads.items()}
-        ends |= {name: _publisher(role, name, roles, config, bus) for name in role.writes}
+        written = {**role.writes, **kind.also}
+        ends |= {name: _publisher(role, topic, roles, config, bus) for name, topic in written.items()}
         driver = kind.implementation_class()
         drivers[role.name] = driver(settings[role.name], where, clock, **ends, events=bus.event_sink(), name=role.name)
     return drivers
@@ -153,10 +154,17 @@ def sensor_services(config: TruckConfig) -> dict[str, Reason]:
     """Services that write what the gate needs, with the reason their loss gives."""
     return {
         role: STALE_TOPICS[topic]
-        for role in config.devices.present()
-        for topic in reversed([*DEVICES.roles[role].writes.values()])  # of several, its own topic's
+        for role, device in config.devices.present().items()
+        for topic in reversed(_written(role, device, config))  # of several, its own topic's
         if topic in STALE_TOPICS
     }
+
+
+def _written(role: str, device: Device[Any], config: TruckConfig) -> list[Topic[Any]]:
+    """Topics that a device writes, its own first, without those that are another configured device's own."""
+    others = {DEVICES.roles[other].topic.name for other in config.devices.present() if other != role}
+    topics = (*DEVICES.roles[role].writes.values(), *device.kind.also.values())
+    return [topic for topic in topics if topic.name not in others]
 
 
 def measures_battery(config: TruckConfig) -> bool:
@@ -170,10 +178,9 @@ def of_duty(drivers: Mapping[str, Service], *duties: Duty) -> dict[str, Service]
 
 
 def _publisher(
-    role: RoleSpec, name: str, roles: Mapping[str, RoleSpec], config: TruckConfig, bus: Bus
+    role: RoleSpec, topic: Topic[Any], roles: Mapping[str, RoleSpec], config: TruckConfig, bus: Bus
 ) -> Publisher[Any] | None:
-    """Write end of one of a role's topics; None where it is another configured role's own."""
-    topic = role.writes[name]
+    """Write end of a topic for the device of a role; None where it is another configured role's own."""
     owner = next((other for other in roles.values() if other.topic is topic), role)
     if owner is not role:
         return None

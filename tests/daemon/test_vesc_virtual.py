@@ -26,14 +26,14 @@ devices:
   drive: null
   steering: null
   compass: null
+  {imu}
   actuators:
     driver:
       kind: vesc
       max_motor_rpm: 1000
       battery: {{ cells: 6 }}
       servo: {{ centre: 0.5, per_radian: 0.6, min: 0.1, max: 0.9, dead_time: 0.012, lag: 0.0 }}
-gate:
-  attitude: {{ stale_after: 0.25, critical: false }}
+{gate}
 sim:
   world:
     truck:
@@ -43,15 +43,20 @@ sim:
 """
 
 
-def car(folder: Path) -> SimulatedTruckConfig:
+BNO085 = "imu: { driver: { kind: bno085 } }"
+NO_ATTITUDE = "gate: { attitude: { stale_after: 0.25, critical: false } }"
+
+
+def car(folder: Path, imu: str = "", gate: str = NO_ATTITUDE) -> SimulatedTruckConfig:
     file = folder / "car.yaml"
-    file.write_text(CAR.format(robots=ROBOTS))
+    file.write_text(CAR.format(robots=ROBOTS, imu=imu, gate=gate))
     config, _ = load_config(file, SimulatedTruckConfig)
     return config.model_copy(update={"recorder": None})
 
 
-def test_it_drives_its_bend_without_a_compass(tmp_path: Path):
-    config = car(tmp_path)
+@pytest.mark.parametrize(("imu", "gate"), [("", NO_ATTITUDE), (BNO085, "")], ids=["no attitude", "BNO085"])
+def test_it_drives_its_bend_without_a_compass(tmp_path: Path, imu: str, gate: str):
+    config = car(tmp_path, imu, gate)
 
     async def main(clock: VirtualClock) -> None:
         rig = VirtualRig(config, clock)

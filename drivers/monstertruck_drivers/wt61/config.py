@@ -4,21 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from monstertruck_drivers.inertial import ImuCorrection
 from monstertruck_schemas.base import Schema
-
-
-class ImuCorrection(Schema):
-    """What is taken out of the measurements, as calibrated; the unit's own axes."""
-
-    rate_x: float = 0.0
-    """Bias of the angular velocity, rad/s"""
-    rate_y: float = 0.0
-    rate_z: float = 0.0
-    rate_scale: Annotated[float, Field(ge=0.5, le=2)] = 1.0
-    """Factor on the angular velocity about z, its bias taken out"""
-    force_x: float = 0.0
-    """Bias of the specific force, m/s^2"""
-    force_y: float = 0.0
 
 
 class Wt61Config(Schema):

@@ -2,13 +2,15 @@
 
 from typing import NamedTuple
 
+from monstertruck_drivers.inertial import corrected_force, corrected_rate, mean
 from monstertruck_drivers.link import Link, Port
-from monstertruck_drivers.wt61.config import ImuCorrection, Wt61Config
-from monstertruck_drivers.wt61.protocol import RATE, TOGGLE_SLEEP, Wt61Kind, Wt61Packet, Wt61Parser, Xyz
+from monstertruck_drivers.streaming import DeviceStream
+from monstertruck_drivers.wt61.config import Wt61Config
+from monstertruck_drivers.wt61.protocol import RATE, TOGGLE_SLEEP, Wt61Kind, Wt61Packet, Wt61Parser
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
-from monstertruck_schemas.sensor import Imu, Vector3
+from monstertruck_schemas.sensor import Imu
 
 
 class ImuSample(NamedTuple):
@@ -28,33 +30,13 @@ class Wt61Session:
 
     def __init__(self, link: Link, clock: Clock) -> None:
         self.parser = Wt61Parser()
-        self.bytes_heard = 0
         self._link = link
-        self._clock = clock
+        self._stream = DeviceStream(link, clock, lambda data: self._samples(self.parser.feed(data)))
         self._acceleration: Wt61Packet | None = None
 
     async def receive(self, within: float) -> list[ImuSample]:
-        """Samples that became complete.
-
-        Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
-            ProtocolError: bytes, but no measurement.
-        """
-        heard, name = self.bytes_heard, self._link.name
-        until = self._clock.now() + round(within * SECOND)
-        while True:
-            try:
-                data = await self._link.read(max(until - self._clock.now(), 0) / SECOND)
-            except TimeoutError:
-                if self.bytes_heard == heard:
-                    raise DeviceTimeoutError(f"{name}: silent for {within} s") from None
-                raise ProtocolError(f"{name}: {self.bytes_heard - heard} bytes, but no measurement") from None
-            self.bytes_heard += len(data)
-            if samples := self._samples(self.parser.feed(data)):
-                return samples
-            if self._clock.now() >= until:
-                raise ProtocolError(f"{name}: {self.bytes_heard - heard} bytes, but no measurement")
+        """Return samples that became complete; raises as ``DeviceStream.receive``."""
+        return await self._stream.receive(within)
 
     def _samples(self, packets: list[Wt61Packet]) -> list[ImuSample]:
         samples = []
@@ -152,25 +134,8 @@ class Wt61Driver:
                 received=received,
                 seq=self._out.next_seq(),
                 frame=self.name,
-                angular_velocity=corrected_rate(_mean([rate.angular_velocity for _, rate in samples]), correction),
-                linear_acceleration=corrected_force(_mean([force.acceleration for force, _ in samples]), correction),
+                angular_velocity=corrected_rate(mean([rate.angular_velocity for _, rate in samples]), correction),
+                linear_acceleration=corrected_force(mean([force.acceleration for force, _ in samples]), correction),
                 temperature=samples[-1][0].celsius,
             )
         )
-
-
-def _mean(vectors: list[Xyz]) -> Xyz:
-    x, y, z = (sum(axis) / len(vectors) for axis in zip(*vectors, strict=True))
-    return x, y, z
-
-
-def corrected_rate(rate: Xyz, by: ImuCorrection) -> Vector3:
-    """Angular velocity without its biases, rad/s."""
-    x, y, z = rate
-    return Vector3(x=x - by.rate_x, y=y - by.rate_y, z=(z - by.rate_z) * by.rate_scale)
-
-
-def corrected_force(force: Xyz, by: ImuCorrection) -> Vector3:
-    """Specific force without its biases, m/s^2."""
-    x, y, z = force
-    return Vector3(x=x - by.force_x, y=y - by.force_y, z=z)

@@ -49,7 +49,7 @@ class Wt61Emulator:
         self._awake_at = 0
 
     async def run(self, end: DeviceEnd) -> None:
-        """Stream, and take commands."""
+        """DeviceStream, and take commands."""
         end.baud = BAUD
         end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
         self.power_cycle()

@@ -27,7 +27,8 @@ def test_the_services_of_the_truck():
 def test_a_role_of_another_name_that_writes_a_sensor_topic(monkeypatch: pytest.MonkeyPatch):
     imu = dataclasses.replace(COMPASS, name="imu")
     monkeypatch.setattr("monstertruckd.assembly.devices.DEVICES", SimpleNamespace(roles={**DEVICES.roles, "imu": imu}))
-    config = SimpleNamespace(devices=SimpleNamespace(present=lambda: {"imu": None, "camera": None}))
+    plain = SimpleNamespace(kind=SimpleNamespace(also={}))
+    config = SimpleNamespace(devices=SimpleNamespace(present=lambda: dict.fromkeys(("imu", "camera"), plain)))
     assert sensor_services(config) == {"imu": Reason.ATTITUDE_STALE}  # type: ignore[arg-type]
 
 

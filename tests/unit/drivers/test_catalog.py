@@ -35,7 +35,7 @@ def test_every_role_of_the_enum_has_its_row_a_kind_and_a_key():
 def test_a_driver_takes_the_ends_of_its_roles_topics(kind: DeviceKind):
     hints = get_type_hints(kind.implementation_class().__init__)
     for role in kind.roles:
-        for ends, end in ((role.writes, Publisher), (role.reads, Subscription)):
+        for ends, end in ((role.writes, Publisher), (kind.also, Publisher), (role.reads, Subscription)):
             for name, topic in ends.items():
                 assert end[topic.model] in (hints[name], *getattr(hints[name], "__args__", ())), (kind.name, name)
     assert {"events", "name", "clock", "config"} <= hints.keys()

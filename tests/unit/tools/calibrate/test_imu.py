@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from monstertruck_drivers.inertial import corrected_force, corrected_rate
 from monstertruck_drivers.wt61.config import ImuCorrection
-from monstertruck_drivers.wt61.driver import corrected_force, corrected_rate
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics

@@ -1,0 +1,134 @@
+"""The device side of a BNO085 in UART-RVC mode, byte for byte.
+
+Habits of the real thing: it streams from power-up on and hears nothing; its heading is 0 at power-up and drifts; the
+accelerometer feels the body's own acceleration, which its fusion takes out of pitch and roll only slowly.
+"""
+
+from math import atan2, exp, hypot, radians
+from typing import Final
+
+import numpy as np
+
+from monstertruck_drivers.bno085.protocol import BAUD, INDICES, RATE, RvcFrame, build, measured
+from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import EmulatorSetup, ImuSource, ReceivedBytes
+from monstertruck_drivers.signals import SignalKind, Signals
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+BOOT: Final = 300_000_000
+"""Nanoseconds from power-up to the first frame."""
+DRIFT: Final = radians(0.5) / 60
+"""Of the heading, rad/s, greatest."""
+FUSION: Final = 0.5
+"""Time constant with which pitch and roll follow the accelerometer's vertical, s."""
+NOISE: Final = 4.0
+"""Standard deviation of the accelerometer, 0.001 g."""
+REPORTED: Final = ("yaw", "pitch", "roll", "x", "y", "z")
+
+
+class Bno085Emulator:
+    """A unit that streams.
+
+    Faults (``inject``): ``frozen on|off`` (the same measurement again and again, the index goes on), ``silent on|off``,
+    ``bad_checksum N`` (the next so many frames), ``skip N`` (so many frames are not sent), ``half_frame``, ``reset``.
+
+    Args:
+        clock: time.
+        source: physics.
+        seed: of noise and drift.
+    """
+
+    def __init__(self, clock: Clock, source: ImuSource, *, seed: int = 0) -> None:
+        self.name = "bno085"
+        self.received = ReceivedBytes()
+        """Bytes the host sent, for tests."""
+        self._clock = clock
+        self._source = source
+        self._rng = np.random.default_rng(seed)
+        self.signals = Signals(clock.now, dict.fromkeys(REPORTED, SignalKind.NUMBER), self._rng)
+        self._drift = float(self._rng.uniform(-DRIFT, DRIFT))
+        self._faults = {"frozen": False, "silent": False}
+        self._bad_checksums = self._skip = 0
+        self.power_cycle()
+
+    def power_cycle(self) -> None:
+        """Supply off and on: heading and index begin at 0."""
+        self._index, self._yaw = 0, 0.0
+        self._tilt: tuple[float, float] | None = None
+        self._last: RvcFrame | None = None
+        self._torn = True
+        self._awake_at = self._clock.now() + BOOT
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        match fault, values:
+            case _, (("on" | "off") as state,) if fault in self._faults:
+                self._faults[fault] = state == "on"
+            case "bad_checksum", (count,) if count.isdigit():
+                self._bad_checksums = int(count)
+            case "skip", (count,) if count.isdigit():
+                self._skip = int(count)
+            case "half_frame", ():
+                self._torn = True
+            case "reset", ():
+                self.power_cycle()
+            case _:
+                raise InputError(
+                    f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: frozen on|off, "
+                    "silent on|off, bad_checksum N, skip N, half_frame, reset"
+                )
+
+    async def run(self, end: DeviceEnd) -> None:
+        """DeviceStream until cancelled."""
+        end.baud = BAUD
+        end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
+        self.power_cycle()
+        due = self._clock.now()
+        while True:
+            due += SECOND // RATE
+            await self._clock.sleep_until(due)
+            if due < self._awake_at:
+                continue
+            frame = self._frame(due)
+            self._index += 1
+            if self._faults["silent"]:
+                continue
+            if self._skip:
+                self._skip -= 1
+                continue
+            data = build(frame)
+            if self._bad_checksums:
+                self._bad_checksums -= 1
+                data = data[:9] + bytes((data[9] ^ 0x10,)) + data[10:]
+            if self._torn:
+                self._torn, data = False, data[5:]
+            end.write(data)
+
+    def _frame(self, now: int) -> RvcFrame:
+        reading = self._source.imu(now)
+        self._yaw += (reading.angular_velocity[2] + self._drift) / RATE
+        x, y, z = reading.acceleration
+        felt = atan2(-x, hypot(y, z)), atan2(y, z)
+        share = 1.0 if self._tilt is None else 1.0 - exp(-1.0 / (RATE * FUSION))
+        pitch, roll = self._tilt or felt
+        roll_rate, pitch_rate, _ = (rate / RATE for rate in reading.angular_velocity)
+        pitch, roll = pitch + pitch_rate, roll + roll_rate
+        self._tilt = pitch + share * (felt[0] - pitch), roll + share * (felt[1] - roll)
+        true = measured(self._index, (self._yaw, *self._tilt), reading.acceleration)
+        noise = np.rint(NOISE * self._rng.standard_normal(3)).astype(int).tolist()
+        numbers = dict(zip(REPORTED, (*true[1:4], *(a + b for a, b in zip(true[4:], noise, strict=True))), strict=True))
+        shown = {name: max(-32767, min(32767, self.signals.report(name, value))) for name, value in numbers.items()}
+        if self._faults["frozen"] and self._last is not None:
+            return self._last._replace(number=self._index % INDICES)
+        self._last = RvcFrame(self._index % INDICES, **shown)
+        return self._last
+
+
+def emulated(setup: EmulatorSetup) -> Bno085Emulator:
+    """The unit of a simulated robot."""
+    return Bno085Emulator(setup.clock, setup.physics.imu, seed=setup.seed)

@@ -1,0 +1,92 @@
+"""Frames of the BNO085's UART-RVC mode (CEVA, "BNO08X Data Sheet", section 1.3.5.2).
+
+A frame has 19 bytes, a hundred times a second, unasked: AA AA, an index that counts frames, yaw, pitch and roll in
+0.01 degree, acceleration along x, y and z in 0.001 g, each signed with the low byte first, three reserved bytes, and
+the sum of the sixteen bytes from the index on. The unit takes no commands in this mode.
+"""
+
+import struct
+from math import degrees, radians
+from typing import Final, NamedTuple
+
+BAUD: Final = 115200
+RATE: Final = 100
+HEADER: Final = b"\xaa\xaa"
+SIZE: Final = 19
+INDICES: Final = 256
+GRAVITY: Final = 9.80665
+_BODY: Final = struct.Struct("<B6h3x")
+_ANGLE: Final = radians(0.01)
+_FORCE: Final = GRAVITY / 1000
+_MOST: Final = 32767
+
+Xyz = tuple[float, float, float]
+
+
+class RvcFrame(NamedTuple):
+    """Raw numbers of one frame."""
+
+    number: int
+    """Of the frame: the index, which wraps at 256."""
+    yaw: int
+    """0.01 degree since power-up, -18000 to 18000."""
+    pitch: int
+    roll: int
+    x: int
+    """0.001 g."""
+    y: int
+    z: int
+
+    @property
+    def angles(self) -> Xyz:
+        """Yaw, pitch and roll, rad."""
+        return self.yaw * _ANGLE, self.pitch * _ANGLE, self.roll * _ANGLE
+
+    @property
+    def acceleration(self) -> Xyz:
+        """Specific force, m/s^2."""
+        return self.x * _FORCE, self.y * _FORCE, self.z * _FORCE
+
+
+def build(frame: RvcFrame) -> bytes:
+    """Return the bytes of a frame.
+
+    Raises:
+        struct.error: a number beyond its bits.
+    """
+    body = _BODY.pack(*frame)
+    return HEADER + body + bytes((sum(body) & 0xFF,))
+
+
+def measured(index: int, angles: Xyz, acceleration: Xyz) -> RvcFrame:
+    """Return the frame of a measurement in rad and m/s^2, clipped to the unit's range."""
+    yaw, pitch, roll = (round(100 * degrees(angle)) for angle in angles)
+    x, y, z = (max(-_MOST, min(_MOST, round(force / _FORCE))) for force in acceleration)
+    return RvcFrame(index % INDICES, (yaw + 18_000) % 36_000 - 18_000, pitch, roll, x, y, z)
+
+
+class RvcParser:
+    """Collects bytes to frames; counts the bytes that belong to none."""
+
+    def __init__(self) -> None:
+        self.refused = 0
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> list[RvcFrame]:
+        """Return frames that became complete."""
+        self._buffer += data
+        frames = []
+        while (frame := self._next()) is not None:
+            frames.append(frame)
+        return frames
+
+    def _next(self) -> RvcFrame | None:
+        buffer = self._buffer
+        while len(buffer) >= SIZE:
+            if buffer.startswith(HEADER) and sum(buffer[2 : SIZE - 1]) & 0xFF == buffer[SIZE - 1]:
+                frame = RvcFrame(*_BODY.unpack(buffer[2 : SIZE - 1]))
+                del buffer[:SIZE]
+                return frame
+            del buffer[0]
+            self.refused += 1
+        return None
