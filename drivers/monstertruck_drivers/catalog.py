@@ -15,6 +15,7 @@ from monstertruck_drivers.ax12.protocol import BAUD as AX12_BAUD
 from monstertruck_drivers.bno085.protocol import BAUD as BNO085_BAUD
 from monstertruck_drivers.emulation import EmulatorFactory
 from monstertruck_drivers.epos.protocol import BAUD as EPOS_BAUD
+from monstertruck_drivers.ld19.protocol import BAUD as LD19_BAUD
 from monstertruck_drivers.os4000.protocol import FACTORY_BAUD as OS4000_BAUD
 from monstertruck_drivers.steppers.protocol import BAUD as STEPPERS_BAUD
 from monstertruck_drivers.vesc.protocol import BAUD as VESC_BAUD
@@ -326,6 +327,17 @@ DEVICES: Final = DeviceCatalog(
         emulator="monstertruck_drivers.hokuyo_urg.emulator:emulated",
         probe="monstertruck_drivers.hokuyo_urg.probe:probe",
         usb=UsbIdentity("15d1:0000", "URG-Series USB Driver", "ttyACM"),
+    ),
+    DeviceKind(
+        name="ld19",
+        doc="LDROBOT LD06, LD19 or STL-19P laser scanner",
+        roles=(LIDAR,),
+        settings="monstertruck_drivers.ld19.config:Ld19Config",
+        implementation="monstertruck_drivers.ld19.driver:Ld19Driver",
+        emulator="monstertruck_drivers.ld19.emulator:emulated",
+        probe="monstertruck_drivers.ld19.probe:probe",
+        baud=LD19_BAUD,
+        usb=UsbIdentity("10c4:ea60", "CP2102 USB to UART Bridge Controller", "ttyUSB"),
     ),
     DeviceKind(
         name="epos",

@@ -9,7 +9,6 @@ from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
 
-from monstertruck_drivers.hokuyo_urg.clock_map import Anchor, ClockMap
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.hokuyo_urg.protocol import (
     SCIP1_PARAMETERS,
@@ -33,6 +32,8 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
     split_ranges,
 )
 from monstertruck_drivers.link import Link, Port
+from monstertruck_drivers.scanning.clock_map import Anchor, ClockMap
+from monstertruck_drivers.scanning.clock_watch import ClockWatch
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import (
     DeviceError,
@@ -50,12 +51,6 @@ TRANSFER = 0.002
 """Seconds assumed from the last beam to the arrival where it cannot be measured."""
 GREATEST_2CHAR = 4.095
 """Greatest range in two characters, m."""
-TOO_LATE = 0.3
-"""Seconds by which scans arrive later than at the start, from which on they are worth little."""
-LATE_FOR = 3.0
-"""Seconds of such scans after which the session restarts, and with it the comparison of the clocks."""
-SLEW_PERIOD = 60.0
-"""Least seconds between two reports of clocks that run apart."""
 LISTEN = 0.05
 """Seconds whose bytes are thrown away after opening."""
 WAKE_TIMEOUT = 0.5
@@ -327,8 +322,7 @@ class HokuyoDriver:
         self._clock = clock
         self._out = out
         self._events = events
-        self._slew_due = 0
-        self._late_since: int | None = None
+        self._watch = ClockWatch(events, name)
 
     async def run(self, ready: Ready) -> None:
         """One session: wake, identify, compare clocks, stream; the laser is off when it ends.
@@ -380,7 +374,9 @@ class HokuyoDriver:
                         self._report_ready(sensor)
                     bad, first = 0, False
                     due = self._deadline(config.stale_periods * interval)
-                    self._publish(block, self._stamp(mapping, block, session.arrival), geometry, session.arrival)
+                    assert block.counter is not None  # SCIP 2.0
+                    step_0 = self._watch.stamp(mapping, block.counter, session.arrival, self._port.name)
+                    self._publish(block, step_0, geometry, session.arrival)
                 elif outcome is StatusMeaning.DATA:
                     bad += 1
                 else:
@@ -400,28 +396,6 @@ class HokuyoDriver:
             await session.reset()
             raise DeviceFaultError(f"{self._port.name}: sensor reports hardware trouble, status {status}")
         raise ProtocolError(f"{self._port.name}: status {status} within a stream of scans")
-
-    def _stamp(self, mapping: ClockMap, block: ScanBlock, arrival: int) -> int:
-        """The daemon's time at step 0, ns."""
-        assert block.counter is not None  # SCIP 2.0
-        restarts, slews = mapping.restarts, mapping.slews
-        stamp = mapping.stamp(block.counter, arrival)
-        if mapping.restarts > restarts:
-            self._report(Severity.WARNING, "sensor's clock restarted", counter=block.counter)
-        if mapping.slews > slews and arrival >= self._slew_due:
-            self._slew_due = arrival + round(SLEW_PERIOD * SECOND)
-            text = f"the sensor's clock and the computer's run apart by {mapping.drift:.1%}: followed"
-            self._report(Severity.WARNING, text, reason=Reason.CLOCK_DRIFT)
-        if mapping.late < TOO_LATE * SECOND:
-            self._late_since = None
-        elif self._late_since is None:
-            self._late_since = arrival
-        elif arrival - self._late_since > LATE_FOR * SECOND:
-            self._late_since = None
-            raise DeviceTimeoutError(
-                f"{self._port.name}: scans arrive {mapping.late / SECOND:.1f} s later than at the start: begins anew"
-            )
-        return stamp
 
     # SCIP 1.1
 

@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from monstertruck_drivers.hokuyo_urg.protocol import COUNTER_BITS, COUNTER_MASK
 from monstertruck_runtime.clock import SECOND
 
 MILLISECOND: Final = 1_000_000
@@ -44,7 +43,7 @@ class Anchor:
     """One comparison of both clocks."""
 
     counter: int
-    """Sensor's milliseconds, 24 bits."""
+    """Sensor's milliseconds."""
     host: int
     """The daemon's time when the counter said so, ns."""
     round_trip: int = 0
@@ -59,9 +58,11 @@ class ClockMap:
             be measured (no ``anchor``, or the counter restarted before the first scan), and none that is measured is
             less, but for a slew: while the drift is not known yet, a fast sensor's scans seem to arrive too soon.
         anchor: comparison made at start.
+        turn: milliseconds after which the counter starts at 0 again.
     """
 
-    def __init__(self, nominal_latency: int, anchor: Anchor | None = None) -> None:
+    def __init__(self, nominal_latency: int, anchor: Anchor | None = None, *, turn: int = 1 << 24) -> None:
+        self._turn = turn * MILLISECOND
         self.restarts = 0
         """How often the counter restarted."""
         self.late = 0
@@ -93,7 +94,7 @@ class ClockMap:
         """The daemon's time, ns, at which the sensor's counter said ``counter``.
 
         Args:
-            counter: milliseconds, 24 bits, later than that of the previous call.
+            counter: milliseconds, later than that of the previous call.
             arrival: when the last byte came, ns.
         """
         self._follow(counter, arrival)
@@ -109,8 +110,8 @@ class ClockMap:
         if previous is None:
             self._take(0, arrival)
             return
-        step = ((counter - previous) & COUNTER_MASK) * MILLISECOND
-        if abs(_signed(step - waited)) > RESTART:
+        step = (counter - previous) * MILLISECOND % self._turn
+        if abs(self._signed(step - waited)) > RESTART:
             self.restarts += 1
             self._restart(waited, arrival)
             return
@@ -128,7 +129,7 @@ class ClockMap:
             self._drift.add(elapsed, sample)
             slewed = self.slews > breaks or (abs(self.drift - drift) > BREAK and not self._is_steady())
             if slewed and self._reference is not None:
-                # Samples since the slew say nothing of the latency.
+                # BeamSamples since the slew say nothing of the latency.
                 before = self._settling[: max(len(self._settling) - RECENT * BLOCK, BLOCK)]
                 self._find_latency(self._reference, before, drift)
                 self._keep_latency()
@@ -167,6 +168,10 @@ class ClockMap:
         """The least time from the counter to the arrival, by the comparison at the start."""
         found = round(min(sample - reference - drift * elapsed for elapsed, sample in samples))
         self._latency = max(found, self._least_latency)
+
+    def _signed(self, difference: int) -> int:
+        """A difference of counters, ns, as the least one of all that a wrap makes equal."""
+        return (difference + self._turn // 2) % self._turn - self._turn // 2
 
     def _keep_latency(self) -> None:
         """It is no longer looked for."""
@@ -222,9 +227,3 @@ class Drift:
 
     def _lowest(self, samples: list[tuple[int, int]]) -> tuple[int, int]:
         return min(samples, key=lambda pair: pair[1] - self.rate * pair[0])
-
-
-def _signed(difference: int) -> int:
-    """A difference of counters, ns, as the least one of all that a wrap makes equal."""
-    turn = MILLISECOND << COUNTER_BITS
-    return (difference + turn // 2) % turn - turn // 2

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monstertruck_drivers.hokuyo_urg.clock_map import Anchor, ClockMap
+from monstertruck_drivers.scanning.clock_map import Anchor, ClockMap
 
 MS = 1_000_000
 SECOND = 1000 * MS

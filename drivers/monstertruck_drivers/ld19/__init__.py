@@ -1,0 +1,1 @@
+"""LDROBOT LD06, LD19 and STL-19P laser scanners."""

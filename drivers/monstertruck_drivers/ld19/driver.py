@@ -1,0 +1,189 @@
+"""Driver of the LD19: listens, and publishes every revolution."""
+
+from typing import Final
+
+import numpy as np
+
+from monstertruck_drivers.ld19.config import Ld19Config
+from monstertruck_drivers.ld19.protocol import (
+    BAUD,
+    FULL_TURN,
+    MODELS,
+    POINT,
+    POINTS,
+    SIZE,
+    STAMP_TURN,
+    Ld19Packet,
+    Ld19Parser,
+)
+from monstertruck_drivers.link import Link, Port
+from monstertruck_drivers.scanning.clock_map import ClockMap
+from monstertruck_drivers.scanning.clock_watch import ClockWatch
+from monstertruck_drivers.scanning.publishing import publish
+from monstertruck_drivers.scanning.turns import BeamSamples, TurnCutter, on_equal_steps
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import LaserScan
+
+BATCH: Final = 4 * SIZE
+"""Bytes worth waking for."""
+TRANSFER: Final = 0.001
+"""Seconds assumed from the end of a packet on the line to its arrival."""
+LISTEN: Final = 1.5
+"""Seconds to find a packet of a unit that was powered just now; it is silent for half a second."""
+WIDEST: Final = FULL_TURN // 4
+"""Angle that no packet covers, 0.01 degrees: a damaged one, or a head that starts."""
+
+
+class Ld19Session:
+    """Listening to one unit.
+
+    Args:
+        link: open link.
+        clock: time.
+    """
+
+    def __init__(self, link: Link, clock: Clock) -> None:
+        self.parser = Ld19Parser()
+        self.arrival = 0
+        """When the newest bytes came, ns."""
+        self.packets = 0
+        """Packets received so far."""
+        self._link, self._clock = link, clock
+
+    async def receive(self, within: float) -> list[Ld19Packet]:
+        """Packets that became complete, perhaps none.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence.
+        """
+        try:
+            data = await self._link.read(within, least=BATCH)
+        except TimeoutError:
+            raise DeviceTimeoutError(f"{self._link.name}: silent for {within:.1f} s") from None
+        self.arrival = self._clock.now()
+        packets = self.parser.feed(data)
+        self.packets += len(packets)
+        return packets
+
+    async def start(self) -> list[Ld19Packet]:
+        """First packets.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence to the end.
+            WrongDeviceError: bytes, but none of an LD19.
+        """
+        until = self._clock.now() + round(LISTEN * SECOND)
+        while (left := until - self._clock.now()) > 0:
+            try:
+                packets = await self.receive(left / SECOND)
+            except DeviceTimeoutError:
+                if self._link.discard() or self.parser.refused:
+                    break
+                raise
+            if packets:
+                return packets
+        raise WrongDeviceError(
+            f"{self._link.name}: {self.parser.refused} bytes, none of an LD19: another device, or another baud rate"
+        )
+
+
+class PacketSamples:
+    """BeamSamples of packets, on the unit's own clock since the session began."""
+
+    def __init__(self) -> None:
+        self.elapsed = 0
+        """Of the newest packet, ns."""
+        self._stamp: int | None = None
+
+    def of(self, packets: list[Ld19Packet]) -> BeamSamples:
+        """BeamSamples of packets that follow one another; those of a head that stands are left out."""
+        kept, ends = [], []
+        for packet in packets:
+            if self._stamp is not None:
+                self.elapsed += (packet.stamp - self._stamp) % STAMP_TURN * 1_000_000
+            self._stamp = packet.stamp
+            if packet.speed and 0 < packet.span < WIDEST:
+                kept.append(packet)
+                ends.append(self.elapsed)
+        points = np.frombuffer(b"".join(packet.points for packet in kept), POINT)
+        start, span, speed = (
+            np.array(values, np.float64)[:, None]
+            for values in ([p.start for p in kept], [p.span for p in kept], [p.speed for p in kept])
+        )
+        number = np.arange(POINTS)
+        each = span / (POINTS - 1)
+        times = np.array(ends, np.float64)[:, None] - (POINTS - 1 - number) * each / 100 / speed * SECOND
+        return BeamSamples(
+            ((start + number * each) / FULL_TURN).ravel(),
+            points["distance"] / 1000.0,
+            points["intensity"],
+            times.ravel(),
+        )
+
+
+class Ld19Driver:
+    """LD06, LD19 or STL-19P on a port.
+
+    Args:
+        config: model, frame and patience.
+        port: where it is plugged in.
+        clock: time.
+        out: where scans go.
+        events: where readiness and changes of its clock are reported.
+        name: of the service.
+    """
+
+    def __init__(
+        self,
+        config: Ld19Config,
+        port: Port,
+        clock: Clock,
+        out: Publisher[LaserScan],
+        events: EventSink,
+        name: str = "lidar",
+    ) -> None:
+        self.name = name
+        self._config, self._port, self._clock, self._out, self._events = config, port, clock, out, events
+        self._watch = ClockWatch(events, name)
+
+    async def run(self, ready: Ready) -> None:
+        """Serve one session.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence, a head that does not turn, or scans that arrive late for seconds.
+            ProtocolError: bytes without a packet.
+            WrongDeviceError: nothing that comes at the start is of an LD19.
+            PortBusyError: another process holds the port.
+        """
+        config, limits = self._config, MODELS[self._config.model].ranges
+        async with await self._port.open() as link:
+            session, cutter, samples = Ld19Session(link, self._clock), TurnCutter(), PacketSamples()
+            mapping = ClockMap(round((SIZE * 10 / BAUD + TRANSFER) * SECOND), turn=STAMP_TURN)
+            due, first = self._clock.now() + round(config.first_scan * SECOND), True
+            packets = await session.start()
+            heard = session.packets
+            while True:
+                for revolution in cutter.add(samples.of(packets)) if packets else ():
+                    if (turn := on_equal_steps(revolution)) is None:
+                        continue
+                    if first:
+                        ready()
+                        self._events(Reason.DEVICE_READY, Severity.INFO, self.name, MODELS[config.model].title)
+                    due, first, heard = self._clock.now() + round(config.stale * SECOND), False, session.packets
+                    stamp = self._watch.stamp(mapping, packets[-1].stamp, session.arrival, link.name)
+                    publish(turn, stamp - samples.elapsed, session.arrival, limits[:2], config, self._out)
+                if self._clock.now() >= due:
+                    raise self._stale(link.name, session.packets > heard)
+                packets = await session.receive(config.silence)
+
+    def _stale(self, port: str, packets: bool) -> Exception:
+        if packets:
+            return DeviceTimeoutError(f"{port}: packets, but no whole revolution: its head does not turn")
+        return ProtocolError(f"{port}: bytes, but no packet of an LD19")

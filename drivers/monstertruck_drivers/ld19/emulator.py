@@ -1,0 +1,141 @@
+"""The device side of an LD19, byte for byte: silent after power-up, its head comes up to speed, packets without end."""
+
+import asyncio
+from typing import Final
+
+import numpy as np
+
+from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import BeamSource, EmulatorSetup, ReceivedBytes
+from monstertruck_drivers.ld19.config import Ld19Config
+from monstertruck_drivers.ld19.protocol import (
+    BAUD,
+    FULL_TURN,
+    MODELS,
+    POINT,
+    POINTS,
+    STAMP_TURN,
+    Ld19Packet,
+    ModelSheet,
+    build,
+)
+from monstertruck_drivers.scanning.head import FAULTS as HEAD_FAULTS
+from monstertruck_drivers.scanning.head import TurningHead
+from monstertruck_drivers.signals import SignalKind, Signals
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+BOOT: Final = 500_000_000
+"""Nanoseconds from power-up to the first packet (maker's description of the start-up)."""
+OVERSLEPT: Final = 5 * SECOND // 10
+"""Nanoseconds that it lags behind after the host's machine slept, at most; older packets are lost."""
+BRIGHT: Final = 230
+"""Intensity of a near white surface; it falls with the distance."""
+FADING: Final = 6.0
+"""Distance at which a quarter of the intensity is left, m."""
+RANGE: Final = "range"
+"""Distances of a packet, mm."""
+COUNTER: Final = "counter"
+"""Time stamp, ms."""
+
+
+class Ld19Emulator:
+    """An LD06, LD19 or STL-19P that streams from power-up on.
+
+    Faults (``inject``): ``silent on|off``, ``bad_crc N`` (the next so many packets), ``half_packet``, and those of the
+    head.
+
+    Args:
+        clock: time.
+        source: what it sees.
+        sheet: of the model.
+        seed: of covers.
+    """
+
+    def __init__(self, clock: Clock, source: BeamSource, sheet: ModelSheet = MODELS["ld19"], *, seed: int = 0) -> None:
+        self.name = "lidar"
+        self.received = ReceivedBytes()
+        """Bytes the host sent, for tests: it takes no notice of any."""
+        rng = np.random.default_rng(seed)
+        kinds = {RANGE: SignalKind.ARRAY, COUNTER: SignalKind.NUMBER}
+        self.signals = Signals(clock.now, kinds, rng, codes={RANGE: 1})
+        self.head = TurningHead(clock, source, sheet.ranges, sheet.frequency, rng)
+        self._clock, self._period = clock, SECOND / sheet.rate
+        self._silent = False
+        self._bad_sums = 0
+        self._torn = True
+        self._powered_at = 0
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Stream until cancelled."""
+        end.baud = BAUD
+        end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
+        self.power_cycle()
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._stream(end))
+            while True:
+                self.received.extend(await end.read())
+
+    def power_cycle(self) -> None:
+        """Supply off and on: its clock starts at 0, its head stands."""
+        self.head.stop()
+        self._torn = True
+        self._powered_at = self.head.now()
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        match fault, values:
+            case "silent", (("on" | "off") as state,):
+                self._silent = state == "on"
+            case "bad_crc", (count,) if count.isdigit():
+                self._bad_sums = int(count)
+            case "half_packet", ():
+                self._torn = True
+            case _ if self.head.inject(fault, *values):
+                pass
+            case _:
+                raise InputError(
+                    f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: silent on|off | "
+                    f"bad_crc N | half_packet | {HEAD_FAULTS}"
+                )
+
+    async def _stream(self, end: DeviceEnd) -> None:
+        begin = float(self.head.now())
+        while True:
+            times = (begin + self._period * np.arange(1, POINTS + 1)).astype(np.int64)
+            last = int(times[-1])
+            await self._clock.sleep_until(self.head.world_time(last))
+            late = self.head.now() - last > OVERSLEPT
+            begin = float(self.head.now() if late else begin + self._period * POINTS)
+            if self._silent or last - self._powered_at < BOOT:
+                self.head.turn(times)
+                continue
+            data = build(self._packet(times))
+            if self._bad_sums:
+                self._bad_sums -= 1
+                data = data[:-1] + bytes((data[-1] ^ 0x10,))
+            if self._torn:
+                self._torn, data = False, data[5:]
+            end.write(data)
+
+    def _packet(self, times: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> Ld19Packet:
+        turned, ranges = self.head.measure(times)
+        points = np.zeros(POINTS, POINT)
+        millimetres = np.rint(ranges * 1000).astype(np.int64)
+        points["distance"] = np.clip(self.signals.report(RANGE, millimetres), 0, 0xFFFF)
+        points["intensity"] = np.where(points["distance"] > 0, BRIGHT / (1.0 + 3.0 * (ranges / FADING) ** 2), 0.0)
+        angles = np.rint(turned[[0, -1]] * FULL_TURN).astype(np.int64) % FULL_TURN
+        stamp = self.signals.report(COUNTER, (int(times[-1]) - self._powered_at) // 1_000_000 % STAMP_TURN)
+        return Ld19Packet(
+            round(self.head.speed * 360), int(angles[0]), points.tobytes(), int(angles[1]), int(stamp) % STAMP_TURN
+        )
+
+
+def emulated(setup: EmulatorSetup) -> Ld19Emulator:
+    """The lidar of a simulated robot."""
+    settings = setup.settings if isinstance(setup.settings, Ld19Config) else Ld19Config()
+    return Ld19Emulator(setup.clock, setup.physics.lidar, MODELS[settings.model], seed=setup.seed)

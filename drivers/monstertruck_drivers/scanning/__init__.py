@@ -1,0 +1,1 @@
+"""What scanners of all makers have in common."""

@@ -1,0 +1,23 @@
+"""Settings that all scanners with a turning head share."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from monstertruck_schemas.base import FrameId, Schema
+
+
+class TurningHeadConfig(Schema):
+    """A scanner that streams its beams while its head turns."""
+
+    frame: FrameId = "lidar"
+    """Frame of the published scans."""
+    no_return: Literal["unknown", "free"] = "unknown"
+    """What a beam without a return says: nothing, or that the way is free as far as the scanner reaches. The scanner
+    reports a covered window and open ground alike"""
+    silence: Annotated[float, Field(gt=0, le=10)] = 0.5
+    """Seconds without a byte that end the session"""
+    first_scan: Annotated[float, Field(gt=0, le=60)] = 6.0
+    """Seconds allowed for the first revolution; the motor may have to start"""
+    stale: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """Seconds without a whole revolution, later on, that end the session"""

@@ -1,0 +1,145 @@
+"""The turning head of an emulated scanner: its motor, its own clock, what covers its window."""
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.emulation import Array, BeamSource, RangeSheet
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+SPIN_UP: Final = 0.4
+"""Time constant of the motor, s."""
+TURNING: Final = 0.5
+"""Share of the set speed from which on the head measures."""
+LEAST_CODE: Final = 20
+"""Values of ``cover`` below are the codes of the URG: no return; others are millimetres."""
+SPECULAR: Final = 0.2
+"""Share of a mirror, in its middle, from which the light comes straight back and dazzles."""
+FAULTS: Final = "cover FROM TO VALUE [SHARE] | cover off | mirror FROM TO | drift PPM | blocked on|off | frequency HZ"
+
+
+class TurningHead:
+    """Turns clockwise; asked for rising instants of its own clock.
+
+    Faults (``inject``): ``cover`` puts something over the window between two directions, degrees from straight ahead,
+    left positive: the beams, or a random share of them, give the value (below 20: no return, otherwise mm). ``mirror``
+    puts a mirror there. ``drift`` sets the rate of its clock against the world's; ``blocked`` holds the head;
+    ``frequency`` changes its speed.
+
+    Args:
+        clock: the world's time.
+        source: what it sees.
+        sheet: of its ranges.
+        frequency: turns a second.
+        rng: of the covers.
+    """
+
+    def __init__(
+        self, clock: Clock, source: BeamSource, sheet: RangeSheet, frequency: float, rng: np.random.Generator
+    ) -> None:
+        self.sheet = sheet
+        self.frequency = frequency
+        """Turns a second that the motor is set to; 0 = off."""
+        self._clock, self._source, self._rng = clock, source, rng
+        self._rate = 1.0
+        self._born, self._elapsed = clock.now(), 0
+        self._blocked = False
+        self._at, self._turned, self._speed = 0.0, 0.3, 0.0
+        """Instant (s of its own clock), angle (turns) and speed (turns a second) up to which it has turned."""
+        self._covers: list[tuple[float, float, Callable[[Array], Array]]] = []
+
+    # Time
+
+    def now(self) -> int:
+        """Its own clock, ns since it was made."""
+        return self._elapsed + round((self._clock.now() - self._born) * self._rate)
+
+    def world_time(self, time: int) -> int:
+        """The world's time at an instant of its own clock, ns."""
+        return self._born + round((time - self._elapsed) / self._rate)
+
+    # Motor
+
+    @property
+    def speed(self) -> float:
+        """Turns a second at the newest instant."""
+        return self._speed
+
+    def stop(self) -> None:
+        """The supply is off: the head stands."""
+        self._speed = 0.0
+
+    def turn(self, times: NDArray[np.int64]) -> Array:
+        """Angles at instants of its own clock, shape (n,), turns; the last one becomes the newest instant."""
+        target = 0.0 if self._blocked else self.frequency
+        passed = times / SECOND - self._at
+        fading = np.exp(-np.maximum(passed, 0.0) / SPIN_UP)
+        turned: Array = self._turned + target * passed + (self._speed - target) * SPIN_UP * (1.0 - fading)
+        self._at, self._turned = float(times[-1]) / SECOND, float(turned[-1]) % 1.0
+        self._speed = target + (self._speed - target) * float(fading[-1])
+        return turned
+
+    # Beams
+
+    def measure(self, times: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Angles, turns, and ranges, m, 0 = no return, at instants of its own clock, (n,), that are over."""
+        turned = self.turn(times)
+        bearings = -math.tau * turned
+        at = np.array([self.world_time(int(time)) for time in times], np.int64)
+        ranges = self._source.beams(bearings, at, self.sheet)
+        if self._speed < TURNING * max(self.frequency, 0.1):
+            ranges = np.zeros(len(ranges))
+        for begin, width, cover in self._covers:
+            behind = np.mod(bearings - begin, math.tau) <= width
+            ranges[behind] = cover(ranges[behind])
+        return turned, np.where(np.isfinite(ranges) & (ranges >= self.sheet.least), ranges, 0.0)
+
+    # Faults
+
+    def inject(self, fault: str, *values: str) -> bool:
+        """Start or end a fault.
+
+        Returns:
+            Whether it is one of the head's.
+
+        Raises:
+            InputError: a bad value.
+        """
+        try:
+            match fault, values:
+                case "cover", ("off",):
+                    self._covers.clear()
+                case "cover", (begin, end, value, *share):
+                    self._cover(begin, end, self._covered(int(value), *map(float, share)))
+                case "mirror", (begin, end):
+                    self._cover(begin, end, self._mirrored)
+                case "drift", (ppm,):
+                    self._elapsed, self._born = self.now(), self._clock.now()
+                    self._rate = 1.0 + float(ppm) * 1e-6
+                case "blocked", (("on" | "off") as state,):
+                    self._blocked = state == "on"
+                case "frequency", (hertz,):
+                    self.frequency = float(hertz)
+                case _:
+                    return False
+        except (TypeError, ValueError) as error:
+            raise InputError(f"cannot inject {' '.join((fault, *values))!r}; known: {FAULTS}") from error
+        return True
+
+    def _cover(self, begin: str, end: str, cover: Callable[[Array], Array]) -> None:
+        first, last = math.radians(float(begin)), math.radians(float(end))
+        if not 0.0 < last - first <= math.tau:
+            raise ValueError(f"{begin}..{end} degrees")
+        self._covers.append((first, last - first, cover))
+
+    def _covered(self, value: int, share: float = 1.0) -> Callable[[Array], Array]:
+        shown = 0.0 if value < LEAST_CODE else value / 1000
+        return lambda ranges: np.where(self._rng.random(len(ranges)) < share, shown, ranges)
+
+    def _mirrored(self, ranges: Array) -> Array:
+        dazzled = self._rng.random(len(ranges)) < SPECULAR
+        return np.where(dazzled | (2 * ranges > self.sheet.greatest), 0.0, 2 * ranges)

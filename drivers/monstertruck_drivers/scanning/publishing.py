@@ -1,0 +1,50 @@
+"""Revolutions of a turning head, published as scans."""
+
+import math
+
+import numpy as np
+
+from monstertruck_drivers.scanning.config import TurningHeadConfig
+from monstertruck_drivers.scanning.turns import HeadTurn, codes_of
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.ports import Publisher
+from monstertruck_schemas.sensor import LaserScan
+
+
+def publish(
+    turn: HeadTurn,
+    origin: int,
+    received: int,
+    limits: tuple[float, float],
+    config: TurningHeadConfig,
+    out: Publisher[LaserScan],
+) -> None:
+    """Publish a revolution of a head that turns clockwise.
+
+    Args:
+        turn: the revolution.
+        origin: the daemon's time at the zero of the samples' clock, ns.
+        received: when its last sample came, ns.
+        limits: least and greatest range of the scanner, m.
+        config: of the scanner.
+        out: where scans go.
+    """
+    start = math.pi - math.tau * turn.first
+    count = len(turn.ranges)
+    out.put(
+        LaserScan(
+            stamp=origin + round(turn.begin),
+            received=received,
+            seq=out.next_seq(),
+            frame=config.frame,
+            start_angle=start,
+            end_angle=start - math.tau * turn.step * (count - 1),
+            time_increment=turn.period * turn.step / SECOND,
+            scan_time=turn.period / SECOND,
+            range_min=limits[0],
+            range_max=limits[1],
+            ranges=np.where(turn.ranges > 0.0, turn.ranges, np.inf),
+            codes=codes_of(turn, free=config.no_return == "free"),
+            intensities=turn.intensities,
+        )
+    )
