@@ -18,6 +18,7 @@ from monstertruck_drivers.usb.tree import (
     port_directory,
     port_of,
     read_device,
+    topology_of,
 )
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import (
@@ -84,6 +85,7 @@ class PortPower:
         self._machine = machine
         self._events = events
         self._cycles: dict[str, tuple[int, int]] = {}
+        """Number of cycles and instant of the newest one, by the port's name by topology: buses get other numbers."""
         self._writing: defaultdict[str, Lock] = defaultdict(Lock)
         """By first attribute: keeps writes of one port in their order, also after a caller was cancelled."""
 
@@ -104,7 +106,7 @@ class PortPower:
         device = await self._machine.offload(lambda: read_device(self._machine.sysfs, name))
         if parent_of(name) is None or (device is not None and device.hub):
             raise DeviceError(f"{name} is a hub: only ports of single devices are switched")
-        self._pace(name)
+        self._pace(name, await self._machine.offload(lambda: topology_of(self._machine.sysfs, name)))
         try:
             if method is CycleMethod.UHUBCTL:
                 await self._cycle_by_uhubctl(name)
@@ -137,9 +139,9 @@ class PortPower:
     async def _present_name(self, name: str) -> str:
         return await self._machine.offload(lambda: at_present(self._machine.sysfs, name))
 
-    def _pace(self, name: str) -> None:
+    def _pace(self, name: str, topology: str) -> None:
         now = self._machine.clock.now()
-        count, last = self._cycles.get(name, (0, now))
+        count, last = self._cycles.get(topology, (0, now))
         if now - last > FORGET_AFTER * SECOND:
             count = 0
         if count:
@@ -147,7 +149,7 @@ class PortPower:
             left = pause - (now - last) / SECOND
             if left > 0:
                 raise BusyError(f"{place(name)} was switched just now; again in {left:.1f} s")
-        self._cycles[name] = (min(count + 1, LONGEST_PAUSE), now)
+        self._cycles[topology] = (min(count + 1, LONGEST_PAUSE), now)
 
     async def _halves(self, name: str) -> list[str]:
         """Attributes of the port: a USB 3 hub is two hubs to the kernel, and power is off once both ports are."""

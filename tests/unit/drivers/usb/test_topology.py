@@ -23,6 +23,7 @@ from monstertruck_drivers.usb.tree import (
     topology_of,
 )
 from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import BusyError
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.usb import UsbState
 from tests.unit.drivers.usb.rig import BY_TOPOLOGY, PORTS, Bench, play
@@ -169,6 +170,18 @@ def test_the_port_that_is_switched_is_the_one_where_the_device_is_now(tmp_path: 
 
     by_port = UsbConfig(power=PowerConfig(method=CycleMethod.PORT))
     play(tmp_path, scene, by_port, BY_TOPOLOGY, watched=False)
+
+
+def test_a_port_is_not_switched_sooner_because_its_bus_got_another_number(tmp_path: Path):
+    async def scene(bench: Bench) -> None:
+        port = BY_TOPOLOGY["drive"].device
+        await bench.power.cycle(port)
+        bench.usb.renumber({"1": "4"})
+        for name in (port, "4-1.3"):
+            with pytest.raises(BusyError, match="hub 4-1 port 3 was switched just now"):
+                await bench.power.cycle(name)
+
+    play(tmp_path, scene, UsbConfig(power=PowerConfig(method=CycleMethod.AUTHORIZED)), places=BY_TOPOLOGY)
 
 
 def test_a_bus_number_that_another_controller_had_keeps_nothing_of_it(tmp_path: Path):
