@@ -168,8 +168,15 @@ class Joint:
         return self._straying >= STRAYS
 
     async def _stop_straying(self, session: Ax12Session, present: Present) -> None:
-        """Take the unit's torque away for a rest."""
+        """Take the unit's torque away for a rest; read back, as a late answer may be that of an earlier write.
+
+        Raises:
+            DeviceTimeoutError, ProtocolError: it does not say that its torque is off; the next reading repeats it.
+        """
         await session.write(self.id, p.TORQUE_ENABLE, b"\x00")
+        enabled, *_ = await self._settings(session, RETRIES)
+        if enabled:
+            raise ProtocolError(f"unit {self.id} ({self._name}) keeps its torque")
         self._straying, rest = 0, self._begin_rest()
         self._strays += 1
         text = f"turned to {present.position} by itself, its goal is {self._goal}: no torque for {rest:g} s"
@@ -244,9 +251,9 @@ class Joint:
         self._outage = True
         self._report(Reason.DEVICE_TIMEOUT, Severity.WARNING, f"does not answer, asked again once in a while: {why}")
 
-    async def _settings(self, session: Ax12Session) -> tuple[int, int, int]:
+    async def _settings(self, session: Ax12Session, retries: int = 0) -> tuple[int, int, int]:
         """Torque switch, moving speed, torque limit."""
-        answer = await session.read(self.id, p.TORQUE_ENABLE, SETTINGS, retries=0)
+        answer = await session.read(self.id, p.TORQUE_ENABLE, SETTINGS, retries)
         self._error, data = answer.error, answer.data
         self._check_at = self._clock.now() + round(self._config.check_interval * SECOND)
         return data[0], word(data, 8), word(data, 10)

@@ -2,6 +2,9 @@
 
 import pytest
 
+from monstertruck_drivers.ax12 import protocol as p
+from monstertruck_drivers.ax12.protocol import Alarm, Register
+from monstertruck_drivers.ax12.session import Ax12Session
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import TorqueState
 from tests.unit.drivers.ax12.rig import Rig, on_bench
@@ -24,6 +27,30 @@ def test_a_unit_that_drives_itself_away_from_its_goal_loses_its_torque_within_0_
             stands = rig.joint("pitch")
             await rig.settle(1.0)
             assert rig.joint("pitch") == stands
+
+    on_bench(test)
+
+
+def test_an_order_that_only_a_late_answer_confirms_is_repeated(monkeypatch: pytest.MonkeyPatch):
+    """The answer to an earlier write looks like the one to this."""
+    write, lost = Ax12Session.write, [b"\x00"]
+
+    async def write_or_lose(session: Ax12Session, unit: int, start: Register, data: bytes, retries: int = 2) -> Alarm:
+        if start is p.TORQUE_ENABLE and data in lost:
+            lost.remove(data)
+            return Alarm(0)
+        return await write(session, unit, start, data, retries)
+
+    async def test(rig: Rig) -> None:
+        async with rig.driving():
+            await rig.settle(0.3)
+            monkeypatch.setattr(Ax12Session, "write", write_or_lose)
+            rig.bus.inject("stray", "1", "420")
+            await rig.settle(0.25)
+            assert lost == []
+            assert rig.out.kept[-1].pitch_joint.torque is TorqueState.LIMP
+            assert not rig.unit(1).get(p.TORQUE_ENABLE)
+            assert rig.events.reasons() == [Reason.UNCOMMANDED_MOTION]
 
     on_bench(test)
 
