@@ -54,6 +54,7 @@ from monstertruckd.config.load import Tree, resolved
 from monstertruckd.config.start import LeftOut, set_aside
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate.core import Gate
+from monstertruckd.gate.hand import HandService
 from monstertruckd.gate.latch import EstopLatch, Latch, MemoryLatch, marks_folder
 from monstertruckd.gate.service import GateOutputs, GateService, register_gate_calls
 from monstertruckd.host.health import ClockService, HealthBoard, MeterService, ServiceCalls
@@ -176,6 +177,8 @@ class Daemon:
             self._say_what_is_left_out()
             self._start_drivers(actuators, OnBug.EXIT, Duty.ACTUATOR)
             self._start(gate, self.gate, OnBug.EXIT)
+            if self.config.devices.hand is not None:
+                self._start(gate, self._hand_service())
             self._start(gate, self._calibration)
             self._start(gate, MeterService(self.clock, self.gate, self.recorder, self.bus, self._events))
             if self._seed is None:
@@ -197,6 +200,18 @@ class Daemon:
             self.gate.shut_down()
 
     # The scopes' contents
+
+    def _hand_service(self) -> HandService:
+        """Build the service that drives by the radio control of the operator beside the robot."""
+        return HandService(
+            self.config.hand,
+            self.clock,
+            self.bus.subscribe(topics.HAND, latest()),
+            self.bus.subscribe(topics.GATE, latest()),
+            self.bus.inject,
+            self._events,
+            steered=self._body.chassis.steered,
+        )
 
     def _peer_services(self) -> Iterator[Service]:
         """Services that receive the poses of other robots; on the virtual clock nothing comes over Zenoh."""

@@ -16,7 +16,10 @@ from monstertruck_drivers.bno085.protocol import BAUD as BNO085_BAUD
 from monstertruck_drivers.emulation import EmulatorFactory
 from monstertruck_drivers.epos.protocol import BAUD as EPOS_BAUD
 from monstertruck_drivers.ld19.protocol import BAUD as LD19_BAUD
+from monstertruck_drivers.link import Framing
 from monstertruck_drivers.os4000.protocol import FACTORY_BAUD as OS4000_BAUD
+from monstertruck_drivers.receiver.crsf import BAUD as CRSF_BAUD
+from monstertruck_drivers.receiver.sbus import BAUD as SBUS_BAUD
 from monstertruck_drivers.steppers.protocol import BAUD as STEPPERS_BAUD
 from monstertruck_drivers.vesc.protocol import BAUD as VESC_BAUD
 from monstertruck_drivers.wt61.protocol import BAUD as WT61_BAUD
@@ -177,6 +180,13 @@ ENCODERS: Final = RoleSpec(
     writes={"out": topics.ENCODERS},
     start=11,
 )
+HAND: Final = RoleSpec(
+    name=DeviceRole.HAND.value,
+    duty=Duty.SENSOR,
+    doc="Receiver of the radio control of the operator beside the robot; without it the robot does not move",
+    writes={"out": topics.HAND},
+    start=5,
+)
 BATTERY: Final = RoleSpec(
     name=DeviceRole.BATTERY.value,
     duty=Duty.MONITOR,
@@ -205,6 +215,7 @@ OUR_ROLES: Final = (
     SONAR,
     IMU,
     ENCODERS,
+    HAND,
     BATTERY,
     LINK,
     HOST,
@@ -243,6 +254,8 @@ class DeviceKind(Plugin):
     """What driver and probe get: a serial ``Port``, a ``FrameSource`` (the probe: a path), or the ``Computer``."""
     baud: int | None = None
     """Baud rate of its serial line; None = USB from end to end, any rate works."""
+    framing: Framing | None = None
+    """Bits of a byte on its serial line; None = 8N1."""
     usb: UsbIdentity | None = None
 
     @property
@@ -446,6 +459,29 @@ DEVICES: Final = DeviceCatalog(
         emulator="monstertruck_drivers.roboclaw.emulator:emulated",
         probe="monstertruck_drivers.roboclaw.probe:probe",
         usb=UsbIdentity("03eb:2404", "USB Roboclaw", "ttyACM"),
+    ),
+    DeviceKind(
+        name="crsf",
+        doc="Radio control receiver that speaks CRSF (ExpressLRS, TBS Crossfire)",
+        roles=(HAND,),
+        settings="monstertruck_drivers.receiver.config:CrsfConfig",
+        implementation="monstertruck_drivers.receiver.driver:ReceiverDriver",
+        emulator="monstertruck_drivers.receiver.emulator:emulated",
+        probe="monstertruck_drivers.receiver.probe:probe",
+        baud=CRSF_BAUD,
+        usb=UsbIdentity("10c4:ea60", "CP2102N USB to UART Bridge Controller", "ttyUSB"),
+    ),
+    DeviceKind(
+        name="sbus",
+        doc="Radio control receiver that speaks SBUS, behind an inverter",
+        roles=(HAND,),
+        settings="monstertruck_drivers.receiver.config:SbusConfig",
+        implementation="monstertruck_drivers.receiver.driver:ReceiverDriver",
+        emulator="monstertruck_drivers.receiver.emulator:emulated",
+        probe="monstertruck_drivers.receiver.probe:probe",
+        baud=SBUS_BAUD,
+        framing="8E2",
+        usb=UsbIdentity("0403:6001", "FT232R USB UART", "ttyUSB"),
     ),
     DeviceKind(
         name="iio",

@@ -13,7 +13,7 @@ from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
 from monstertruck_drivers.catalog import DEVICES, DeviceKind, Duty, RoleSpec
 from monstertruck_drivers.computer import Sysfs
-from monstertruck_drivers.link import BAUD
+from monstertruck_drivers.link import BAUD, Framing
 from monstertruck_drivers.shafts import SteeringOutputs, steering_outputs
 from monstertruck_drivers.usb.config import Baud, UsbPortConfig
 from monstertruck_drivers.usb.tree import place
@@ -47,6 +47,8 @@ class PortConfig(Schema):
     """Level of the line DTR while the port is open; false lets an RPLIDAR's motor turn"""
     rts: bool = True
     """Level of the line RTS while the port is open"""
+    framing: Framing | None = None
+    """Bits of a byte; null = the device's own"""
 
 
 def _way(port: Any) -> str:
@@ -75,10 +77,9 @@ class Device(Schema, Generic[C]):
 
     @model_validator(mode="after")
     def _own_baud(self) -> Self:
-        if self.port.baud is not None:
-            return self
-        port = self.port.model_copy(update={"baud": self.kind.baud or BAUD})
-        return self.model_copy(update={"port": port})
+        own = {"baud": self.kind.baud or BAUD, "framing": self.kind.framing}
+        missing = {name: value for name, value in own.items() if value and getattr(self.port, name) is None}
+        return self.model_copy(update={"port": self.port.model_copy(update=missing)}) if missing else self
 
 
 def kind_of(settings: Schema) -> DeviceKind:
@@ -205,6 +206,7 @@ if TYPE_CHECKING:
         sonar: Device[Srf08Config] | None = None
         imu: Device[Schema] | None = None
         encoders: Device[Schema] | None = None
+        hand: Device[Schema] | None = None
         wheels: Device[StepperConfig] | None = None
         actuators: Device[VescConfig] | None = None
 

@@ -6,12 +6,14 @@ whether the bytes come from a tty, a pty or another coroutine.
 
 import asyncio
 from collections.abc import Callable
-from typing import Protocol, Self
+from typing import Literal, Protocol, Self
 
 from monstertruck_runtime.errors import DeviceLostError
 
 BAUD = 115200
 """Bits per second of a line whose device takes any."""
+Framing = Literal["8N1", "8E2"]
+"""Bits of a byte on a serial line: data bits, parity, stop bits."""
 BUFFER_LIMIT = 1 << 16
 """Unread bytes kept; beyond that the oldest are dropped, as a tty's buffer would."""
 TIMER_STEP = 0.001

@@ -23,7 +23,7 @@ from weakref import WeakValueDictionary
 import serial
 import serial_asyncio
 
-from monstertruck_drivers.link import BAUD, Link, Port
+from monstertruck_drivers.link import BAUD, Framing, Link, Port
 from monstertruck_runtime.errors import DeviceLostError, DeviceWedgedError, PortBusyError
 from monstertruck_runtime.open_files import holders
 
@@ -43,7 +43,14 @@ class OpenSerial(Protocol):
     """Makes a port of a serial node: ``SerialPort``, or an emulated computer's own."""
 
     def __call__(
-        self, path: Path, baud: int = BAUD, *, dtr: bool = True, rts: bool = True, low_latency: bool = False
+        self,
+        path: Path,
+        baud: int = BAUD,
+        *,
+        dtr: bool = True,
+        rts: bool = True,
+        low_latency: bool = False,
+        framing: Framing = "8N1",
     ) -> Port:
         """See ``SerialPort``."""
 
@@ -57,14 +64,22 @@ class SerialPort:
         dtr: level of the line DTR while the port is open; the kernel itself raises both lines for a moment on opening.
         rts: level of the line RTS while the port is open.
         low_latency: ask the adapter's driver not to gather bytes.
+        framing: bits of a byte.
     """
 
     def __init__(
-        self, path: Path, baud: int = BAUD, *, dtr: bool = True, rts: bool = True, low_latency: bool = False
+        self,
+        path: Path,
+        baud: int = BAUD,
+        *,
+        dtr: bool = True,
+        rts: bool = True,
+        low_latency: bool = False,
+        framing: Framing = "8N1",
     ) -> None:
         self.name = str(path)
         self._path = path
-        self._make = partial(_Tty, str(path), baud, dtr=dtr, rts=rts, low_latency=low_latency)
+        self._make = partial(_Tty, str(path), baud, dtr=dtr, rts=rts, low_latency=low_latency, framing=framing)
 
     async def open(self) -> Link:
         """Open raw and exclusive, with empty buffers; waits for a link of this process that is being closed.
@@ -229,13 +244,19 @@ class _Tty(serial.Serial):
         dtr: see ``SerialPort``.
         rts: see ``SerialPort``.
         low_latency: see ``SerialPort``.
+        framing: see ``SerialPort``.
     """
 
     _ending: Future[None] | None = None
     _is_handed_over = False
 
-    def __init__(self, path: str, baud: int, *, node: _PortNode, dtr: bool, rts: bool, low_latency: bool) -> None:
-        super().__init__(None, baudrate=baud, timeout=0, write_timeout=0, exclusive=True)
+    def __init__(
+        self, path: str, baud: int, *, node: _PortNode, dtr: bool, rts: bool, low_latency: bool, framing: Framing
+    ) -> None:
+        _, parity, stop = framing
+        super().__init__(
+            None, baudrate=baud, parity=parity, stopbits=int(stop), timeout=0, write_timeout=0, exclusive=True
+        )
         self._node = node
         self.dtr, self.rts = dtr, rts
         self.port = path

@@ -68,7 +68,7 @@ class Cabling:
             return self._given[role]
         if isinstance(port, UsbPortConfig):
             return HubPort(port, self._machine, self._events, self._hubs, self._power, role)
-        return SerialPort(port.path, port.baud or BAUD, dtr=port.dtr, rts=port.rts)
+        return SerialPort(port.path, port.baud or BAUD, dtr=port.dtr, rts=port.rts, framing=port.framing or "8N1")
 
     def camera(self, role: str) -> FrameSource:
         """Where a camera's pictures come from."""

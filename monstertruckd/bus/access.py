@@ -38,9 +38,9 @@ class Grant:
     """Highest priority it may claim."""
 
     def capped(self, role: Role) -> Role:
-        """``role``, or the rank if that is lower."""
+        """``role``, or the rank if that is lower; the hand's is that of the receiver alone."""
         order = list(Role)
-        return max(role, self.rank, key=order.index)
+        return max(Role.GAMEPAD if role is Role.HAND else role, self.rank, key=order.index)
 
 
 EVERYTHING: Final = Grant(AccessRole.ENGINEER, Role.ESTOP)

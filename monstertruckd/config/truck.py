@@ -39,6 +39,7 @@ from monstertruckd.bus.zenoh_config import PeerConfig, ZenohConfig
 from monstertruckd.config.device_safety import beyond_devices, packs, unattended_times, weakened_devices
 from monstertruckd.gate.catalog import AnyCheck
 from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, impossible_settings, weakened, weaker
+from monstertruckd.gate.hand import HandConfig
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
 ROBOT: Final = "truck"
@@ -130,6 +131,8 @@ class TruckConfig(Schema):
     levelling: AnyLevelling = StabiliserConfig()
     """How the stabiliser follows the compass, where there are both"""
     gate: GateConfig = GateConfig()
+    hand: HandConfig = HandConfig()
+    """What the radio control of the operator beside the robot does (`devices.hand`)"""
     checks: dict[Name, AnyCheck] = Field(default_factory=dict)
     """Checks by name that make the safety gate stricter"""
     odometry: AnyOdometry = OdometryConfig()

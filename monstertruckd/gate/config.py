@@ -40,6 +40,7 @@ def _limit(topic: Topic[Any], *, critical: bool = True) -> SensorLimit:
 class Leases(Schema):
     """Longest lease granted to each role, s, whatever the request asks for."""
 
+    hand: Annotated[float, Field(gt=0, le=1)] = 0.25
     gamepad: Annotated[float, Field(gt=0, le=1)] = 0.25
     keyboard: Annotated[float, Field(gt=0, le=1)] = 0.25
     station: Annotated[float, Field(gt=0, le=1)] = 0.25
@@ -400,6 +401,7 @@ WEAKER_ABOVE: Final = (
     "quick_deceleration",
     "steering_rate",
     "standstill",
+    "leases.hand",
     "leases.gamepad",
     "leases.keyboard",
     "leases.station",

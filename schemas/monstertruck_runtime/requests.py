@@ -23,7 +23,7 @@ from monstertruck_schemas.topics import Topic, owner_of
 M = TypeVar("M", bound=Message)
 R = TypeVar("R", bound=Request)
 
-OPERATORS: Final = frozenset({Role.GAMEPAD, Role.KEYBOARD, Role.STATION})
+OPERATORS: Final = frozenset({Role.HAND, Role.GAMEPAD, Role.KEYBOARD, Role.STATION})
 """Roles of human operators: may arm and reset."""
 
 MAX_SOURCES: Final = 64

@@ -20,6 +20,8 @@ class Role(StrEnum):
     """Who asks; priority falls in this order."""
 
     ESTOP = "estop"
+    HAND = "hand"
+    """The operator beside the robot, by the receiver on it; no sender outside has this role."""
     GAMEPAD = "gamepad"
     KEYBOARD = "keyboard"
     STATION = "station"

@@ -217,6 +217,37 @@ class WheelEncoders(Message):
     """Of the right wheel."""
 
 
+class HandControls(Message):
+    """Sticks and switches of the radio control of the operator beside the robot, by the receiver on it.
+
+    ``stamp`` is when the newest channels came. While the transmitter is lost all controls are neutral and off.
+    """
+
+    lost: bool
+    """The receiver hears no transmitter."""
+    speed: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    """Stick, forward positive."""
+    steer: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    """Stick, left positive."""
+    arm: bool = False
+    """Switch without which the robot does not move."""
+    drive: bool = True
+    """The hand drives; False: it only supervises."""
+    estop: bool = False
+    """Switch of the emergency stop."""
+    unseen: bool = False
+    """Switch to drive into unseen ground."""
+    link_quality: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Share of the radio's packets that arrive; None = not known."""
+    rssi: float | None = None
+    """Signal at the receiver, dBm; None = not known."""
+
+    @property
+    def switches(self) -> tuple[bool, ...]:
+        """Link and switches."""
+        return self.lost, self.arm, self.drive, self.estop, self.unseen
+
+
 class CompressedImage(Message):
     """One picture of the camera; ``stamp`` is when it was exposed, as far as the camera states it."""
 

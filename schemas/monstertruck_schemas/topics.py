@@ -44,6 +44,7 @@ from monstertruck_schemas.sensor import (
     Battery,
     CompressedImage,
     DriveFeedback,
+    HandControls,
     Imu,
     LaserScan,
     SonarRanges,
@@ -176,6 +177,9 @@ SONAR: Final = Topic(
 IMU: Final = Topic("sensor/imu", Imu, W.DRIVER, "Angular velocity and specific force", 50, stale_after=0.2)
 ENCODERS: Final = Topic(
     "sensor/encoders", WheelEncoders, W.DRIVER, "Rear wheels of a tricycle, by their encoders", 25, stale_after=0.2
+)
+HAND: Final = Topic(
+    "sensor/hand", HandControls, W.DRIVER, "Radio control of the operator beside the robot", 50, stale_after=0.25
 )
 
 ODOMETRY: Final = Topic(

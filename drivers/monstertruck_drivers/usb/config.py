@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 
 from monstertruck_drivers.catalog import start_order, started_apart
 from monstertruck_drivers.computer import Sysfs
+from monstertruck_drivers.link import Framing
 from monstertruck_drivers.usb.tree import at_present, device_name, parent_of, port_of
 from monstertruck_schemas.base import Schema
 
@@ -33,6 +34,8 @@ its kernel's name, which may change with the next boot: "1-1", or "usb1" for a r
     """Level of the line DTR while the port is open; false lets an RPLIDAR's motor turn"""
     rts: bool = True
     """Level of the line RTS while the port is open"""
+    framing: Framing | None = None
+    """Bits of a byte; null = the device's own"""
     usb_id: Annotated[str, Field(pattern=r"^[0-9a-f]{4}:[0-9a-f]{4}$")] | None = None
     """Expected vendor:product, checked before the first byte; None leaves it to the handshake"""
     latency_ms: Annotated[int, Field(ge=1, le=255)] = 1

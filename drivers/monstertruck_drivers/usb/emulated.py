@@ -14,7 +14,7 @@ from typing import Final
 
 from monstertruck_drivers.cable import EmulatedPort, MemoryPort, PtyPort
 from monstertruck_drivers.computer import Machine, Sysfs
-from monstertruck_drivers.link import BAUD, Port
+from monstertruck_drivers.link import BAUD, Framing, Port
 from monstertruck_drivers.tty import SerialPort
 from monstertruck_drivers.usb.tree import DEVICES, ancestors, parent_of, port_directory, port_of, renumbered, sort_key
 from monstertruck_runtime.clock import Clock
@@ -336,12 +336,19 @@ class EmulatedUsb:
             (folder / attribute).write_text(f"{value}\n")
 
     def _serial(
-        self, path: Path, baud: int = BAUD, *, dtr: bool = True, rts: bool = True, low_latency: bool = False
+        self,
+        path: Path,
+        baud: int = BAUD,
+        *,
+        dtr: bool = True,
+        rts: bool = True,
+        low_latency: bool = False,
+        framing: Framing = "8N1",
     ) -> Port:
         for device in self._devices.values():
             if device.node_name == path.name and isinstance(device.cable, MemoryPort):
                 return device.cable
-        return SerialPort(path, baud, dtr=dtr, rts=rts, low_latency=low_latency)
+        return SerialPort(path, baud, dtr=dtr, rts=rts, low_latency=low_latency, framing=framing)
 
     async def _run(self, arguments: Sequence[str]) -> tuple[int, str]:
         """The only program there is: a uhubctl that switches one port."""

@@ -334,7 +334,12 @@ class HubPort:
         config, machine = self._config, self._machine
         by_flag = await machine.offload(lambda: lower_latency(machine.sysfs, node, config.latency_ms))
         port = machine.serial(
-            machine.dev / node.name, config.baud or BAUD, dtr=config.dtr, rts=config.rts, low_latency=by_flag
+            machine.dev / node.name,
+            config.baud or BAUD,
+            dtr=config.dtr,
+            rts=config.rts,
+            low_latency=by_flag,
+            framing=config.framing or "8N1",
         )
         return await port.open()
 

@@ -153,6 +153,6 @@ async def _probe(
     line = (
         HubPort(port, machine, lambda *_, **__: None, role=role)
         if isinstance(port, UsbPortConfig)
-        else machine.serial(node, port.baud or BAUD, dtr=port.dtr, rts=port.rts)
+        else machine.serial(node, port.baud or BAUD, dtr=port.dtr, rts=port.rts, framing=port.framing or "8N1")
     )
     return await kind.probe_function()(line, machine.clock, device.driver)

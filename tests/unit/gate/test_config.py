@@ -16,7 +16,7 @@ DELIVERED = {
     "steering_rate": 1.0,
     "reaction": 0.08,
     "standstill": 0.01,
-    "leases": {"gamepad": 0.25, "keyboard": 0.25, "station": 0.25, "tracker": 0.25},
+    "leases": {"hand": 0.25, "gamepad": 0.25, "keyboard": 0.25, "station": 0.25, "tracker": 0.25},
     "max_request_age": 0.5,
     "remote_trackers": (),
     "disarm_after": 1.5,
@@ -68,8 +68,9 @@ def test_a_sensor_of_which_nothing_is_said_stops_the_truck():
 
 
 def test_every_driving_role_has_its_own_lease():
-    leases = Leases(gamepad=0.1, keyboard=0.2, station=0.3, tracker=0.4)
-    assert [leases.of(role) for role in (Role.GAMEPAD, Role.KEYBOARD, Role.STATION, Role.TRACKER)] == [
+    leases = Leases(hand=0.05, gamepad=0.1, keyboard=0.2, station=0.3, tracker=0.4)
+    assert [leases.of(role) for role in (Role.HAND, Role.GAMEPAD, Role.KEYBOARD, Role.STATION, Role.TRACKER)] == [
+        0.05,
         0.1,
         0.2,
         0.3,

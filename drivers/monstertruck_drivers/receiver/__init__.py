@@ -1,0 +1,1 @@
+"""Receivers of radio controls: the operator beside the robot."""

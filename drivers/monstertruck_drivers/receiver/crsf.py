@@ -1,0 +1,100 @@
+"""CRSF frames of a receiver (TBS Crossfire, ExpressLRS).
+
+Source: TBS, "CRSF protocol" (github.com/tbs-fpv/tbs-crsf-spec). A frame is an address (C8), the length of what follows,
+a type, the payload, and a CRC-8 (polynomial D5, start 0) of type and payload; 64 bytes at most. Type 16 carries the
+channels, type 14 the quality of the radio link: signal of two antennas (dBm without its sign), share of packets (%),
+and more. Without its transmitter an ExpressLRS receiver sends no channels, and a link quality of 0.
+"""
+
+from typing import Final
+
+from monstertruck_drivers.receiver.channels import PACKED, ChannelWords, pack, unpack
+from monstertruck_drivers.receiver.frames import ReceiverFrame
+
+BAUD: Final = 420_000
+ADDRESS: Final = 0xC8
+CHANNELS_TYPE: Final = 0x16
+LINK_TYPE: Final = 0x14
+LINK_SIZE: Final = 10
+LONGEST: Final = 62
+"""Greatest length byte."""
+_POLYNOMIAL: Final = 0xD5
+
+
+def _crc_of(byte: int) -> int:
+    for _ in range(8):
+        byte = (byte << 1 ^ _POLYNOMIAL if byte & 0x80 else byte << 1) & 0xFF
+    return byte
+
+
+_TABLE: Final = tuple(_crc_of(byte) for byte in range(256))
+
+
+def crc8(data: bytes) -> int:
+    """Return the CRC of type and payload."""
+    crc = 0
+    for byte in data:
+        crc = _TABLE[crc ^ byte]
+    return crc
+
+
+def frame(kind: int, payload: bytes) -> bytes:
+    """Return the bytes of a frame."""
+    body = bytes((kind,)) + payload
+    return bytes((ADDRESS, len(body) + 1)) + body + bytes((crc8(body),))
+
+
+def channels_frame(channels: ChannelWords) -> bytes:
+    """Return a frame with the positions of all sticks and switches."""
+    return frame(CHANNELS_TYPE, pack(channels))
+
+
+def link_frame(quality: float, rssi: float) -> bytes:
+    """Return a frame with the quality of the radio link; what is not used is 0."""
+    signal = max(0, min(255, round(-rssi)))
+    return frame(LINK_TYPE, bytes((signal, signal, round(100 * quality), *bytes(LINK_SIZE - 3))))
+
+
+class CrsfParser:
+    """Collects bytes to messages; frames of other types are skipped."""
+
+    def __init__(self) -> None:
+        self.refused = 0
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> list[ReceiverFrame]:
+        """Return messages that became complete."""
+        self._buffer += data
+        messages = []
+        while (body := self._next()) is not None:
+            if (message := _message(body)) is not None:
+                messages.append(message)
+        return messages
+
+    def _next(self) -> bytes | None:
+        """Type and payload of the next whole frame; None until more bytes come."""
+        buffer = self._buffer
+        while len(buffer) >= 2:
+            size = buffer[1] + 2
+            if buffer[0] == ADDRESS and 4 <= size <= LONGEST + 2:
+                if len(buffer) < size:
+                    return None
+                body = bytes(buffer[2 : size - 1])
+                if crc8(body) == buffer[size - 1]:
+                    del buffer[:size]
+                    return body
+            del buffer[0]
+            self.refused += 1
+        return None
+
+
+def _message(body: bytes) -> ReceiverFrame | None:
+    kind, payload = body[0], body[1:]
+    if kind == CHANNELS_TYPE and len(payload) == PACKED:
+        return ReceiverFrame(channels=unpack(payload))
+    if kind == LINK_TYPE and len(payload) == LINK_SIZE:
+        quality = payload[2] / 100
+        signals = [signal for signal in payload[:2] if signal]
+        rssi = -float(min(signals)) if signals else None
+        return ReceiverFrame(quality=min(quality, 1.0), rssi=rssi, failsafe=quality == 0.0)
+    return None

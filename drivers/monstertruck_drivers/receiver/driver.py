@@ -1,0 +1,198 @@
+"""Driver of a receiver: channels become what the hand of the operator beside the robot asks for."""
+
+from collections import deque
+from typing import Final
+
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.receiver.channels import ChannelWords, position
+from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig
+from monstertruck_drivers.receiver.crsf import CrsfParser
+from monstertruck_drivers.receiver.frames import ReceiverFrame, ReceiverParser
+from monstertruck_drivers.receiver.sbus import SbusParser
+from monstertruck_drivers.streaming import DeviceStream
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import HandControls
+
+LISTEN: Final = 1.0
+"""Seconds to receive a frame at the start; a receiver without its transmitter sends link statistics only."""
+SILENT: Final = 1.0
+"""Seconds without a byte that end the session."""
+PERIOD: Final = SECOND // 50
+"""Between two messages; a change of the switches or of the link comes at once."""
+SWITCHED: Final = 0.5
+"""Position from which on a switch is on."""
+RECENT: Final = 100
+"""Frames of which the share that arrived is the link quality of a receiver that does not say it."""
+
+
+def parser_of(config: ReceiverConfig) -> ReceiverParser:
+    """Return the parser of a receiver's protocol."""
+    return CrsfParser() if isinstance(config, CrsfConfig) else SbusParser()
+
+
+class Hand:
+    """What the newest frames together say. Pure.
+
+    Args:
+        config: what the channels mean.
+    """
+
+    def __init__(self, config: ReceiverConfig) -> None:
+        self._config = config
+        self._channels: ChannelWords | None = None
+        self._heard = 0
+        """When the newest channels came, ns."""
+        self._on: dict[int, int] = {}
+        """Frames in a row in which a switch was on, by channel."""
+        self._failsafe = False
+        self._quality: float | None = None
+        self._rssi: float | None = None
+        self._missed: deque[bool] = deque(maxlen=RECENT)
+
+    def take(self, frame: ReceiverFrame, now: int) -> None:
+        """Take one frame that came at ``now``."""
+        if frame.quality is not None:
+            self._quality, self._rssi, self._failsafe = frame.quality, frame.rssi, frame.failsafe
+        if frame.channels is None:
+            return
+        if frame.quality is None and self._rssi is None:
+            self._missed.append(frame.lost)
+            self._failsafe = frame.failsafe
+        if frame.failsafe or frame.lost:
+            return
+        self._channels, self._heard = frame.channels, now
+        for channel, raw in enumerate(frame.channels, 1):
+            on = self._position(channel, raw) > SWITCHED
+            self._on[channel] = self._on.get(channel, 0) + 1 if on else 0
+
+    def lost(self, now: int) -> bool:
+        """Whether the transmitter is lost."""
+        silent = self._channels is None or now - self._heard > self._config.silence * SECOND
+        return silent or self._failsafe
+
+    def controls(self, now: int, seq: int, frame: str) -> HandControls:
+        """Return what the hand asks for; nothing while the transmitter is lost."""
+        config, lost = self._config, self.lost(now)
+        quality = self._quality
+        if quality is None and self._missed:
+            quality = 1.0 - sum(self._missed) / len(self._missed)
+        return HandControls(
+            stamp=self._heard or now,
+            received=now,
+            seq=seq,
+            frame=frame,
+            lost=lost,
+            speed=0.0 if lost else self._stick(config.speed),
+            steer=0.0 if lost else self._stick(config.steer),
+            arm=not lost and self._switch(config.arm),
+            drive=not lost and (config.drive is None or self._switch(config.drive)),
+            estop=not lost and config.estop is not None and self._switch(config.estop),
+            unseen=not lost and config.unseen is not None and self._switch(config.unseen),
+            link_quality=quality,
+            rssi=self._rssi,
+        )
+
+    def _position(self, channel: int, raw: int) -> float:
+        return position(raw) * (-1 if channel in self._config.inverted else 1)
+
+    def _stick(self, channel: int) -> float:
+        assert self._channels is not None
+        value = self._position(channel, self._channels[channel - 1])
+        return 0.0 if abs(value) < self._config.dead_band else value
+
+    def _switch(self, channel: int) -> bool:
+        return self._on.get(channel, 0) >= self._config.settle
+
+
+class ReceiverDriver:
+    """Listens.
+
+    Args:
+        config: protocol and channels.
+        port: where the receiver hangs.
+        clock: time.
+        out: what the hand asks for, at 50 Hz, while the transmitter is lost as well.
+        events: its loss and return.
+        name: of the service.
+    """
+
+    def __init__(
+        self,
+        config: ReceiverConfig,
+        port: Port,
+        clock: Clock,
+        out: Publisher[HandControls],
+        events: EventSink,
+        name: str = "hand",
+    ) -> None:
+        self.name = name
+        self._config = config
+        self._port = port
+        self._clock = clock
+        self._out = out
+        self._events = events
+        self._said: bool | None = None
+        """Whether the loss of the transmitter was reported."""
+
+    async def run(self, ready: Ready) -> None:
+        """Serve one session.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence.
+            ProtocolError: bytes without a frame.
+            WrongDeviceError: nothing that comes at the start is a frame.
+            PortBusyError: another process holds the port.
+        """
+        async with await self._port.open() as link:
+            stream = DeviceStream(link, self._clock, parser_of(self._config).feed)
+            frames = await first_frames(stream, self._config)
+            ready()
+            hand, heard = Hand(self._config), self._clock.now()
+            newest: HandControls | None = None
+            while True:
+                for frame in frames:
+                    hand.take(frame, self._clock.now())
+                newest = self._publish(hand, newest)
+                try:
+                    frames = await stream.receive(PERIOD / SECOND)
+                    heard = self._clock.now()
+                except (DeviceTimeoutError, ProtocolError):
+                    frames = []
+                    if self._clock.now() - heard > SILENT * SECOND:
+                        raise
+
+    def _publish(self, hand: Hand, newest: HandControls | None) -> HandControls:
+        """Publish when it is due, or when a switch or the link has changed; returns the newest message."""
+        now = self._clock.now()
+        controls = hand.controls(now, self._out.next_seq(), self.name)
+        if newest is not None and now - newest.received < PERIOD and controls.switches == newest.switches:
+            return newest
+        self._out.put(controls)
+        if controls.lost is not self._said:
+            reason, severity = (
+                (Reason.DEVICE_LOST, Severity.WARNING) if controls.lost else (Reason.DEVICE_READY, Severity.INFO)
+            )
+            text = "the radio control is lost" if controls.lost else "the radio control is there"
+            self._events(reason, severity, self.name, text, link_quality=controls.link_quality, rssi=controls.rssi)
+            self._said = controls.lost
+        return controls
+
+
+async def first_frames(stream: DeviceStream[ReceiverFrame], config: ReceiverConfig) -> list[ReceiverFrame]:
+    """Wait for the first frames of a session.
+
+    Raises:
+        DeviceLostError: unplugged.
+        DeviceTimeoutError: silence.
+        WrongDeviceError: bytes, but no frame.
+    """
+    try:
+        return await stream.receive(LISTEN)
+    except ProtocolError as error:
+        hint = "another protocol or baud rate" if isinstance(config, CrsfConfig) else "is the line inverted back?"
+        raise WrongDeviceError(f"{error} of a receiver: {hint}") from None

@@ -1,0 +1,132 @@
+"""The device side of receivers, byte for byte, with the hand that holds their transmitter.
+
+Habits of the real things: they stream unasked; a CRSF receiver without its transmitter sends no channels and a link
+quality of 0; an SBUS receiver goes on with its newest channels, says for a while that packets are lost, then that it
+has lost its transmitter.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes
+from monstertruck_drivers.receiver import crsf, sbus
+from monstertruck_drivers.receiver.channels import CENTRE, CHANNELS, LOW, raw
+from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig
+from monstertruck_drivers.signals import SignalKind, Signals
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+CRSF_PERIOD: Final = SECOND // 100
+"""Between two packets of a transmitter at 100 Hz, ns."""
+STATISTICS: Final = 20
+"""Packets for each frame of link statistics."""
+FAILSAFE_AFTER: Final = SECOND
+"""After which an SBUS receiver says that it has lost its transmitter, ns."""
+SIGNAL: Final = -60.0
+"""dBm."""
+
+
+class ReceiverEmulator:
+    """A receiver and its transmitter: sticks in the middle, switches off.
+
+    Faults (``inject``), besides the hand's own ``move CHANNEL POSITION``: ``transmitter on|off``, ``quality SHARE``,
+    ``silent on|off``, ``damage N`` (the next so many frames have a wrong byte).
+
+    Args:
+        clock: time.
+        settings: which protocol.
+        seed: of packets that are lost.
+    """
+
+    def __init__(self, clock: Clock, settings: ReceiverConfig | None = None, *, seed: int = 0) -> None:
+        self.name = "receiver"
+        self.received = ReceivedBytes()
+        """Bytes the host sent, for tests."""
+        self._clock = clock
+        self._crsf = isinstance(settings or CrsfConfig(), CrsfConfig)
+        self._rng = np.random.default_rng(seed)
+        names = [f"channel_{i}" for i in range(1, CHANNELS + 1)]
+        self.signals = Signals(clock.now, dict.fromkeys([*names, "quality"], SignalKind.NUMBER), self._rng)
+        self._positions = [CENTRE] * 4 + [LOW] * (CHANNELS - 4)
+        self._silent = False
+        self._transmitter = True
+        self._quality = 1.0
+        self._damage = 0
+        self._lost_at = 0
+        self._packets = 0
+        self._sent = tuple(self._positions)
+
+    def move(self, channel: int, position: float) -> None:
+        """Move a stick or switch, -1 to 1."""
+        self._positions[channel - 1] = raw(position)
+
+    def power_cycle(self) -> None:
+        """Supply off and on: the transmitter is found again, if it is on."""
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault, see the class.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        try:
+            match fault, values:
+                case "move", (channel, position):
+                    self.move(int(channel), float(position))
+                case "transmitter", (("on" | "off") as word,):
+                    self._transmitter, self._lost_at = word == "on", self._clock.now()
+                case "quality", (share,):
+                    self._quality = float(share)
+                case "silent", (("on" | "off") as word,):
+                    self._silent = word == "on"
+                case "damage", (count,):
+                    self._damage = int(count)
+                case _:
+                    raise ValueError(fault)
+        except (ValueError, IndexError) as error:
+            raise InputError(
+                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: move CHANNEL POSITION, "
+                "transmitter on|off, quality SHARE, silent on|off, damage N"
+            ) from error
+
+    async def run(self, end: DeviceEnd) -> None:
+        """DeviceStream until cancelled."""
+        end.baud = crsf.BAUD if self._crsf else sbus.BAUD
+        period = CRSF_PERIOD if self._crsf else round(sbus.PERIOD * SECOND)
+        due = self._clock.now()
+        while True:
+            due += period
+            await self._clock.sleep_until(due)
+            for data in self._frames():
+                if self._silent:
+                    continue
+                end.write(self._damaged(data))
+
+    def _damaged(self, data: bytes) -> bytes:
+        if not self._damage:
+            return data
+        self._damage -= 1
+        return data[:4] + bytes((data[4] ^ 0x08,)) + data[5:-1] + bytes((data[-1] ^ 0x03,))
+
+    def _frames(self) -> list[bytes]:
+        self._packets += 1
+        arrives = self._transmitter and float(self._rng.random()) < self._quality
+        if arrives:
+            shown = (self.signals.report(f"channel_{i}", value) for i, value in enumerate(self._positions, 1))
+            self._sent = tuple(max(0, min(2047, value)) for value in shown)
+        if not self._crsf:
+            gone = not self._transmitter and self._clock.now() - self._lost_at >= FAILSAFE_AFTER
+            return [sbus.frame(self._sent, lost=not arrives, failsafe=gone)]
+        frames = [crsf.channels_frame(self._sent)] if arrives else []
+        if self._packets % STATISTICS == 0:
+            quality = self._quality if self._transmitter else 0.0
+            quality = max(0.0, min(1.0, self.signals.report("quality", quality)))
+            frames.append(crsf.link_frame(quality, SIGNAL if self._transmitter else 0.0))
+        return frames
+
+
+def emulated(setup: EmulatorSetup) -> ReceiverEmulator:
+    """The receiver of a simulated robot."""
+    return ReceiverEmulator(setup.clock, setup.settings, seed=setup.seed)

@@ -1,0 +1,65 @@
+"""SBUS frames of a receiver (Futaba and others); source: the decoder of PX4 (``src/lib/rc/sbus.cpp``).
+
+100000 baud, 8 data bits, even parity, 2 stop bits, the line inverted: an adapter or a transistor must invert it back.
+A frame has 25 bytes, every 7 or 14 ms: 0F, the channels, flags, and 00 (or 04, 14, 24, 34 of SBUS 2). Flag 4 says that
+the radio packet was lost, flag 8 that the receiver has lost its transmitter. There is no sum: a wrong bit is a wrong
+position, so a frame that follows damage counts only once the next one begins where it ends.
+"""
+
+from typing import Final
+
+from monstertruck_drivers.receiver.channels import PACKED, ChannelWords, pack, unpack
+from monstertruck_drivers.receiver.frames import ReceiverFrame
+
+BAUD: Final = 100_000
+SIZE: Final = 25
+HEADER: Final = 0x0F
+FOOTERS: Final = frozenset((0x00, 0x04, 0x14, 0x24, 0x34))
+LOST: Final = 0x04
+FAILSAFE: Final = 0x08
+PERIOD: Final = 0.014
+"""Seconds between two frames."""
+
+
+def frame(channels: ChannelWords, *, lost: bool = False, failsafe: bool = False) -> bytes:
+    """Return the bytes of a frame."""
+    flags = LOST * lost | FAILSAFE * failsafe
+    return bytes((HEADER,)) + pack(channels) + bytes((flags, 0))
+
+
+class SbusParser:
+    """Collects bytes to messages."""
+
+    def __init__(self) -> None:
+        self.refused = 0
+        self._buffer = bytearray()
+        self._in_step = False
+        """The buffer begins where a frame ended."""
+
+    def feed(self, data: bytes) -> list[ReceiverFrame]:
+        """Return messages that became complete."""
+        self._buffer += data
+        messages = []
+        buffer = self._buffer
+        while len(buffer) >= (SIZE if self._in_step else 2 * SIZE):
+            if _is_frame(buffer) and (self._in_step or _is_frame(buffer[SIZE:])):
+                if self._in_step:
+                    messages.append(_message(bytes(buffer[:SIZE])))
+                self._in_step = True
+                del buffer[:SIZE]
+            else:
+                self._in_step = False
+                del buffer[0]
+                self.refused += 1
+        return messages
+
+
+def _is_frame(data: bytearray) -> bool:
+    return data[0] == HEADER and data[SIZE - 1] in FOOTERS
+
+
+def _message(data: bytes) -> ReceiverFrame:
+    flags = data[1 + PACKED]
+    return ReceiverFrame(
+        channels=unpack(data[1 : 1 + PACKED]), failsafe=bool(flags & FAILSAFE), lost=bool(flags & LOST)
+    )

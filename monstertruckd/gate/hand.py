@@ -1,0 +1,216 @@
+"""The operator beside the robot, with a radio control: the highest role that drives.
+
+- The arm switch of the transmitter is a key: while it is off nothing drives, whoever has armed the robot, and going
+  from off to on is the order to arm.
+- While it is on and the drive switch (where there is one) is on, the sticks drive.
+- Losing the transmitter stops and disarms the robot, whoever drives. Once it is back, the arm switch must be seen off
+  before it arms.
+"""
+
+import secrets
+from typing import Annotated, Any, Final, NamedTuple, Protocol
+
+from pydantic import Field
+
+from monstertruck_runtime.clock import SECOND, Clock, Schedule
+from monstertruck_runtime.ports import EventSink, Ready, Subscription
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Schema
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import ControlRequest, DriveRequest, Order, RequestedTwist, Role
+from monstertruck_schemas.roles import DeviceRole, ServiceName
+from monstertruck_schemas.sensor import HandControls
+from monstertruck_schemas.state import GateMode, GateState
+from monstertruck_schemas.topics import Topic
+
+RATE: Final = 20.0
+"""Requests per second."""
+LEASE: Final = 0.25
+"""Seconds a request stands."""
+REPEAT: Final = SECOND // 5
+"""Between two orders to stop a robot that has not stopped yet, ns."""
+MOBILE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING})
+"""Modes in which the robot moves, or may begin to."""
+
+
+class HandConfig(Schema):
+    """What the radio control of the operator beside the robot (`devices.hand`) does."""
+
+    speed: Annotated[float, Field(gt=0, le=10)] = 0.2
+    """Speed with the stick at its end, m/s"""
+    angle: Annotated[float, Field(gt=0, le=0.8)] = 0.35
+    """Angle of the front axle with the stick at its end, rad"""
+    turn: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """Yaw rate with the stick at its end, rad/s, of a body without steered axles"""
+    lost_after: Annotated[float, Field(gt=0, le=1)] = 0.25
+    """Age of the newest message of the receiver at which the radio control counts as lost, s"""
+    quality: Annotated[float, Field(ge=0, le=1)] = 0.3
+    """Share of the radio's packets below which the radio control counts as lost"""
+
+
+class HandActions(NamedTuple):
+    """What the hand wants at one moment."""
+
+    orders: tuple[Order, ...] = ()
+    drives: bool = False
+    """The sticks ask for a motion, or for standstill."""
+    lost: str | None = None
+    """Why the radio control counts as lost; None if it does not."""
+
+
+class HandPolicy:
+    """From what the receiver says to orders. Pure.
+
+    Args:
+        config: limits.
+    """
+
+    def __init__(self, config: HandConfig) -> None:
+        self._config = config
+        self._seen_off = False
+        """The arm switch was off since the transmitter was lost, or since the last order to arm."""
+        self._estop = False
+        self._stopped_at: int | None = None
+
+    def step(self, controls: HandControls | None, mode: GateMode | None, now: int) -> HandActions:
+        """Return what the hand wants.
+
+        Args:
+            controls: newest message of the receiver, if any.
+            mode: of the gate, if it is known.
+            now: time, ns.
+        """
+        lost = self._lost(controls, now)
+        if lost is not None or controls is None:
+            self._seen_off = self._estop = False
+            return HandActions(self._stop(mode, now), lost=lost)
+        orders: tuple[Order, ...] = ()
+        if controls.estop and not self._estop:
+            orders = (Order.ESTOP,)
+        self._estop = controls.estop
+        if not controls.arm:
+            self._seen_off = True
+            return HandActions((*orders, *self._stop(mode, now)))
+        self._stopped_at = None
+        if self._seen_off and mode is GateMode.DISARMED:
+            orders = (*orders, Order.ARM)
+        self._seen_off = False
+        return HandActions(orders, drives=controls.drive)
+
+    def _lost(self, controls: HandControls | None, now: int) -> str | None:
+        config = self._config
+        if controls is None:
+            return "nothing heard of the receiver"
+        if now - controls.received > config.lost_after * SECOND:
+            return f"the receiver is silent for more than {config.lost_after:g} s"
+        if controls.lost:
+            return "the receiver does not hear its transmitter"
+        if controls.link_quality is not None and controls.link_quality < config.quality:
+            return f"link quality {controls.link_quality:.0%}, at least {config.quality:.0%} is needed"
+        return None
+
+    def _stop(self, mode: GateMode | None, now: int) -> tuple[Order, ...]:
+        """Orders that bring a mobile robot to rest; repeated until it is."""
+        if mode not in MOBILE or (self._stopped_at is not None and now - self._stopped_at < REPEAT):
+            return ()
+        self._stopped_at = now
+        return Order.STOP, Order.DISARM
+
+
+class Inject(Protocol):
+    """Takes in a request; ``Bus.inject``."""
+
+    def __call__(self, topic: Topic[Any], message: Any) -> object:
+        """See ``Bus.inject``."""
+
+
+class HandService:
+    """Drives by the radio control, and stops the robot when it is lost.
+
+    Args:
+        config: limits.
+        clock: time.
+        hand: newest message of the receiver.
+        gate: newest state of the gate.
+        inject: where the requests go.
+        events: loss and return of the radio control.
+        steered: whether the body has steered axles; without them the steering stick turns the body.
+    """
+
+    name = ServiceName.HAND_DRIVE.value
+
+    def __init__(
+        self,
+        config: HandConfig,
+        clock: Clock,
+        hand: Subscription[HandControls],
+        gate: Subscription[GateState],
+        inject: Inject,
+        events: EventSink,
+        *,
+        steered: bool,
+    ) -> None:
+        self._config = config
+        self._clock = clock
+        self._hand = hand
+        self._gate = gate
+        self._inject = inject
+        self._events = events
+        self._steered = steered
+        self._policy = HandPolicy(config)
+        self._instance = secrets.token_hex(8)
+        self._seq = 0
+        self._lost: str | None = ""
+        """Why the radio control was lost, as reported; None if it was reported to be there."""
+
+    async def run(self, ready: Ready) -> None:
+        """Ask for what the hand wants until cancelled."""
+        schedule = Schedule(self._clock, RATE)
+        while True:
+            await schedule.next()
+            now, gate, controls = self._clock.now(), self._gate.latest, self._hand.latest
+            actions = self._policy.step(controls, None if gate is None else gate.mode, now)
+            self._report(actions.lost)
+            if gate is not None:
+                self._send(actions, controls, gate, now)
+            ready()
+
+    def _send(self, actions: HandActions, controls: HandControls | None, gate: GateState, now: int) -> None:
+        if actions.drives and controls is not None:
+            # Before an order to arm, so that the gate knows whether the stick is at rest.
+            self._inject(topics.REQ_DRIVE, DriveRequest(**self._header(gate, now), **self._motion(controls)))
+        for order in actions.orders:
+            self._inject(topics.REQ_CONTROL, ControlRequest(**self._header(gate, now), order=order))
+
+    def _motion(self, controls: HandControls) -> dict[str, Any]:
+        config = self._config
+        if self._steered:
+            speed, front = controls.speed * config.speed, controls.steer * config.angle
+            return {"speed": speed, "front": front, "unseen": controls.unseen}
+        twist = RequestedTwist(vx=controls.speed * config.speed, wz=controls.steer * config.turn)
+        return {"speed": 0.0, "front": 0.0, "twist": twist, "unseen": controls.unseen}
+
+    def _header(self, gate: GateState, now: int) -> dict[str, Any]:
+        self._seq += 1
+        return {
+            "stamp": now,
+            "received": now,
+            "seq": self._seq,
+            "source": DeviceRole.HAND.value,
+            "role": Role.HAND,
+            "lease": LEASE,
+            "nonce": gate.nonce,
+            "gate_stamp": gate.stamp,
+            "instance": self._instance,
+        }
+
+    def _report(self, lost: str | None) -> None:
+        """Report loss and return, once each."""
+        if (lost is None) is (self._lost is None):
+            return
+        self._lost = lost
+        if lost is None:
+            self._events(Reason.DEVICE_READY, Severity.INFO, self.name, "the radio control is there")
+        else:
+            self._events(Reason.DEVICE_LOST, Severity.WARNING, self.name, f"radio control lost: {lost}")
