@@ -24,7 +24,7 @@ import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from hashlib import blake2s
 from pathlib import Path
 from time import perf_counter
@@ -263,7 +263,7 @@ def drives(options: argparse.Namespace) -> list[Drive]:
             running = [pool.submit(driven, *place, options.seed, options.confirm) for place in some]
             for place, done in zip(some, running, strict=True):
                 found[place] = done.result()
-                print(json.dumps({"digest": name, **asdict(found[place])}), file=out, flush=True)
+                print(json.dumps({"digest": name, **vars(found[place])}), file=out, flush=True)
     return [found[place] for place in every if place in found]
 
 

@@ -139,6 +139,15 @@ def test_what_the_sonars_see_is_in_the_survey():
         assert ages[row, MAP_SIZE // 2 - round((WALL + 0.1) / MAP_CELL)] == -1
 
 
+def test_an_answer_of_a_sonar_that_looks_elsewhere_says_nothing_of_the_ground_behind():
+    rig = SonarRig().armed()
+    rig.mounts = {"f": (0.2, 0.0, 0.0), **MOUNTS}
+    rig.heard["f"] = 0.2
+    rig.driver = {"speed": -0.15}
+    rig.tick(600)
+    assert 0.05 < rig.room < 0.15
+
+
 def test_only_those_count_that_look_backwards():
     mounts = {name: (0.0, 0.0, yaw) for name, yaw in zip("abcd", np.radians([180, -165, 135, 0]), strict=True)}
     assert set(rear(mounts)) == {"a", "b"}
