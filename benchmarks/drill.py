@@ -1,9 +1,12 @@
 """1000 seeded faults on the whole truck, on the virtual clock: no unsafe motion, nothing stuck, back soon.
 
-    python benchmarks/drill.py [--seed 1] [--count 1000] [--jobs N | --cluster ADDRESS] [--resume FILE]
+    python benchmarks/drill.py [--seed 1] [--count 1000] [--fault KIND ...] [--jobs N | --cluster ADDRESS]
+                               [--resume FILE]
     python benchmarks/drill.py --families [--count 10000] [--from N] [--robot NAME] [...]
 
 What is unsafe is judged by an observer that sees only bytes on the wires of drive and steering, and the world's truth.
+
+``--fault`` draws faults of these kinds alone, as the report names them: "electronics rail lost" takes both hubs.
 
 ``--families`` draws from the families that the devices' own signals have, too: each value falsified, each command
 ignored, singles and pairs, in both directions, judged by the world's truth alone. ``--from`` begins at that trial, so
@@ -21,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from monstertruck_sim.faults import FaultKind
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.campaign import Campaign, CampaignReport
 from monstertruckd.tools.drill.legs import default_jobs
@@ -103,6 +107,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, help="1000; 10000 of families")
+    parser.add_argument("--fault", nargs="+", default=(), type=FaultKind, metavar="KIND", help="only these kinds")
     parser.add_argument("--families", action="store_true", help="falsify signals of devices and commands to them")
     parser.add_argument("--from", type=int, default=0, dest="first", metavar="N", help="of families: first trial")
     parser.add_argument("--robot", metavar="NAME", help="of families: of configs or configs/robots instead of full")
@@ -116,7 +121,7 @@ def main() -> int:
         return drill_families(arguments)
     truck = load_config(ROOT / "configs" / "full.yaml", SimulatedTruckConfig)[0]
     began = perf_counter()
-    report = Drill(arguments.seed, arguments.count or 1000, truck).run(
+    report = Drill(arguments.seed, arguments.count or 1000, truck, faults=arguments.fault).run(
         jobs=arguments.jobs, cluster=arguments.cluster, resume=arguments.resume
     )
     table(report)

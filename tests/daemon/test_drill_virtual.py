@@ -78,6 +78,20 @@ def test_random_faults_end_safely_and_leave_nothing_behind(count: int):
     assert report.score > 95
 
 
+def test_a_drill_of_both_hubs_has_them_back_in_two_seconds():
+    drill = Drill(1, 2, full(), leg=2, faults=[FaultKind.RAIL_ELECTRONICS])
+    outcomes = drill.run().outcomes
+    assert [outcome.kind for outcome in outcomes] == [FaultKind.RAIL_ELECTRONICS] * 2
+    for outcome in outcomes:
+        assert outcome.score == 100, outcome
+        assert 0.0 < (outcome.recovered_s or math.inf) <= 2.0
+
+
+def test_a_fault_that_the_robot_cannot_have_is_refused():
+    with pytest.raises(InputError, match="fault held wheel: expected one that"):
+        Drill(1, 1, demo(), faults=[FaultKind.HELD_WHEEL])
+
+
 @pytest.mark.long
 def test_the_tracker_of_every_second_truck_runs_in_a_worker_that_may_be_killed():
     kinds = {number: {o.kind for o in run_leg(leg)} for number, leg in enumerate(worker_drill().legs())}

@@ -41,8 +41,15 @@ class DrillLeg:
     seed: int
     number: int
     count: int
+    faults: tuple[str, ...] = ()
+    """Kinds of faults that are drawn; empty = all that the robot can have."""
     version: str = __version__
     """Version of the program; another one would give another report."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All that decides what the legs of a drill are, but for its seed."""
+        return self.config | ({"faults": list(self.faults)} if self.faults else {})
 
 
 def truck_of_leg(config: SimulatedTruckConfig, seed: int, records: str | None) -> SimulatedTruckConfig:
@@ -69,7 +76,7 @@ class LegFile(Generic[Outcome]):
     def __init__(self, path: Path, leg: DrillLeg, adapter: TypeAdapter[list[Outcome]]) -> None:
         self._adapter = adapter
         self._path = path
-        self._header = {"seed": leg.seed, "program": _digest(leg.config)}
+        self._header = {"seed": leg.seed, "program": _digest(leg.settings)}
         self._found: dict[tuple[int, int], list[Outcome]] = {}
         self._end = 0
         """Bytes of whole lines: an interrupted program leaves part of one."""

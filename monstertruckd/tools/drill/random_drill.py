@@ -195,13 +195,16 @@ class Drill:
         count: how many faults.
         config: the simulated truck.
         leg: faults of one truck.
+        faults: kinds of faults that are drawn; empty = all that the robot can have.
 
     Raises:
-        InputError: nothing drives the robot, or its tracker has no path.
+        InputError: nothing drives the robot, its tracker has no path, or it cannot have one of the ``faults``.
     """
 
     # 25: faults of one truck
-    def __init__(self, seed: int, count: int, config: SimulatedTruckConfig, *, leg: int = 25) -> None:
+    def __init__(
+        self, seed: int, count: int, config: SimulatedTruckConfig, *, leg: int = 25, faults: Iterable[FaultKind] = ()
+    ) -> None:
         check_drivable(config)
         if config.tracker is not None and config.path is None:
             raise InputError(f"path: {config.robot} has none: expected one that its tracker follows; or no tracker")
@@ -211,12 +214,16 @@ class Drill:
         """Motor controllers that no fault cuts off, for nothing would stop them."""
         self._config = config
         self._leg = leg
+        self._faults = tuple(dict.fromkeys(faults))
+        known = _catalog(wired(config)).kinds
+        if missing := [kind for kind in self._faults if kind not in known]:
+            raise InputError(f"fault {missing[0]}: expected one that {config.robot} can have: {', '.join(known)}")
 
     def legs(self) -> list[DrillLeg]:
         """The parts that can run in parallel."""
         starts = range(0, self.count, self._leg)
         return [
-            DrillLeg(self._config.model_dump(), self.seed, number, min(self._leg, self.count - start))
+            DrillLeg(self._config.model_dump(), self.seed, number, min(self._leg, self.count - start), self._faults)
             for number, start in enumerate(starts)
         ]
 
@@ -256,11 +263,9 @@ class _LegRun:
         workers: tuple[str, ...] = ()
         if base.tracker is not None and leg.number % 2:
             base, workers = with_overlay(base, TRACKER_IN_WORKER), (TRACKING,)
-        monitors, records = base.monitors.present(), base.recorder is not None
-        catalog = FaultCatalog(
-            base.devices, monitors, records=records, restarts=True, workers=workers, unguarded=unguarded(base)
-        )
-        self._faults = _draw(catalog, leg.count, self._rng)
+        catalog = _catalog(base, workers)
+        wanted = frozenset(map(FaultKind, leg.faults or catalog.kinds))
+        self._faults = _draw(catalog, leg.count, self._rng, frozenset(catalog.kinds) - wanted)
         records = any(fault.kind is FaultKind.DISK_FULL for fault in self._faults)
         self._config = truck_of_leg(base, int(self._rng.integers(2**31)), folder if records else None)
         self._outcomes: list[FaultOutcome] = []
@@ -290,14 +295,27 @@ class _LegRun:
         return self._outcomes
 
 
-def _draw(catalog: FaultCatalog, count: int, rng: np.random.Generator) -> list[CatalogFault]:
-    """The faults of a leg; a disk becomes full once."""
+def _catalog(config: SimulatedTruckConfig, workers: tuple[str, ...] = ()) -> FaultCatalog:
+    """Faults of a robot whose daemon has these worker processes."""
+    return FaultCatalog(
+        config.devices,
+        config.monitors.present(),
+        records=config.recorder is not None,
+        restarts=True,
+        workers=workers,
+        unguarded=unguarded(config),
+    )
+
+
+def _draw(
+    catalog: FaultCatalog, count: int, rng: np.random.Generator, without: frozenset[FaultKind]
+) -> list[CatalogFault]:
+    """The faults of a leg, none of the kinds ``without``; a disk becomes full once, unless only that is drawn."""
     faults: list[CatalogFault] = []
-    full = frozenset[FaultKind]()
     for _ in range(count):
-        faults.append(catalog.draw(rng, without=full))
-        if faults[-1].kind is FaultKind.DISK_FULL:
-            full = frozenset({FaultKind.DISK_FULL})
+        faults.append(catalog.draw(rng, without=without))
+        if faults[-1].kind is FaultKind.DISK_FULL and len(without) < len(catalog.kinds) - 1:
+            without |= {FaultKind.DISK_FULL}
     return faults
 
 
