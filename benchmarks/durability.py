@@ -1,6 +1,6 @@
 """Kills, power cuts and damaged files: nothing that was acknowledged is lost, nothing is mixed, nothing is a traceback.
 
-    python -m benchmarks.durability [--kills 1000] [--cuts 200] [--logs 2000] [--files 20000] [--seed 1] [PART ...]
+    python -m benchmarks.durability [--kills 1000] [--cuts 200] [--logs 2000] [--files 20000] [--from 0] [PART ...]
 
 Parts: ``kills`` ends the writers of all subjects (``durability_parts/deaths.py``) by SIGKILL at any moment; ``cuts``
 plays the traces of their writes to a disk that forgets what was not synced, and cuts its power at any point; ``logs``
@@ -31,6 +31,7 @@ def main() -> int:
     options.add_argument("--cuts", type=int, default=GOALS["cuts"])
     options.add_argument("--logs", type=int, default=GOALS["logs"])
     options.add_argument("--files", type=int, default=GOALS["files"])
+    options.add_argument("--from", dest="first", type=int, default=0, help="number of the first of --files")
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--subject", action="append", help="kill and cut writers of these subjects only")
     given = options.parse_args()
@@ -45,7 +46,7 @@ def main() -> int:
         if "logs" in parts:
             figures["logs"] = {"damaged": damage.run(given.logs, given.seed, Path(name) / "logs")}
         if "files" in parts:
-            figures["files"] = files.run_apart(given.files, given.seed, Path(name) / "files")
+            figures["files"] = files.run_apart(given.files, given.seed, Path(name) / "files", given.first)
     print(json.dumps({"bench": "durability", "figures": figures, "goals": GOALS, "met": _met(figures)}))
     return 0 if _met(figures) else 1
 

@@ -96,8 +96,8 @@ def _patch(run: int, number: int) -> GridPatch:
 
 def _graph(run: int, number: int) -> storage.SavedGraph:
     rng, none = np.random.default_rng(number), np.zeros(0)
-    scans = tuple(storage.elements(rng.normal(size=(20, 2)), normals=np.zeros((20, 2)), variances=np.zeros((20, 2)))
-                  for _ in range(KEYS))  # fmt: skip
+    normals, variances = np.tile((0.0, 1.0), (20, 1)), np.full((20, 2), 1e-4)
+    scans = tuple(storage.elements(rng.normal(size=(20, 2)), normals=normals, variances=variances) for _ in range(KEYS))
     edges = {
         "edge_ends": np.zeros((0, 2), np.int64),
         "edge_measured": np.zeros((0, 3)),

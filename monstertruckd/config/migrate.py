@@ -95,7 +95,7 @@ def carry_out(upgrades: Sequence[Upgrade]) -> None:
     """
     for upgrade in upgrades:
         try:
-            if upgrade.kept.exists() and upgrade.kept.read_text(encoding="utf-8") != upgrade.before:
+            if upgrade.kept.exists() and upgrade.kept.read_bytes() != upgrade.before.encode():
                 raise InputError(f"{upgrade.kept}: holds another version {upgrade.version} already; move it away")
             replace_file(upgrade.kept, upgrade.before)
             replace_file(upgrade.path, upgrade.after)

@@ -159,7 +159,9 @@ def test_an_interrupted_drill_goes_on_where_it_ended_and_gives_the_same_report(t
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("rubbish\n", "line 1 is no leg of a drill"),
+        ("rubbish\n", ":1: expected a leg of a drill"),
+        ("[" * 100_000 + "\n", ":1: expected a leg of a drill: it is nested too deeply"),
+        ('{"seed": 7, "program": "x", "leg": 1e999, "count": 1, "outcomes": []}\n', ":1: expected a leg of a drill"),
         ('{"seed": 7, "program": "x", "leg": 0, "count": 1, "outcomes": []}\n', "of another program"),
     ],
 )

@@ -122,11 +122,7 @@ def require_place(path: Path, role: str) -> YamlText:
         InputError: it cannot be read, is not YAML, or does not say it.
     """
     try:
-        text = YamlText(path.read_text(encoding="utf-8"), path)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: {error}") from error
+        text = YamlText.read(path)
     except ConfigError as error:
         raise InputError(str(error)) from error
     if text.node("devices", role, "port") is None:

@@ -16,6 +16,7 @@ from typing import Any, Final, Generic, TypeVar
 from pydantic import TypeAdapter
 
 from monstertruck_runtime.errors import InputError, NoAnswerError, WorkerError
+from monstertruck_runtime.outside import MEGABYTE, contents, reading
 from monstertruckd import __version__
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
@@ -23,6 +24,8 @@ T = TypeVar("T")
 U = TypeVar("U")
 Outcome = TypeVar("Outcome")
 
+MOST_BYTES: Final = 100 * MEGABYTE
+"""Size of a file of outcomes at most: a campaign of a million trials."""
 CONNECT: Final = 10.0
 """Seconds in which the scheduler of a cluster must answer."""
 
@@ -80,10 +83,9 @@ class LegFile(Generic[Outcome]):
         self._found: dict[tuple[int, int], list[Outcome]] = {}
         self._end = 0
         """Bytes of whole lines: an interrupted program leaves part of one."""
+        data = contents(path, "outcomes of a drill", MOST_BYTES) if path.exists() else b""
         try:
-            with path.open("a+b") as file:  # before the first leg, not after it: it must be possible to write
-                file.seek(0)
-                data = file.read()
+            path.open("ab").close()  # before the first leg, not after it: it must be possible to write
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}") from error
         self._end = data.rfind(b"\n") + 1
@@ -91,15 +93,13 @@ class LegFile(Generic[Outcome]):
             self._read(line, number)
 
     def _read(self, line: bytes, number: int) -> None:
-        try:
+        with reading(f"{self._path}:{number}", "a leg of a drill"):
             row = json.loads(line)
             header = {key: row[key] for key in self._header}
             outcomes = self._adapter.validate_python(row["outcomes"], strict=False)
             leg = int(row["leg"]), int(row["count"])
-        except (ValueError, TypeError, KeyError) as error:
-            raise InputError(f"{self._path}: line {number} is no leg of a drill") from error
         if header != self._header:
-            text = f"{self._path}: line {number} is of seed {header['seed']}, or of another program or configuration"
+            text = f"{self._path}:{number}: is of seed {header['seed']}, or of another program or configuration"
             raise InputError(f"{text}: expected seed {self._header['seed']} and the same program")
         self._found[leg] = outcomes
 

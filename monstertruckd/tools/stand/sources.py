@@ -18,6 +18,7 @@ from monstertruck_drivers.webcam.source import Mode
 from monstertruck_estimation.vision.tags import Picture
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import DeviceLostError, InputError, TruckError
+from monstertruck_runtime.outside import MOST_PIXELS, picture
 from monstertruckd.tools.stand.config import FileSource, RenderedCamera, VideoDevice
 
 ENDINGS: Final = (".png", ".jpg", ".jpeg", ".pgm")
@@ -87,9 +88,9 @@ def _rendered(port: Path, mode: Mode, *, colour: bool) -> Iterator[Picture]:
             found = box.get()
             if isinstance(found, BaseException):
                 raise found
-            picture = cv2.imdecode(np.frombuffer(found, np.uint8), FLAGS[colour])
-            if picture is not None:
-                yield np.asarray(picture, dtype=np.uint8)
+            frame = cv2.imdecode(np.frombuffer(found, np.uint8), FLAGS[colour])
+            if frame is not None:
+                yield np.asarray(frame, dtype=np.uint8)
     finally:
         ended.set()
 
@@ -116,23 +117,27 @@ def _frames(name: Path, capture: cv2.VideoCapture, closed: Exception, *, colour:
     try:
         if not capture.isOpened():
             raise type(closed)(f"{name}: {closed}")
+        width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        if width * height > MOST_PIXELS:
+            raise InputError(f"{name}: {width:.0f} x {height:.0f} pixels: expected at most {MOST_PIXELS}")
         while True:
-            there, picture = capture.read()
+            there, frame = capture.read()
             if not there:
                 return
-            yield np.asarray(picture) if colour else _grey(np.asarray(picture))
+            yield np.asarray(frame) if colour else _grey(np.asarray(frame))
     finally:
         capture.release()
 
 
 def _read(path: Path, *, colour: bool) -> Picture:
-    picture = cv2.imread(str(path), FLAGS[colour])
-    if picture is None:
-        raise InputError(f"{path}: cannot be read as a picture")
-    return np.asarray(picture, dtype=np.uint8)
+    with picture(path):  # refuses one that is too large
+        found = cv2.imread(str(path), FLAGS[colour])
+        if found is None:
+            raise InputError(f"{path}: cannot be read as a picture")
+        return np.asarray(found, dtype=np.uint8)
 
 
-def _grey(picture: np.ndarray) -> Picture:
-    if picture.ndim == 2:
-        return picture.astype(np.uint8)
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+def _grey(frame: np.ndarray) -> Picture:
+    if frame.ndim == 2:
+        return frame.astype(np.uint8)
+    return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8)

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from monstertruck_estimation.slam.correlation import RESOLUTION
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.scans import SLIDE, Scan
 from monstertruck_estimation.slam.worker_io import GridPatch
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap, load_map, load_saved, map_content
+from monstertruck_runtime.map_files import FREE, MOST_CELLS, OCCUPIED, WorldMap, load_map, load_saved, map_content
 from monstertruck_runtime.map_folders import YAML, folder_of, opened, write_save
 from monstertruck_runtime.outside import arrays as arrays_of
 from monstertruck_runtime.outside import reading
@@ -202,10 +203,35 @@ def _graph_of(path: Path, arrays: dict[str, NDArray[Any]]) -> SavedGraph:
     ends = edges["edge_ends"] = edges["edge_ends"].astype(np.int64)
     if ends.size and not (ends.min() >= 0 and ends.max() < count):
         raise InputError(f"{path}: edge_ends: expected numbers of {count} keyframes")
+    if not (every["variances"] > 0.0).all():
+        raise InputError(f"{path}: variances: expected numbers above 0")
+    poses = arrays["poses"].astype(np.float64)
+    _require_extent(path, every["points"], poses[np.repeat(np.arange(count), np.diff(starts))])
     scans = tuple(
         elements(**{name: values[a:b] for name, values in every.items()}) for a, b in itertools.pairwise(starts)
     )
-    return SavedGraph(arrays["stamps"].astype(np.int64), arrays["poses"].astype(np.float64), scans, edges)
+    return SavedGraph(arrays["stamps"].astype(np.int64), poses, scans, edges)
+
+
+def _require_extent(path: Path, points: Array, poses: Array) -> None:
+    """Refuse surfaces so far apart that no grid holds them all.
+
+    Args:
+        path: file that they are read from.
+        points: in base, shape (n, 2).
+        poses: of the base in map for each point, shape (n, 3).
+
+    Raises:
+        InputError: a grid of them would have more than ``MOST_CELLS``.
+    """
+    if not len(points):
+        return
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x = poses[:, 0] + cos * points[:, 0] - sin * points[:, 1]
+    y = poses[:, 1] + sin * points[:, 0] + cos * points[:, 1]
+    width, height = float(np.ptp(x)), float(np.ptp(y))
+    if (width / RESOLUTION + 1.0) * (height / RESOLUTION + 1.0) > MOST_CELLS:
+        raise InputError(f"{path}: surfaces over {width:g} m x {height:g} m: expected at most {MOST_CELLS} cells")
 
 
 NORMAL_REACH: Final = 0.2

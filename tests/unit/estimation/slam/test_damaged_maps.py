@@ -2,6 +2,7 @@
 
 import io
 import random
+import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -128,6 +129,28 @@ def test_a_bomb_is_refused_before_it_is_unpacked(loose: dict[str, bytes], tmp_pa
     assert "the map is used without keyframes" in storage.load(tmp_path).grid.remarks[0]
     with pytest.raises(InputError, match=r"ground\.npz: .*bytes"):
         GroundGrid.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("variances", 0.0, "variances: expected numbers above 0"),
+        ("points", 1e12, "surfaces over .* expected at most 25000000 cells"),
+        ("poses", 1e9, "surfaces over .* expected at most 25000000 cells"),
+    ],
+)
+def test_a_graph_that_no_search_could_use_is_left_out(
+    loose: dict[str, bytes], tmp_path: Path, name: str, value: float, expected: str
+):
+    for file, data in loose.items():
+        (tmp_path / file).write_bytes(data)
+    with np.load(io.BytesIO(loose["graph.npz"])) as file:
+        arrays = dict(file)
+    arrays[name][3] = value, -value, *[0.0] * (arrays[name].shape[1] - 2)
+    np.savez(tmp_path / "graph.npz", **arrays)
+    saved = storage.load(tmp_path)
+    assert saved.graph is None
+    assert re.search(rf"graph\.npz: {expected}.*; the map is used without keyframes", saved.grid.remarks[0])
 
 
 @pytest.mark.parametrize("kind", ["PNG", "PPM", "BMP", "JPEG", "TIFF", "GIF", "WEBP"])

@@ -3,13 +3,17 @@
 import asyncio
 from pathlib import Path
 
+import cv2
 import numpy as np
+import pytest
+from PIL import Image
 
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.webcam.emulator import WebcamEmulator
 from monstertruck_runtime.clock import WallClock
-from monstertruckd.tools.stand.config import RenderedCamera
-from monstertruckd.tools.stand.sources import stream
+from monstertruck_runtime.errors import InputError
+from monstertruckd.tools.stand.config import FileSource, RenderedCamera
+from monstertruckd.tools.stand.sources import pictures_in, stream
 
 
 class Grey:
@@ -39,3 +43,14 @@ def test_a_rendered_camera_streams_through_its_port(tmp_path: Path):
     first, second = asyncio.run(main())
     assert first.shape == second.shape == (120, 160)
     assert abs(int(first[100, 100]) - 90) < 4
+
+
+def test_a_picture_or_film_too_large_to_be_held_is_refused_before_it_is_decoded(tmp_path: Path):
+    Image.new("1", (16_000, 16_000)).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match=r"a\.png: .*256000000 pixels.*expected at most 25000000 pixels"):
+        pictures_in(tmp_path)
+    film = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (6000, 4200))
+    film.write(np.zeros((4200, 6000, 3), np.uint8))
+    film.release()
+    with pytest.raises(InputError, match=r"film\.avi: 6000 x 4200 pixels: expected at most 25000000"):
+        list(stream(FileSource(path=tmp_path / "film.avi"), (64, 48), 10.0))
