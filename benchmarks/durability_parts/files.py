@@ -252,4 +252,5 @@ def run_apart(count: int, seed: int, work: Path, first: int = 0) -> dict[str, An
 
 
 if __name__ == "__main__":
-    print(json.dumps(run(*map(int, sys.argv[1:4]), Path(sys.argv[4]))))
+    begin, number, chosen = map(int, sys.argv[1:4])
+    print(json.dumps(run(begin, number, chosen, Path(sys.argv[4]))))

@@ -37,14 +37,14 @@ from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_runtime.stations import TLS_VARIABLE, station_tls
-from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.base import Message, Pose2D, Twist2D
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest, Role
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.sensor import StandPose
 from monstertruck_schemas.state import Odometry
-from monstertruck_schemas.topics import ODOMETRY, REQ_DRIVE, STAND_POSE
+from monstertruck_schemas.topics import ODOMETRY, REQ_DRIVE, STAND_POSE, Topic
 from monstertruck_sim.world.config import HeightImage
 from monstertruck_sim.world.terrain import load_profile
 from monstertruck_sim.world3d.ground import _pictured, scenery
@@ -107,16 +107,16 @@ class Kind(NamedTuple):
 
     make: Callable[[Path], object]
     read: Callable[[Path], object]
-    share: int = 2
+    share: int = 4
 
 
 def kinds() -> dict[str, Kind]:
     """By name."""
     return {
-        "map": Kind(_map, lambda it: surface_elements(load_map(it / "m.yaml")), 4),
+        "map": Kind(_map, lambda it: surface_elements(load_map(it / "m.yaml")), 8),
         "map16": Kind(_map16, lambda it: load_map(it / "m.yaml")),
-        "saved map": Kind(_saved, _read_saved, 4),
-        "log": Kind(_log, _read_log, 3),
+        "saved map": Kind(_saved, _read_saved, 8),
+        "log": Kind(_log, _read_log, 4),
         "log of a run": Kind(_run, _read_run, 1),
         "log replayed": Kind(_run, _read_replayed, 1),
         "log on the page": Kind(_run, _read_page, 1),
@@ -126,25 +126,25 @@ def kinds() -> dict[str, Kind]:
         "log as npz": Kind(_run, _exported(lambda it: export_npz(it / "log.mcap", it / "npz")), 1),
         "log as MCAP": Kind(_run, _exported(lambda it: export_mcap(it / "log.mcap", it / "dated.mcap")), 1),
         "log as ROS 2 bag": Kind(_run, _exported(lambda it: export_ros2(it / "log.mcap", it / "bag")), 1),
-        "scans npz": Kind(_npz, lambda it: read_scans(it / "log.npz"), 3),
+        "scans npz": Kind(_npz, lambda it: read_scans(it / "log.npz"), 6),
         "scans CARMEN": Kind(_carmen, lambda it: read_scans(it / "log.log")),
         "scans CARMEN, packed": Kind(_carmen_packed, lambda it: read_scans(it / "log.gz")),
         "scans URG": Kind(_urg, lambda it: (read_scans(it / "log.dat"), RecordedRanges.load(it / "log.dat"))),
-        "path": Kind(_path, lambda it: load_path(it / "p.csv", closed=False), 3),
+        "path": Kind(_path, lambda it: load_path(it / "p.csv", closed=False), 6),
         "trajectory": Kind(_trajectory, lambda it: _read_trajectory(it / "t.csv")),
         "wheels": Kind(_wheels, lambda it: _read_wheels(it / "w.yaml")),
-        "mission": Kind(_mission, lambda it: load_config(it / "m.yaml", Mission), 3),
+        "mission": Kind(_mission, lambda it: load_config(it / "m.yaml", Mission), 6),
         "configuration": Kind(_config, lambda it: load_truck(it / "truck.yaml"), 1),
-        "live settings": Kind(_settings, _read_settings, 3),
+        "live settings": Kind(_settings, _read_settings, 6),
         "saved mission": Kind(_progress, _read_progress),
         "users": Kind(_users, _read_users),
         "gamepad": Kind(_gamepad, lambda it: read_mapping(it / "pad.yaml")),
         "profile": Kind(_profile, lambda it: load_profile(it / "h.profile.yaml")),
         "height picture": Kind(_heights, _read_heights),
-        "mjcf": Kind(_mjcf, lambda it: scenery(it / "s.xml"), 3),
+        "mjcf": Kind(_mjcf, lambda it: scenery(it / "s.xml"), 6),
         "stations": Kind(_stations, lambda it: Folder(it / "security").register()),
-        "certificate": Kind(_certificate, lambda it: certificates.load(it / "c.pem", it / "k.pem"), 3),
-        "calibration": Kind(_calibration, _read_calibration, 3),
+        "certificate": Kind(_certificate, lambda it: certificates.load(it / "c.pem", it / "k.pem"), 6),
+        "calibration": Kind(_calibration, _read_calibration, 6),
         "stand": Kind(_stand, lambda it: stand.load(it / "stand.json")),
         "odometer": Kind(_odometer, lambda it: DistanceCounter(it / "odometer.json").load()),
         "map planned over": Kind(_map, _read_planned, 1),
@@ -154,7 +154,7 @@ def kinds() -> dict[str, Kind]:
         "log checked": Kind(_run, _read_checked, 1),
         "log reported": Kind(_run, lambda it: command("log", "report", it / "log.mcap", "-o", it / "report.html"), 1),
         "log of a study": Kind(_study, _read_study),
-        "folder of logs": Kind(_folder, _read_folder),
+        "folder of logs": Kind(_folder, _read_folder, 1),
         "outcomes of a drill": Kind(_drill, _read_drill),
         "old configuration": Kind(_old, lambda it: command("config", "migrate", it / "truck.yaml")),
         "configuration with a port": Kind(_with_port, _read_with_port),
@@ -417,7 +417,7 @@ def _read_checked(folder: Path) -> None:
 
 
 def _read_planned(folder: Path) -> None:
-    command("plan", folder / "m.yaml", "--budget", "0.2", "--", "-0.5,-1.5,0", "-0.4,-1.2,0")
+    command("plan", folder / "m.yaml", "--budget", "0.05", "--", "-0.5,-1.5,0", "-0.4,-1.2,0")
 
 
 def _localised(folder: Path) -> None:
@@ -438,7 +438,7 @@ def _study(folder: Path) -> None:
         stamps: dict[str, Any] = {"stamp": now, "received": now, "seq": seq}
         angle = 0.01 * seq
         pose = Pose2D(x=0.2 * math.sin(angle), y=-0.2 * math.cos(angle), yaw=angle)
-        messages = {
+        messages: dict[Topic[Any], Message] = {
             REQ_DRIVE: DriveRequest(
                 **stamps, source="study", role=Role.STATION, lease=0.25, nonce="n", speed=0.0, front=0.0,
                 shafts=(0.75, 1.5),
@@ -458,7 +458,7 @@ def _study(folder: Path) -> None:
 
 def _read_study(folder: Path) -> None:
     command("stand", "analyse", folder / "log.mcap")
-    command("study", "analyse", folder / "log.mcap", "--out", folder / "figures")
+    command("study", "analyse", folder / "log.mcap")
 
 
 def _folder(folder: Path) -> None:

@@ -20,7 +20,6 @@ from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.points.service import START_TIMEOUT as READER_START
 from monstertruck_estimation.points.service import TARGET as READER
 from monstertruck_estimation.points.service import PointFolders, PointInputs, PointService
-from monstertruck_estimation.points.tracking import PoseAsker
 from monstertruck_estimation.slam.service import SlamService
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount, quaternion_from_rpy
 from monstertruck_kinematics.chassis import Chassis
@@ -127,8 +126,7 @@ def build_estimation(
     if ground is not None:
         yield ground
     if config.points is not None:
-        ask = None if slam is None else slam.bases_at
-        yield _build_points(config, config.points, bus, clock, ask, run)
+        yield _build_points(config, config.points, bus, clock, slam, run)
 
 
 def _build_consistency(
@@ -207,7 +205,7 @@ def _folder(known: Path | None) -> Path | None:
 
 
 def _build_points(
-    config: TruckConfig, points: PointsConfig, bus: Bus, clock: Clock, ask: PoseAsker | None, run: str
+    config: TruckConfig, points: PointsConfig, bus: Bus, clock: Clock, mapper: SlamService | None, run: str
 ) -> PointService:
     camera, slam = config.devices.camera, config.slam
     if camera is not None and find_spec("cv2") is None:
@@ -232,7 +230,7 @@ def _build_points(
             attitude=None if config.devices.compass is None else bus.subscribe(topics.COMPASS, latest()),
             gate=bus.subscribe(topics.GATE, latest()),
         ),
-        ask=ask,
+        ask=None if mapper is None else mapper.bases_at,
         out=bus.publisher(topics.POINTS, Writer.ESTIMATION),
         events=bus.event_sink(),
         folders=PointFolders(
@@ -240,6 +238,7 @@ def _build_points(
             save=slam.save if slam is not None and mapping else folder,
             run=run if mapping else None,
         ),
+        save_map=None if mapper is None else mapper.save_soon,
         offload=inline if isinstance(clock, VirtualClock) else in_thread,
         max_age=config.gate.max_request_age,
     )

@@ -143,7 +143,7 @@ def _repairs(directory: Path, stop: threading.Event | None = None) -> Iterator[R
             log.warning("not repaired: %s", error)
             yield error
         else:
-            log.log(logging.WARNING if recovery.lost else logging.INFO, "repaired %s", recovery)
+            log.log(logging.WARNING if recovery.costs else logging.INFO, "repaired %s", recovery)
             yield recovery
         if stop is not None and stop.is_set():
             break

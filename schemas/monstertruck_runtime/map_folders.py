@@ -95,6 +95,15 @@ def opened(folder: Path) -> Iterator[MapSave]:
         yield _newest(folder)
 
 
+def holds_map(folder: Path, run: str) -> bool:
+    """Whether the newest whole save of a grid is of this run."""
+    try:
+        with opened(folder) as save:
+            return save.run == run and save.file(YAML).exists()
+    except InputError:
+        return False
+
+
 def write_save(
     folder: Path, parts: Mapping[str, bytes], owned: Sequence[str] = (), run: str | None = None, *, new: bool = True
 ) -> Path | None:

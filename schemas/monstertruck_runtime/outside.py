@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 MEGABYTE: Final = 1_000_000
 MOST_UNPACKED: Final = 128 * MEGABYTE
 """Bytes that a compressed file, or a compressed part of one, may hold."""
+MOST_PIXELS: Final = 25 * MEGABYTE
+"""Pixels of a picture: 250 m x 250 m in cells of 5 cm."""
 FORMATS: Final = ("PNG", "PPM", "BMP", "JPEG", "TIFF", "GIF", "WEBP")
 """Formats of pictures that are read; Pillow decodes others by starting programs."""
 LONGEST: Final = 200
@@ -163,9 +165,8 @@ def _require_array(stream: Any, size: int) -> None:
         raise ValueError(f"an array of shape {shape} in {size} bytes")
 
 
-# 25 * MEGABYTE: pixels of a picture: 250 m x 250 m in cells of 5 cm
 @contextmanager
-def picture(file: Path, expected: str = "a picture", most: int = 25 * MEGABYTE) -> Iterator["Image.Image"]:
+def picture(file: Path, expected: str = "a picture", most: int = MOST_PIXELS) -> Iterator["Image.Image"]:
     """Open a picture of one of ``FORMATS``, whose pixels are decoded when they are wanted.
 
     Raises:

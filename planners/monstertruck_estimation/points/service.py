@@ -4,6 +4,7 @@ import asyncio
 import base64
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -20,6 +21,7 @@ from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, WorkerError, disk_reason
 from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.map_folders import holds_map
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import Sequences, examine, parse_request
 from monstertruck_runtime.threads import Offload
@@ -92,6 +94,7 @@ class PointService:
         out: ``state/points``.
         events: what was found, and what fails.
         folders: of the map.
+        save_map: has the map of this run saved as soon as possible; None = it is known.
         offload: where files are read and written.
         max_age: see ``GateConfig.max_request_age``.
     """
@@ -110,13 +113,16 @@ class PointService:
         out: Publisher[PointsOfInterest],
         events: EventSink,
         folders: PointFolders,
+        save_map: Callable[[], object] | None,
         offload: Offload,
         max_age: float,
     ) -> None:
         self._config, self._clock, self._actor, self._in = config, clock, actor, inputs
         mount, self._lens = (Mount(), LensConfig()) if camera is None else camera
         self._ask, self._out, self._events, self._folders = ask, out, events, folders
-        self._offload = offload
+        self._save_map, self._offload = save_map, offload
+        self._map_saved = False
+        """Whether the map of this run was saved."""
         self._map = PointMap(config, mount)
         self._sequences = Sequences(max_age)
         self._history: deque[_Placed] = deque(maxlen=128)  # poses kept: 2.5 s at 50 Hz
@@ -312,10 +318,10 @@ class PointService:
     # Requests
 
     async def kept(self) -> None:
-        """Save what is known now, as an answered request has to outlast a power cut.
+        """Save what is known now, as an answered request has to outlast a power cut, with the map that it belongs to.
 
         Raises:
-            RequestRefusedError: it cannot be written; it is tried again.
+            RequestRefusedError: it cannot be written, or the map is not saved in time; it is tried again.
         """
         await self._refresh()
         reason = await self._save()
@@ -323,6 +329,26 @@ class PointService:
         if self._unsaved:
             text = f"done, but a power cut would undo it: {reason.text}; the robot goes on trying to save it"
             raise RequestRefusedError(reason, text)
+        await self._require_map()
+
+    async def _require_map(self) -> None:
+        """Have the map of this run saved if it was not yet: points alone have no place in the map of another run.
+
+        Raises:
+            RequestRefusedError: it is not saved in time.
+        """
+        folder, run = self._folders.save, self._folders.run
+        if folder is None or run is None or self._save_map is None or self._map_saved:
+            return
+        self._save_map()
+        try:
+            async with self._clock.deadline(4.0):  # a call ends after 5 s
+                while not await self._offload(lambda: holds_map(folder, run)):
+                    await self._clock.sleep(0.1)
+        except TimeoutError:
+            text = "done, but a power cut would undo it: the map is not saved yet; the robot goes on trying"
+            raise RequestRefusedError(Reason.NO_MAP, text) from None
+        self._map_saved = True
 
     def take(self, request: PointRequest) -> Pose2 | None:
         """Mark a place, or forget a point.

@@ -123,6 +123,14 @@ def test_the_repair_of_a_start_keeps_the_original_and_says_what_is_lost(tmp_path
     assert recover_directory(tmp_path) == []
 
 
+def test_a_repair_that_may_have_lost_messages_is_a_warning(tmp_path, logs, caplog):
+    log = logs[Compression.LZ4, False]
+    (tmp_path / "run-000001-000.mcap").write_bytes(log.data[: log.data.index(log.chunks[-1][0])])
+    (done,) = recover_directory(tmp_path)
+    assert (done.lost, done.counted) == (0, False)
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+
+
 def test_a_chunk_that_is_there_twice_is_kept_once(tmp_path, logs):
     log = logs[Compression.ZSTD, True]
     file = tmp_path / "log.mcap"

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.durability_parts import maps
 from monstertruck_estimation.points import files
 from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.points.service import (
@@ -18,10 +19,12 @@ from monstertruck_estimation.points.service import (
     PointInputs,
     PointService,
 )
+from monstertruck_estimation.slam import storage
 from monstertruck_runtime.actors.actor import LoopActor
-from monstertruck_runtime.clock import run_virtual
+from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_runtime.map_folders import holds_map
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.body import LensConfig, Mount
@@ -53,7 +56,7 @@ class Calls(dict):
 class Rig:
     """A robot that creeps along x."""
 
-    def __init__(self, clock, folder, ask=None, load=None, standing=None) -> None:
+    def __init__(self, clock, folder, ask=None, load=None, standing=None, run=None, save_map=None) -> None:
         self.clock, self.out, self.events, self.seq, self.speed = clock, Kept(), [], 0, 0.05
         self.camera, self.pose, self.felt = Mailbox(latest()), Mailbox(fifo(256)), Mailbox(latest())
         self.gate = SimpleNamespace(latest=SimpleNamespace(nonce="n", stamp=0))
@@ -64,7 +67,7 @@ class Rig:
             LoopActor(TARGET, clock, 0.05),
             inputs=PointInputs(self.camera, self.pose, slam, self.felt, self.gate), ask=ask, out=self.out,
             events=lambda reason, *args, **_: self.events.append((reason, args[-1])),
-            folders=PointFolders(load=load, save=folder), offload=inline, max_age=5.0,
+            folders=PointFolders(load=load, save=folder, run=run), save_map=save_map, offload=inline, max_age=5.0,
         )  # fmt: skip
         self.service.register(self.calls)
 
@@ -268,6 +271,35 @@ def test_an_answered_request_is_on_the_disk(tmp_path):
         assert files.load(tmp_path) == []
 
     run_scenario(story, tmp_path)
+
+
+def test_a_mark_before_the_first_save_of_a_map_is_answered_once_its_map_is_saved(tmp_path):
+    def save_map(run: int = 2) -> None:
+        storage.save(tmp_path, maps._patch(run, 1), maps._graph(run, 1), str(run))
+
+    async def story(rig: Rig) -> None:
+        await rig.drive(1.0, show=b"")
+        await rig.ask(PointOrder.MARK, "dock")
+        assert [point.name for point, _ in files.load(tmp_path)] == ["dock"]
+        assert holds_map(tmp_path, "2")
+
+    save_map(1)
+    run_scenario(story, tmp_path, run="2", save_map=save_map)
+
+
+def test_a_mark_in_a_map_that_is_never_saved_is_refused(tmp_path):
+    asked = []
+
+    async def story(rig: Rig) -> None:
+        await rig.drive(1.0, show=b"")
+        begin = rig.clock.now()
+        with pytest.raises(RequestRefusedError, match="the map is not saved yet") as refused:
+            await rig.ask(PointOrder.MARK, "dock")
+        assert refused.value.refusal is Reason.NO_MAP
+        assert rig.clock.now() - begin < 4.2 * SECOND
+
+    run_scenario(story, tmp_path, run="2", save_map=lambda: asked.append(True))
+    assert asked == [True]
 
 
 def test_a_robot_that_is_lost_marks_no_place_of_its_own_and_reads_no_tags(tmp_path):
