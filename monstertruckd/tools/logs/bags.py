@@ -17,6 +17,8 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.outside import reading
 
+METADATA: Final = "metadata.yaml"
+"""File that makes a folder a bag of ROS 2."""
 SCANS: Final = "foxglove.LaserScan or sensor_msgs/LaserScan"
 """Messages that are read as scans."""
 

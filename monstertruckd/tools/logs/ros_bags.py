@@ -1,19 +1,45 @@
 """Bags of ROS 1 and 2 by the package ``rosbags``, which comes with the extra ``logs``."""
 
-from collections.abc import Iterator
+import bz2
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
+import lz4.frame
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from monstertruck_runtime.outside import reading
-from monstertruckd.tools.logs.bags import READERS, RawMessage
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.outside import MEGABYTE, MOST_UNPACKED, reading
+from monstertruck_runtime.yaml_files import read_yaml
+from monstertruckd.recorder.reader import open_log
+from monstertruckd.tools.logs.bags import METADATA, READERS, RawMessage, mcap_messages
 
 _ROS1: Final = get_typestore(Stores.ROS1_NOETIC)
 _ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 _ROS2: Final = get_typestore(Stores.ROS2_JAZZY)
+
+
+def _bounded(decompressor: Any) -> Callable[[bytes], bytes]:
+    """Return what unpacks a chunk of at most ``MOST_UNPACKED`` bytes, by a new ``decompressor``."""
+
+    def unpack(data: bytes) -> bytes:
+        unpacking = decompressor()
+        found: bytes = unpacking.decompress(data, MOST_UNPACKED + 1)
+        if not unpacking.eof:
+            text = f"more than {MOST_UNPACKED // MEGABYTE} MB" if len(found) > MOST_UNPACKED else "cut off"
+            raise ValueError(f"a packed chunk is {text}")
+        return found
+
+    return unpack
+
+
+BOUNDED: Final[dict[Any, Callable[[bytes], bytes]]] = {
+    bz2.decompress: _bounded(bz2.BZ2Decompressor),
+    lz4.frame.decompress: _bounded(lz4.frame.LZ4FrameDecompressor),
+}
+"""What unpacks chunks of ROS 1 within bounds, by the function that does so without."""
 
 
 def ros_messages(path: Path, version: int) -> Iterator[RawMessage]:
@@ -22,11 +48,22 @@ def ros_messages(path: Path, version: int) -> Iterator[RawMessage]:
     Topics of other messages than those that are read are yielded once, without data.
 
     Raises:
-        InputError: it cannot be read, or is damaged.
+        InputError: it cannot be read, is damaged, or holds packed chunks that are too large, or packed messages.
     """
     with reading(path, f"a bag of ROS {version}"):
+        if path.is_dir() and (parts := _mcap_parts(path)) is not None:
+            for part in parts:
+                log = open_log(part)
+                yield from mcap_messages(log.records())
+                if log.fault is not None:
+                    raise InputError(f"{part}: {log.fault}")
+            return
         encoding = "ros1" if version == 1 else "cdr"
         with Ros1Reader(path) if version == 1 else Ros2Reader(path) as bag:
+            if isinstance(bag, Ros1Reader):
+                for at, chunk in bag.chunks.items():
+                    unpack = BOUNDED.get(chunk.decompressor, chunk.decompressor)
+                    bag.chunks[at] = chunk._replace(decompressor=unpack)
             read = [one for one in bag.connections if one.msgtype in READERS]
             for one in bag.connections:
                 if one not in read:
@@ -34,6 +71,21 @@ def ros_messages(path: Path, version: int) -> Iterator[RawMessage]:
             if read:
                 for one, time, data in bag.messages(connections=read):
                     yield RawMessage(one.topic, one.msgtype, encoding, time, bytes(data))
+
+
+def _mcap_parts(folder: Path) -> list[Path] | None:
+    """Files of a bag of ROS 2 that is stored as MCAP; None for one that is stored otherwise.
+
+    Raises:
+        InputError: its description cannot be read, or says that it is packed.
+    """
+    about = read_yaml(folder / METADATA)["rosbag2_bagfile_information"]
+    packed = str(about.get("compression_mode") or "none").lower()
+    if packed != "none":
+        raise InputError(f"{folder}: packed by {packed} (compression_mode): unpack it first, by `ros2 bag convert`")
+    if about["storage_identifier"] != "mcap":
+        return None
+    return [folder / Path(name).name for name in about["relative_file_paths"]]
 
 
 def parsed(encoding: str, schema: str, data: bytes) -> Any:

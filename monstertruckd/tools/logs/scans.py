@@ -22,7 +22,7 @@ from monstertruck_schemas.topics import ODOMETRY, SCAN
 from monstertruckd.recorder.frames import MAGIC
 from monstertruckd.recorder.reader import LogReader, open_log
 from monstertruckd.tools.logs.bag_scans import scans_of
-from monstertruckd.tools.logs.bags import content_of, mcap_messages
+from monstertruckd.tools.logs.bags import METADATA, content_of, mcap_messages
 from monstertruckd.tools.logs.carmen import read_carmen
 from monstertruckd.tools.logs.scan_log import (
     BEGIN,
@@ -45,8 +45,6 @@ URG_AHEAD: Final = 341
 """Beam of a URG recording that looks straight ahead."""
 BAG: Final = b"#ROSBAG V"
 DATABASE: Final = b"SQLite format 3\0"
-METADATA: Final = "metadata.yaml"
-"""File that makes a folder a bag of ROS 2."""
 OWN_FIELD: Final = b"codes"
 """Name of a field of our scans that those of others do not have."""
 STRANGERS: Final = {

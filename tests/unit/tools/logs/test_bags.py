@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 
 from monstertruck_estimation.slam.scans import prepare_input
@@ -199,6 +200,33 @@ def test_folders_and_topics_of_logs_that_have_none_are_refused(tmp_path: Path):
     rows = [row for row in drive(RosMessages(ROS2)) if row[0] != "/scan"]
     with pytest.raises(InputError, match=r"no scans: expected a topic of foxglove.LaserScan or sensor_msgs/LaserScan"):
         read_scans(write_ros2(tmp_path / "bag", rows))
+
+
+@pytest.mark.parametrize("packing", ["bz2", "lz4"])
+def test_a_chunk_of_ros_1_is_bounded_before_it_is_unpacked(tmp_path: Path, packing: str):
+    ros, file = RosMessages(ROS1), tmp_path / "a.bag"
+    bag = Ros1Writer(file)
+    bag.set_compression(Ros1Writer.CompressionFormat[packing.upper()])
+    with bag:
+        topic = bag.add_connection("/scan", "sensor_msgs/msg/LaserScan", typestore=ROS1)
+        scan = ros.scan(START, np.zeros(40_000_000, np.float32))
+        bag.write(topic, START, ROS1.serialize_ros1(scan, "sensor_msgs/msg/LaserScan"))
+    assert file.stat().st_size < 2_000_000
+    with pytest.raises(InputError, match=r"a\.bag: expected a bag of ROS 1: a packed chunk is more than 128 MB"):
+        read_scans(file)
+
+
+def test_bags_of_ros_2_that_are_packed_or_describe_too_much_are_refused(tmp_path: Path):
+    bag = write_ros2(tmp_path / "bag", drive(RosMessages(ROS2)))
+    about = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(about.replace("compression_mode: ''", "compression_mode: MESSAGE"))
+    with pytest.raises(InputError, match=r"bag: packed by message .*unpack it first"):
+        read_scans(bag)
+    bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n"
+    bomb += "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 10))
+    (bag / "metadata.yaml").write_text(bomb + about)
+    with pytest.raises(InputError, match=r"metadata\.yaml:.*more than 20000 keys and values"):
+        read_scans(bag)
 
 
 @contextmanager
