@@ -1,11 +1,12 @@
 """Checks of the gate that a configuration adds by ``kind``, of this repository or of other distributions."""
 
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from monstertruck_runtime.plugins import Catalog, Plugin
 from monstertruck_schemas.base import Schema
+from monstertruck_schemas.topics import BY_NAME, Topic
 
 
 class CheckConfig(Schema):
@@ -22,6 +23,34 @@ class FenceConfig(CheckConfig):
     """Corners of a polygon in map, m."""
 
 
+class FreshConfig(CheckConfig):
+    """A topic without which the robot must not move."""
+
+    kind: Literal["fresh"]
+    topic: str
+    """Name of the topic, such as sensor/imu."""
+    within: Annotated[float, Field(gt=0, le=60)] | None = None
+    """Greatest age of its newest message, s; null: the staleness limit of the topic itself."""
+
+    @property
+    def row(self) -> Topic[Any]:
+        """The topic's row in the topic table."""
+        return BY_NAME[self.topic]
+
+    @property
+    def limit(self) -> float:
+        """Greatest age, s; +inf if neither the settings nor the topic has one."""
+        return self.row.fresh_for() if self.within is None else self.within
+
+    @model_validator(mode="after")
+    def _limited(self) -> Self:
+        if self.topic not in BY_NAME or self.row.inward:
+            raise ValueError(f"topic {self.topic!r}: expected a topic of the robot")
+        if self.within is None and self.row.stale_after is None:
+            raise ValueError(f"topic {self.topic}: has no limit of its own: say within")
+        return self
+
+
 GATE_CHECKS: Final = Catalog(
     "monstertruck.gate_checks",
     Plugin(
@@ -29,6 +58,12 @@ GATE_CHECKS: Final = Catalog(
         settings="monstertruckd.gate.catalog:FenceConfig",
         implementation="monstertruckd.gate.fence:FenceCheck",
         doc="Keeps the robot inside a polygon of the map",
+    ),
+    Plugin(
+        name="fresh",
+        settings="monstertruckd.gate.catalog:FreshConfig",
+        implementation="monstertruckd.gate.fresh:FreshCheck",
+        doc="Stops the robot while a topic is silent",
     ),
     base=CheckConfig,
 )
