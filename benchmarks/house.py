@@ -2,11 +2,12 @@
 
     python benchmarks/house.py [--list]
 
-Reads the sources as text and syntax trees; nothing is imported or run. Counted are the files that git tracks in the
-packages of the project, without tests, benchmarks and docs. ``--list`` prints what was counted. The last line is JSON.
+Reads the sources as text and syntax trees. Counted are the files that git tracks in the packages, without
+tests, benchmarks and docs. ``--list`` prints what was counted. The last line is JSON.
 
-*Places to change* are counted by a present example of each kind: the files of the packages that name it, its own among
-them, so what one more of the kind would touch. A *module number* is an assignment at module level whose value is made
+*Places to change* are the files that one more of a kind changes, beside its own: of the trial changes that
+``tests/daemon/test_trial_changes.py`` makes and runs; of trackers and explorers, the files that name a present one. A
+*module number* is an assignment at module level whose value is made
 of numbers: a literal, arithmetic with a literal, or a tuple of these. A *reader* of a file is a file of the packages
 that imports it. *Core* is what a robot needs to own its devices, estimate, map, plan, track, be stopped, be recorded
 and be operated; ``REST`` names everything else.
@@ -17,12 +18,17 @@ import ast
 import json
 import re
 import subprocess
+import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 ROOT: Final = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tests.trial_changes import TRIALS  # noqa: E402
+
 PACKAGES: Final = ("monstertruckd", "drivers", "planners", "schemas")
 FACTS: Final = ("protocol.py", "objects.py")
 """Names of files that hold numbers of manuals, each with its source."""
@@ -68,17 +74,12 @@ PATH_TYPE: Final = re.compile(
 POSE_TYPE: Final = re.compile(r"_?(Pose|Pose2|Pose2D|Twist|Twist2|Vector)")
 MESSAGES: Final = "schemas/monstertruck_schemas/"
 EXAMPLES: Final = {
-    "wizard": r"ImuWizard",
     "tracker": r"[Ss]tanley",
     "explorer": r"TourConfig|:Tour\b|class Tour\b",
-    "motor_controller": r"[Rr]obo[Cc]law",
-    "body": r"Synchro\b|SynchroChassis|\"synchro\"",
-    "task": r"ExplorerService|ExplorationState|ExploreRequest|ExploreOrder",
-    "sensor_role": r"\bENCODERS\b|devices\.encoders|FreeEncoders|encoders:",
 }
-"""A present example of each kind of change, by the names that belong to it alone."""
-PLACES: Final = {"wizard": 2, "tracker": 3, "motor_controller": 1, "body": 2, "task": 2, "sensor_role": 4}
-"""Files that a change may touch, a folder of its own counted as one."""
+"""A present example of each kind for which no trial is written, by the names that belong to it alone."""
+PLACES: Final = {"wizard": 1, "tracker": 3, "motor_controller": 1, "body": 2, "task": 1, "sensor_role": 4}
+"""Files that a change may touch, beside its own."""
 PLACES_OF_PATHS: Final = ("planners/", MESSAGES)
 """Where classes of such names are paths to be driven, not names of files."""
 
@@ -288,8 +289,8 @@ def main() -> None:
 
 
 def places(files: list[Source]) -> dict[str, list[str]]:
-    """Return, for each kind of change, the files that name its example; a folder of its own counts as one."""
-    found = {}
+    """Return, for each kind of change, the files of its trial, or those that name its example."""
+    found = {kind: trial().places for kind, trial in TRIALS.items()}
     for kind, pattern in EXAMPLES.items():
         named_in = [source.path for source in files if re.search(pattern, (ROOT / source.path).read_text())]
         own = {str(Path(path).parent) for path in named_in if re.search(pattern, Path(path).parent.name)}
