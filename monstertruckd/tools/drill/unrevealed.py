@@ -45,11 +45,14 @@ UNREVEALED: Final = (
             "drive* profile_acceleration *",
             "drive* profile_deceleration *",
             "drive* quick_stop_deceleration *",
-            "drive* mode_of_operation *",
-            "drive* mode_of_operation_display *",
         ),
         "written or read only while the drive is prepared",
         "`uncommanded_motion` where the shaft turns faster or stops later than ordered",
+    ),
+    Unrevealed(
+        ("drive* mode_of_operation *", "drive* mode_of_operation_display *"),
+        "written and read only while the drive is prepared",
+        "`uncommanded_motion` where the shaft turns otherwise than ordered",
     ),
     Unrevealed(
         ("drive* current_actual *",),
