@@ -5,9 +5,9 @@
 One argument for each controller, all stopped at once. Without a KIND it is an EPOS: quick stop, then power stage off;
 NODE and BAUD must equal ``driver.node`` and ``port.baud`` of the configuration's drive; left out they are those of the
 controller as delivered. Of a VESC WORDS are ``AMPERES:ERPM:ID,...``: it is braked by that current until all motors are
-slower than ERPM; an empty ID is the controller that is connected. Of the steppers there are none: quick stop, then
-coils off. Needs nothing but Python's standard library and the codecs installed with it. Exit code 0 once every
-controller has stopped, 1 if one did not within five seconds, for whatever reason.
+slower than ERPM; an empty ID is the controller that is connected. Steppers (quick stop, then coils off) and boards with
+ROSArduinoBridge (voltage off) have no WORDS. Needs nothing but Python's standard library and the codecs installed with
+it. Exit code 0 once every controller has stopped, 1 if one did not within five seconds, for whatever reason.
 """
 
 import contextlib
@@ -25,6 +25,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve()
 sys.path += [str(HERE.parents[1] / "drivers"), str(HERE.parents[2])]  # a checkout's, an installation's
 
+from monstertruck_drivers.arduino_bridge import protocol as board
 from monstertruck_drivers.epos.protocol import BAUD, Frame, FrameError, decode_body, stop_frames
 from monstertruck_drivers.steppers import protocol as steppers
 from monstertruck_drivers.vesc import protocol as vesc
@@ -70,7 +71,8 @@ def job(argument: str) -> tuple[str, Callable[[], None]]:
     if not colon:
         return port, partial(stop, *drive(argument))
     words, _, baud = rest.partition("@")
-    return port, partial({"vesc": stop_vesc, "steppers": stop_steppers}[kind], port, words, int(baud))
+    others = {"vesc": stop_vesc, "steppers": stop_steppers, "arduino_bridge": stop_board}
+    return port, partial(others[kind], port, words, int(baud))
 
 
 def drive(argument: str) -> tuple[str, int, int]:
@@ -183,6 +185,25 @@ def stop_steppers(port: str, words: str, baud: int) -> None:
                 raise NotStoppedError(f"motors still turn at {rates} steps/s")
             time.sleep(AGAIN)
         step_rates(line, "D")
+
+
+def stop_board(port: str, words: str, baud: int) -> None:
+    """Take the motors' voltage; a board that restarts because its port was opened is waited for.
+
+    Raises:
+        OSError: the port cannot be used.
+        NotStoppedError: the board is silent.
+    """
+    del words
+    end = time.monotonic() + ATTEMPT
+    with opened(port, baud) as line:
+        lines = board.BoardLines()
+        while time.monotonic() < end:
+            os.write(line, board.END + board.speeds(0, 0))
+            with contextlib.suppress(NotStoppedError):
+                if board.OK in lines.feed(some(line)):
+                    return
+    raise NotStoppedError("no answer")
 
 
 def step_rates(line: int, verb: str) -> list[float]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final, Literal, NamedTuple, cast
 
+from monstertruck_drivers.arduino_bridge.protocol import BAUD as BOARD_BAUD
 from monstertruck_drivers.ax12.protocol import BAUD as AX12_BAUD
 from monstertruck_drivers.bno085.protocol import BAUD as BNO085_BAUD
 from monstertruck_drivers.emulation import EmulatorFactory
@@ -372,6 +373,17 @@ DEVICES: Final = DeviceCatalog(
         emulator="monstertruck_drivers.steppers.emulator:emulated",
         probe="monstertruck_drivers.steppers.probe:probe",
         baud=STEPPERS_BAUD,
+        usb=UsbIdentity("1a86:7523", "USB Serial", "ttyUSB"),
+    ),
+    DeviceKind(
+        name="arduino_bridge",
+        doc="Two motors with encoders on a microcontroller that speaks ROSArduinoBridge",
+        roles=(WHEELS,),
+        settings="monstertruck_drivers.arduino_bridge.config:ArduinoBridgeConfig",
+        implementation="monstertruck_drivers.arduino_bridge.driver:ArduinoBridgeDriver",
+        emulator="monstertruck_drivers.arduino_bridge.emulator:emulated",
+        probe="monstertruck_drivers.arduino_bridge.probe:probe",
+        baud=BOARD_BAUD,
         usb=UsbIdentity("1a86:7523", "USB Serial", "ttyUSB"),
     ),
     DeviceKind(

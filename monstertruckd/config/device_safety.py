@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from typing import Final
 
+from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
 from monstertruck_drivers.battery.config import PackConfig
 from monstertruck_drivers.config import Devices, Monitors
 from monstertruck_drivers.epos.config import EposConfig
@@ -29,6 +30,7 @@ WEAKER_ABOVE: Final[dict[type[Schema], tuple[str, ...]]] = {
         "fault_resets",
     ),
     StepperConfig: ("max_rate", "answer_timeout", "command_timeout", "quick_stop_after", "watchdog"),
+    ArduinoBridgeConfig: ("max_rate", "answer_timeout", "command_timeout", "auto_stop"),
     VescConfig: (
         "max_motor_rpm",
         "min_motor_rpm",
@@ -62,6 +64,7 @@ WEAKER_BELOW: Final[dict[type[Schema], tuple[str, ...]]] = {
         "fault_reset_pause",
     ),
     StepperConfig: ("acceleration", "quick_deceleration", "rate"),
+    ArduinoBridgeConfig: ("deceleration", "quick_deceleration", "rate"),
     VescConfig: ("deceleration_rpm_s", "quick_stop_deceleration_rpm_s", "brake_current", "rate", "battery_rate"),
     MaestroConfig: ("poll_rate", "battery_rate"),
     HokuyoConfig: (),
@@ -73,6 +76,7 @@ WEAKER_BELOW: Final[dict[type[Schema], tuple[str, ...]]] = {
 UNATTENDED: Final[dict[type[Schema], tuple[str, ...]]] = {
     EposConfig: ("command_timeout", "quick_stop_after", "status_period"),
     StepperConfig: ("command_timeout", "quick_stop_after", "watchdog"),
+    ArduinoBridgeConfig: ("command_timeout", "auto_stop"),
     VescConfig: ("command_timeout", "watchdog"),
     MaestroConfig: ("command_timeout",),
 }
@@ -128,6 +132,8 @@ def weakened_devices(devices: Devices, monitors: Monitors) -> Iterator[str]:
             yield from _weaker(place, driver, type(driver)())
         if isinstance(driver, StepperConfig):
             yield f"{place}: steppers report the steps commanded: a wheel that is held or slips is not noticed"
+        if isinstance(driver, ArduinoBridgeConfig):
+            yield f"{place}: its lines have no sum: a damaged command runs the motors until the next one"
         if isinstance(driver, MaestroConfig):
             if driver.deadman_feed == "always":
                 yield f"{place}.deadman_feed always: the deadman line guards against a dead process only"

@@ -24,6 +24,8 @@ FUSION: Final = 0.5
 """Time constant with which pitch and roll follow the accelerometer's vertical, s."""
 NOISE: Final = 4.0
 """Standard deviation of the accelerometer, 0.001 g."""
+LATENCY: Final = 0.004
+"""Seconds from a measurement to the first byte of its frame."""
 REPORTED: Final = ("yaw", "pitch", "roll", "x", "y", "z")
 
 
@@ -55,6 +57,8 @@ class Bno085Emulator:
     def power_cycle(self) -> None:
         """Supply off and on: heading and index begin at 0."""
         self._index, self._yaw = 0, 0.0
+        self._turning = 0.0
+        """Newest turn rate, rad/s."""
         self._tilt: tuple[float, float] | None = None
         self._last: RvcFrame | None = None
         self._torn = True
@@ -107,11 +111,13 @@ class Bno085Emulator:
                 data = data[:9] + bytes((data[9] ^ 0x10,)) + data[10:]
             if self._torn:
                 self._torn, data = False, data[5:]
-            end.write(data)
+            end.write(data, LATENCY)
 
     def _frame(self, now: int) -> RvcFrame:
         reading = self._source.imu(now)
-        self._yaw += (reading.angular_velocity[2] + self._drift) / RATE
+        turning = reading.angular_velocity[2] + self._drift
+        self._yaw += (self._turning + turning) / 2 / RATE
+        self._turning = turning
         x, y, z = reading.acceleration
         felt = atan2(-x, hypot(y, z)), atan2(y, z)
         share = 1.0 if self._tilt is None else 1.0 - exp(-1.0 / (RATE * FUSION))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from monstertruck_drivers.arduino_bridge.emulator import ArduinoBridgeEmulator
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.steppers.emulator import StepperEmulator
@@ -55,6 +56,16 @@ async def test_all_motors_of_a_vesc_and_of_the_steppers_are_stopped(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("stopped") == 2
     assert [round(rotor.reading(clock.now()).rpm, 1) for rotor in rotors] == [0.0, 0.0, 0.0]
+
+
+async def test_a_board_that_restarts_when_its_port_is_opened_is_waited_for(tmp_path):
+    clock, rotors = WallClock(), (FreeMotor(), FreeMotor())
+    board = ArduinoBridgeEmulator(clock, rotors)
+    async with plugged_in(board, tmp_path / "board"):
+        rotors[0].command(clock.now(), 20.0, 1e4)
+        done = await neutral(f"{tmp_path / 'board'}=arduino_bridge:@57600")
+    assert done.returncode == 0, done.stderr
+    assert rotors[0].reading(clock.now()).rpm == 0.0
 
 
 async def test_a_motor_that_disobeys_and_a_silent_controller_are_reported(tmp_path):

@@ -1,0 +1,44 @@
+"""Devices that builders buy today, each at its emulator: clocks, trouble, and how soon an actuator stands without host.
+
+One row for each device. `stand_ms`: from the last byte of a host that died to standstill of all motors, worst of all
+tries. `clock_ms`: greatest error of the stamps. `lost_ms`: from the loss of a transmitter to the message that says so,
+worst of all tries. `trouble`: passed of loss, damage, stalls, single bytes and unplugging, after each of which the
+driver must serve again, and of a stranger that it must refuse. `foreign`: the test in which another implementation
+agrees with the emulator's bytes. All on the virtual clock. The last line is JSON.
+
+    python benchmarks/devices_today.py [DEVICE ...]
+"""
+
+import importlib
+import json
+import pkgutil
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks import devices_today_parts
+
+STAND_MS, CLOCK_MS = 300.0, 5.0
+
+
+def main(names: list[str]) -> int:
+    rows: dict[str, dict[str, Any]] = {}
+    for module in pkgutil.iter_modules(devices_today_parts.__path__):
+        part = importlib.import_module(f"benchmarks.devices_today_parts.{module.name}")
+        for name, measure in getattr(part, "ROWS", {}).items():
+            if not names or name in names:
+                rows[name] = measure()
+                print(f"{name:16}", "  ".join(f"{key} {value}" for key, value in rows[name].items()), flush=True)
+    stands = [row["stand_ms"] for row in rows.values() if row.get("stand_ms") is not None]
+    clocks = [row["clock_ms"] for row in rows.values() if row.get("clock_ms") is not None]
+    passed = all(row["trouble"].split("/")[0] == row["trouble"].split("/")[1] for row in rows.values())
+    met = max(stands, default=0) <= STAND_MS and max(clocks, default=0) <= CLOCK_MS and passed
+    goals = {"stand_ms": STAND_MS, "clock_ms": CLOCK_MS, "trouble": "all"}
+    print(json.dumps({"bench": "devices_today", "figures": rows, "goals": goals, "met": met}))
+    return 0 if met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,179 @@
+"""Rows of the motor controllers."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from benchmarks.devices_today_parts.kit import Bench, Newest, on_bench, running, score, stranger_refused, survived
+from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
+from monstertruck_drivers.arduino_bridge.driver import ArduinoBridgeDriver
+from monstertruck_drivers.arduino_bridge.emulator import ArduinoBridgeEmulator
+from monstertruck_drivers.epos.firmware import FreeMotor
+from monstertruck_drivers.vesc.config import VescConfig, VescMotorConfig
+from monstertruck_drivers.vesc.driver import VescDriver
+from monstertruck_drivers.vesc.emulator import VescEmulator
+from monstertruck_runtime.clock import SECOND, VirtualClock
+from monstertruck_runtime.mailbox import Mailbox, latest
+from monstertruck_schemas.cmd import DriveAction, DriveCommand
+from monstertruck_schemas.sensor import DriveFeedback
+
+NAMES = ("", "_2", "_3", "_4")
+RPM = math.tau / 60
+TRIES = 20
+
+
+class DriveBench(Bench):
+    """Motors that are commanded 50 times a second.
+
+    Args:
+        clock: time.
+        emulator: makes the emulated controller of two rotors.
+        driver: makes the driver from port, events and the ends of its topics.
+        rate: that is commanded, rad/s.
+    """
+
+    def __init__(
+        self,
+        clock: VirtualClock,
+        emulator: Callable[[tuple[FreeMotor, ...]], Any],
+        driver: Callable[..., Any],
+        rate: float,
+    ) -> None:
+        self.rotors = (FreeMotor(), FreeMotor())
+        self.rate = rate
+        self.commands: list[Mailbox[DriveCommand]] = [Mailbox(latest(), lambda _: None) for _ in NAMES]
+        self.outs: list[Newest[DriveFeedback]] = [Newest() for _ in NAMES]
+        ends: dict[str, Any] = {f"commands{n}": box for n, box in zip(NAMES, self.commands, strict=True)}
+        ends |= {f"out{n}": out for n, out in zip(NAMES, self.outs, strict=True)}
+        super().__init__(clock, emulator(self.rotors), lambda port, events: driver(port, events, ends))
+
+    async def command(self) -> None:
+        """The gate's ticks."""
+        while True:
+            now = self.clock.now()
+            for box in self.commands:
+                box.put(
+                    DriveCommand(
+                        stamp=now,
+                        received=now,
+                        seq=0,
+                        action=DriveAction.RUN,
+                        speed=0.0,
+                        motor_velocity=self.rate,
+                    )
+                )
+            await self.clock.sleep(0.02)
+
+    @property
+    def fastest(self) -> float:
+        """Speed of the faster rotor, rad/s."""
+        return max(abs(rotor.reading(self.clock.now()).rpm) for rotor in self.rotors) * RPM
+
+    def healthy(self) -> bool:
+        """Whether both rotors turn as commanded, and that is reported."""
+        slow = [abs(r.reading(self.clock.now()).rpm * RPM - self.rate) > 0.05 * self.rate for r in self.rotors]
+        fresh = all(self.clock.now() - out.kept[-1].received < 0.2 * SECOND for out in self.outs[:2] if out.kept)
+        return not any(slow) and fresh
+
+
+async def stand(bench: DriveBench, after: float) -> float:
+    """Milliseconds from the death of the host to standstill."""
+    async with running(bench.command(), bench.serve()):
+        await bench.clock.sleep(4.0 + after)
+        assert bench.fastest > 0.9 * bench.rate
+        bench.port.device.faults.deaf = True
+        died = bench.clock.now()
+        while bench.fastest > 0.01 * bench.rate:
+            await bench.clock.sleep(0.001)
+        return (bench.clock.now() - died) / 1e6
+
+
+async def clock_error(bench: DriveBench) -> float:
+    """Greatest error of the stamps at a constant speed, ms: by how much a position is another instant's."""
+    async with running(bench.command(), bench.serve()):
+        await bench.clock.sleep(5.0)
+        first = len(bench.outs[0].kept)
+        await bench.clock.sleep(5.0)
+        now = bench.clock.now()
+        reading = bench.rotors[0].reading(now)
+        speed = reading.rpm * RPM
+        errors = [
+            (reading.turns * math.tau - speed * (now - one.stamp) / SECOND - one.position) / speed
+            for one in bench.outs[0].kept[first:]
+        ]
+        return max(map(abs, errors)) * 1000
+
+
+def row(make: Callable[[VirtualClock], DriveBench], foreign: str) -> dict[str, Any]:
+    """All measurements of one controller."""
+    stands = [on_bench(make, lambda bench, i=i: stand(bench, i * 0.0037)) for i in range(TRIES)]
+
+    async def trouble(bench: DriveBench) -> dict[str, bool]:
+        async with running(bench.command(), bench.serve()):
+            await bench.clock.sleep(4.0)
+            return await survived(bench, bench.healthy, ("silent on", "silent off"), ("noise 9", "noise 0"))
+
+    found = on_bench(make, trouble)
+
+    async def refused(bench: DriveBench) -> bool:
+        bench.emulator.inject("silent", "on")
+        return await stranger_refused(bench)
+
+    found["stranger"] = on_bench(make, refused)
+    return {
+        "stand_ms": round(max(stands), 1),
+        "clock_ms": round(on_bench(make, clock_error), 2),
+        "trouble": score(found),
+        "foreign": foreign,
+    }
+
+
+def vesc() -> dict[str, Any]:
+    """Two controllers, one of them behind CAN, at 2000 rpm."""
+    config = VescConfig(motors=(VescMotorConfig(), VescMotorConfig(can_id=7)))
+
+    def driver(clock: VirtualClock) -> Callable[..., Any]:
+        def make(port: Any, events: Any, ends: dict[str, Any]) -> VescDriver:
+            none: Any = Mailbox(latest(), lambda _: None)
+            return VescDriver(
+                config,
+                port,
+                clock,
+                steering_commands=none,
+                drive=none,
+                steering=None,
+                battery=None,
+                events=events,
+                **ends,
+            )
+
+        return make
+
+    return row(
+        lambda clock: DriveBench(
+            clock, lambda rotors: VescEmulator(clock, rotors, None, config), driver(clock), 2000 * RPM
+        ),
+        "tests/unit/drivers/vesc/test_third_party.py",
+    )
+
+
+def arduino_bridge() -> dict[str, Any]:
+    """A board whose firmware was compiled with an auto-stop of 200 ms, at 2 rad/s."""
+    config = ArduinoBridgeConfig(auto_stop=0.2)
+
+    def driver(clock: VirtualClock) -> Callable[..., Any]:
+        def make(port: Any, events: Any, ends: dict[str, Any]) -> ArduinoBridgeDriver:
+            return ArduinoBridgeDriver(config, port, clock, events=events, **ends)
+
+        return make
+
+    rate = 8 * config.pid_rate * config.turn
+    return row(
+        lambda clock: DriveBench(
+            clock, lambda rotors: ArduinoBridgeEmulator(clock, rotors, config), driver(clock), rate
+        ),
+        "none found as a package",
+    )
+
+
+ROWS = {"vesc": vesc, "arduino_bridge": arduino_bridge}

@@ -1,0 +1,1 @@
+"""Microcontroller boards that speak the text protocol of ROSArduinoBridge."""

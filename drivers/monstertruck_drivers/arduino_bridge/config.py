@@ -1,0 +1,67 @@
+"""Settings of boards that speak ROSArduinoBridge."""
+
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from monstertruck_drivers.arduino_bridge.protocol import AUTO_STOP, PID_RATE
+from monstertruck_drivers.shafts import MotorLimits
+from monstertruck_schemas.base import Schema
+
+Seconds = Annotated[float, Field(gt=0)]
+
+
+class ArduinoBridgeConfig(Schema):
+    """Two motors with encoders on a microcontroller; the left one turns the body's first shaft."""
+
+    kind: Literal["arduino_bridge"] = "arduino_bridge"
+    counts_per_turn: Annotated[int, Field(ge=4, le=1_000_000)] = 1440
+    """Encoder counts in one turn of the shaft; of the wheel where `geometry.drive_ratio` is 1"""
+    pid_rate: Annotated[float, Field(gt=0, le=1000)] = PID_RATE
+    """Periods of its speed controller in a second (`PID_RATE` of the firmware)"""
+    inverted: Annotated[tuple[bool, bool], Field(strict=False)] = (False, False)
+    """Left and right: driving forward takes negative counts"""
+    max_rate: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    """Requests are limited to this, rad/s"""
+    deceleration: Annotated[float, Field(gt=0)] = 20.0
+    """Deceleration by a lower set-point, as measured, rad/s^2"""
+    quick_deceleration: Annotated[float, Field(gt=0)] = 30.0
+    """Deceleration after `m 0 0`, which takes the motors' voltage at once, as measured, rad/s^2"""
+    auto_stop: Annotated[float, Field(ge=0.05, le=10)] = AUTO_STOP
+    """Seconds without a set-point after which the board stops the motors (`AUTO_STOP_INTERVAL`). Compiled into the
+    firmware, and it cannot be asked: compile it with 250 ms, and say so here"""
+    rate: Annotated[float, Field(ge=5, le=50)] = 20.0
+    """Exchanges per second"""
+    answer_timeout: Annotated[float, Field(gt=0, le=0.5)] = 0.1
+    """Seconds in which an answer must come"""
+    command_timeout: Seconds = 0.25
+    """Age of the newest command at which the motors are stopped"""
+    boot: Annotated[float, Field(ge=0, le=10)] = 3.0
+    """Longest time that a board takes to answer after its port was opened, s: most restart then"""
+
+    @property
+    def shafts(self) -> int:
+        """How many driven shafts it serves."""
+        return len(self.inverted)
+
+    @property
+    def turn(self) -> float:
+        """Angle of a count, rad."""
+        return math.tau / self.counts_per_turn
+
+    @property
+    def motor_limits(self) -> MotorLimits:
+        """What a motor does."""
+        return MotorLimits(self.max_rate, self.deceleration, self.quick_deceleration)
+
+    @property
+    def stop_words(self) -> str:
+        """Nothing: the stop script needs the port alone."""
+        return ""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.auto_stop <= 2.0 / self.rate:
+            raise ValueError(f"auto_stop {self.auto_stop:g} s: expected more than two exchanges, {2.0 / self.rate:g} s")
+        return self

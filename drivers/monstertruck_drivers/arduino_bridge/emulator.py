@@ -1,0 +1,193 @@
+"""The board's side of ROSArduinoBridge: lines in, lines out, a controller with whole counts, and its auto-stop.
+
+Habits of the real thing: it restarts when its port is opened, is deaf for a second and a half then, and counts from 0;
+takes damaged commands as they are, for there is no sum; holds whole counts for each period of its controller; stops the
+motors when set-points stop coming, after two seconds as published.
+"""
+
+import asyncio
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
+from monstertruck_drivers.arduino_bridge.protocol import BAUD, OK, REFUSED, BoardLines
+from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.disobedience import USAGE, DisobedientMotor
+from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ReceivedBytes
+from monstertruck_drivers.epos.firmware import FreeMotor
+from monstertruck_drivers.signals import SignalKind, Signals
+from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+BOOT: Final = 1500 * MILLISECOND
+"""From a restart to the first answer: the boot loader waits for a new program."""
+THINKING: Final = 0.001
+"""Seconds from the end of a command to its answer."""
+WATCH_PERIOD: Final = 0.01
+"""Seconds between two looks at the auto-stop."""
+FULL_PWM: Final = 255
+FREE_RPM: Final = 200.0
+"""Speed of a motor at full PWM, rpm."""
+TO_RPM: Final = 60.0
+
+
+class ArduinoBridgeEmulator:
+    """A board with two motors.
+
+    Faults (``inject``): ``silent on|off`` (gives no answers), ``late SECONDS [COUNT]`` (answers), ``noise COUNT`` (so
+    many answers have a wrong byte), ``reset``, ``runaway`` (both motors disobey, see ``DisobedientMotor``).
+
+    Args:
+        clock: time.
+        plants: what the motors turn; free motors take the missing places.
+        settings: counts, auto-stop.
+    """
+
+    def __init__(
+        self, clock: Clock, plants: tuple[MotorPlant, ...] = (), settings: ArduinoBridgeConfig | None = None
+    ) -> None:
+        self.name = "arduino_bridge"
+        self.received = ReceivedBytes()
+        """Newest bytes from the host."""
+        kinds = dict.fromkeys(("left", "right"), SignalKind.NUMBER)
+        kinds |= dict.fromkeys(("run_left", "run_right"), SignalKind.ORDER)
+        self.signals = Signals(clock.now, kinds, np.random.default_rng(0))
+        self._clock = clock
+        self._config = settings or ArduinoBridgeConfig()
+        self._plants = [*plants, *(FreeMotor() for _ in range(2 - len(plants)))][:2]
+        self._silent = False
+        self._late: list[float] = []
+        self._noise = 0
+        self._runaway: DisobedientMotor | None = None
+        self._restart()
+
+    def _restart(self, boot: int = 0) -> None:
+        now = self._clock.now()
+        self._lines = BoardLines(b"\r")
+        self._awake_at = now + boot
+        self._origin = [plant.reading(now).turns for plant in self._plants]
+        self._fed = now
+        self._targets: list[float | None] = [None, None]
+        self._drive()
+
+    def power_cycle(self) -> None:
+        """Supply off and on, or the reset that opening its port gives it."""
+        self._restart(BOOT)
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault, see the class.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        try:
+            match fault, values:
+                case "silent", (("on" | "off") as word,):
+                    self._silent = word == "on"
+                case "late", (seconds, *count):
+                    self._late = [float(seconds)] * int(*count or ("1",))
+                case "noise", (count,):
+                    self._noise = int(count)
+                case "reset", ():
+                    self.power_cycle()
+                case "runaway", words:
+                    self._runaway = DisobedientMotor.parse(*words)
+                    self._drive()
+                case _:
+                    raise ValueError(fault)
+        except (ValueError, TypeError) as error:
+            raise InputError(
+                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: silent on|off, late SECONDS "
+                f"[COUNT], noise COUNT, reset, runaway {USAGE}"
+            ) from error
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Serve until cancelled."""
+        end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._watch())
+            while True:
+                data = await end.read()
+                self.received.extend(data)
+                if self._clock.now() < self._awake_at:
+                    continue
+                for line in self._lines.feed(data):
+                    self._answer(end, self._obey(line))
+
+    async def _watch(self) -> None:
+        """Stop the motors when set-points stop coming."""
+        while True:
+            await self._clock.sleep(WATCH_PERIOD)
+            if any(self._targets) and self._clock.now() - self._fed > self._config.auto_stop * SECOND:
+                self._targets = [0.0, 0.0]
+                self._drive()
+
+    def _obey(self, line: bytes) -> bytes:
+        verb, *words = line.split(b" ")
+        numbers = [_atoi(word) for word in words] + [0, 0]
+        match verb:
+            case b"m":
+                for i, name in enumerate(("run_left", "run_right")):
+                    counts = numbers[i] * self._config.pid_rate
+                    self.signals.order(name, counts / self._config.counts_per_turn * TO_RPM, partial(self._turn, i))
+                self._fed = self._clock.now()
+            case b"o":
+                left, right = (number / FULL_PWM * FREE_RPM if number else None for number in numbers[:2])
+                self._targets, self._fed = [left, right], self._clock.now()
+                self._drive()
+            case b"e":
+                return b"%d %d" % self._counts()
+            case b"r":
+                self._origin = [plant.reading(self._clock.now()).turns for plant in self._plants]
+            case b"b":
+                return b"%d" % BAUD
+            case b"u":
+                pass  # the emulated controller needs no gains
+            case _:
+                return REFUSED
+        return OK
+
+    def _turn(self, i: int, rpm: float) -> None:
+        self._targets[i] = rpm
+        self._drive()
+
+    def _drive(self) -> None:
+        """Ask the motors for their speeds."""
+        now = self._clock.now()
+        for plant, target in zip(self._plants, self._targets, strict=True):
+            wanted = target
+            if self._runaway is not None:
+                wanted = self._runaway.target(target, plant.reading(now).rpm)
+            braking = self._config.quick_deceleration if not wanted else self._config.deceleration
+            plant.command(now, wanted, braking * TO_RPM / (2 * np.pi))
+
+    def _counts(self) -> tuple[int, int]:
+        now, scale = self._clock.now(), self._config.counts_per_turn
+        left, right = (
+            self.signals.report(name, int((plant.reading(now).turns - origin) * scale // 1))
+            for name, plant, origin in zip(("left", "right"), self._plants, self._origin, strict=True)
+        )
+        return left, right
+
+    def _answer(self, end: DeviceEnd, line: bytes) -> None:
+        if self._silent:
+            return
+        if self._noise > 0:
+            self._noise -= 1
+            line = bytes((line[0] ^ 0x40,)) + line[1:]
+        end.write(line + b"\r\n", self._late.pop() if self._late else THINKING)
+
+
+def _atoi(word: bytes) -> int:
+    """A number as C reads it: 0 where there is none."""
+    sign, digits = (-1, word[1:]) if word.startswith(b"-") else (1, word)
+    end = next((i for i, byte in enumerate(digits) if not 48 <= byte <= 57), len(digits))
+    return sign * int(digits[: min(end, 9)] or b"0")
+
+
+def emulated(setup: EmulatorSetup) -> ArduinoBridgeEmulator:
+    """The board of a simulated robot's first two shafts, on a line of real speed."""
+    setup.port.device.baud = BAUD
+    return ArduinoBridgeEmulator(setup.clock, setup.physics.motors[:2], setup.settings)

@@ -1,0 +1,76 @@
+"""Lines of ROSArduinoBridge; standard library only, which the stop script needs.
+
+Source: Patrick Goebel and James Nugen, ``commands.h`` and ``ROSArduinoBridge.ino``. The host sends a letter and its
+arguments, one space apart, and a carriage return; the board answers every command by one line that ends with CR and LF,
+and says nothing unasked. There is no sum and no sequence number.
+
+============== =========================================================== =================
+command        meaning                                                     answer
+============== =========================================================== =================
+``m L R``      hold so many counts for each period of the controller       ``OK``
+``o L R``      raw PWM, -255 to 255, without the controller                ``OK``
+``e``          counts of both encoders since power-up or reset             ``L R``
+``r``          set them to 0                                               ``OK``
+``u P:D:I:O``  gains of the controller                                     ``OK``
+``b``          baud rate                                                   a number
+============== =========================================================== =================
+
+Anything else is answered ``Invalid Command``. Without ``m`` or ``o`` for ``AUTO_STOP_INTERVAL``, 2000 ms as published,
+the board stops both motors. The interval is compiled in.
+"""
+
+import re
+from typing import Final
+
+BAUD: Final = 57_600
+PID_RATE: Final = 30.0
+"""Periods of the controller in a second, as published."""
+AUTO_STOP: Final = 2.0
+"""Seconds, as published."""
+LONGEST: Final = 64
+OK: Final = b"OK"
+REFUSED: Final = b"Invalid Command"
+_COUNTS: Final = re.compile(rb"(-?\d{1,10}) (-?\d{1,10})")
+_NUMBER: Final = re.compile(rb"\d{4,7}")
+
+
+def speeds(left: int, right: int) -> bytes:
+    """Command: counts for each period of the controller."""
+    return b"m %d %d\r" % (left, right)
+
+
+def pwm(left: int, right: int) -> bytes:
+    """Command: raw PWM."""
+    return b"o %d %d\r" % (left, right)
+
+
+ENCODERS: Final = b"e\r"
+BAUD_RATE: Final = b"b\r"
+END: Final = b"\r"
+"""Ends what a dead host left half sent."""
+
+
+def counts_of(line: bytes) -> tuple[int, int] | None:
+    """Return the counts of an answer to ``e``; None if it is none."""
+    match = _COUNTS.fullmatch(line)
+    return None if match is None else (int(match[1]), int(match[2]))
+
+
+def is_number(line: bytes) -> bool:
+    """Whether a line is an answer to ``b``."""
+    return _NUMBER.fullmatch(line) is not None
+
+
+class BoardLines:
+    """Cuts a stream of bytes into lines."""
+
+    def __init__(self, end: bytes = b"\n") -> None:
+        self._end = end
+        self._rest = bytearray()
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Return lines that became complete, without their ends; a line that never ends is dropped."""
+        self._rest += data
+        *lines, rest = bytes(self._rest).split(self._end)
+        self._rest = bytearray(rest if len(rest) <= LONGEST else b"")
+        return [line.strip(b"\r\n") for line in lines]

@@ -1,0 +1,107 @@
+"""Commands and answers, with a board over one open link; shared by driver and probe."""
+
+from typing import Final
+
+from monstertruck_drivers.arduino_bridge.protocol import (
+    BAUD_RATE,
+    ENCODERS,
+    END,
+    OK,
+    REFUSED,
+    BoardLines,
+    counts_of,
+    is_number,
+    speeds,
+)
+from monstertruck_drivers.link import Link
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
+
+KNOCK: Final = 0.25
+"""Seconds between two questions to a board that restarts."""
+
+
+class BoardSession:
+    """One session. Answers carry no mark of their own: what is left of an earlier one is thrown away before a question.
+
+    Args:
+        link: open link.
+        clock: time.
+        timeout: seconds in which an answer must come.
+    """
+
+    def __init__(self, link: Link, clock: Clock, timeout: float) -> None:
+        self.asked = 0
+        """When the newest question was sent, ns."""
+        self._link = link
+        self._clock = clock
+        self._timeout = timeout
+        self._lines = BoardLines()
+        self._heard = b""
+
+    def send(self, *commands: bytes) -> None:
+        """Send commands whose answers are not waited for.
+
+        Raises:
+            DeviceLostError: unplugged.
+        """
+        self._link.write(b"".join(commands))
+
+    async def identify(self, boot: float) -> None:
+        """Stop the motors, and wait until the board answers.
+
+        Args:
+            boot: seconds that it may take.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence.
+            WrongDeviceError: something else answers.
+        """
+        until = self._clock.now() + round(max(boot, KNOCK) * SECOND)
+        while self._clock.now() < until:
+            self._forget()
+            self.send(END, speeds(0, 0), BAUD_RATE)
+            found = await self._collect(KNOCK, 4)
+            if OK in found and any(map(is_number, found)):
+                return
+        name = self._link.name
+        if self._heard:
+            raise WrongDeviceError(f"{name}: {self._heard[:40]!r} is no answer of ROSArduinoBridge")
+        raise DeviceTimeoutError(f"{name}: silence; expected a board with ROSArduinoBridge")
+
+    async def exchange(self, command: bytes) -> tuple[int, int]:
+        """Give a command and read both encoders.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: not both answers came in time.
+            ProtocolError: they are others.
+        """
+        self._forget()
+        self.asked = self._clock.now()
+        self.send(command, ENCODERS)
+        found = await self._collect(self._timeout, 2)
+        if len(found) < 2:
+            raise DeviceTimeoutError(f"{self._link.name}: {len(found)} of 2 answers within {self._timeout} s")
+        counts = counts_of(found[1])
+        if found[0] != OK or counts is None:
+            raise ProtocolError(f"{self._link.name}: answers {found[0]!r} and {found[1]!r}: expected OK and two counts")
+        return counts
+
+    def _forget(self) -> None:
+        if self._link.discard():
+            self._lines = BoardLines()
+
+    async def _collect(self, within: float, count: int) -> list[bytes]:
+        """Lines that come within so many seconds, at most ``count``; empty ones and refusals of noise do not count."""
+        found: list[bytes] = []
+        due = self._clock.now() + round(within * SECOND)
+        while len(found) < count and (left := due - self._clock.now()) > 0:
+            try:
+                data = await self._link.read(left / SECOND)
+            except TimeoutError:
+                break
+            self._heard = data or self._heard
+            found += [line for line in self._lines.feed(data) if line and line != REFUSED]
+        return found
