@@ -40,6 +40,7 @@ LIMITS: Final = {"module_numbers_per_1000_lines": 6.0, "most_in_a_file_per_1000_
 CELL: Final = 200
 """Characters of a table cell of the documentation."""
 REST: Final = (
+    "drivers/monstertruck_drivers/ld19",
     "drivers/monstertruck_drivers/roboclaw",
     "drivers/monstertruck_drivers/srf08",
     "drivers/monstertruck_drivers/steppers",
