@@ -354,6 +354,16 @@ DEVICES: Final = DeviceCatalog(
         usb=UsbIdentity("10c4:ea60", "CP2102 USB to UART Bridge Controller", "ttyUSB"),
     ),
     DeviceKind(
+        name="rplidar",
+        doc="SLAMTEC RPLIDAR A1, A2, A3, C1, S1 or S2 laser scanner",
+        roles=(LIDAR,),
+        settings="monstertruck_drivers.rplidar.config:RplidarConfig",
+        implementation="monstertruck_drivers.rplidar.driver:RplidarDriver",
+        emulator="monstertruck_drivers.rplidar.emulator:emulated",
+        probe="monstertruck_drivers.rplidar.probe:probe",
+        usb=UsbIdentity("10c4:ea60", "CP2102 USB to UART Bridge Controller", "ttyUSB"),
+    ),
+    DeviceKind(
         name="epos",
         doc="maxon EPOS 24/1 motor controller (RS232)",
         roles=(DRIVE, DRIVE_2, DRIVE_3, DRIVE_4),

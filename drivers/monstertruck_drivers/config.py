@@ -77,7 +77,7 @@ class Device(Schema, Generic[C]):
 
     @model_validator(mode="after")
     def _own_baud(self) -> Self:
-        own = {"baud": self.kind.baud or BAUD, "framing": self.kind.framing}
+        own = {"baud": getattr(self.driver, "own_baud", self.kind.baud) or BAUD, "framing": self.kind.framing}
         missing = {name: value for name, value in own.items() if value and getattr(self.port, name) is None}
         return self.model_copy(update={"port": self.port.model_copy(update=missing)}) if missing else self
 

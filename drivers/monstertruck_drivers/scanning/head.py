@@ -88,6 +88,10 @@ class TurningHead:
     def measure(self, times: NDArray[np.int64]) -> tuple[Array, Array]:
         """Angles, turns, and ranges, m, 0 = no return, at instants of its own clock, (n,), that are over."""
         turned = self.turn(times)
+        return turned, self.look(turned, times)
+
+    def look(self, turned: Array, times: NDArray[np.int64]) -> Array:
+        """Ranges at angles, turns, and instants, (n,), m; 0 = no return."""
         bearings = -math.tau * turned
         at = np.array([self.world_time(int(time)) for time in times], np.int64)
         ranges = self._source.beams(bearings, at, self.sheet)
@@ -96,7 +100,7 @@ class TurningHead:
         for begin, width, cover in self._covers:
             behind = np.mod(bearings - begin, math.tau) <= width
             ranges[behind] = cover(ranges[behind])
-        return turned, np.where(np.isfinite(ranges) & (ranges >= self.sheet.least), ranges, 0.0)
+        return np.where(np.isfinite(ranges) & (ranges >= self.sheet.least), ranges, 0.0)
 
     # Faults
 

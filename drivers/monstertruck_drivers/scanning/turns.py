@@ -16,6 +16,10 @@ REAR: Final = 0.5
 """Where a revolution is cut."""
 LEAST_SAMPLES: Final = 16
 """BeamSamples without which a revolution has no step."""
+GAP: Final = 4.0
+"""Neighbours so many usual distances apart have lost samples between them."""
+SLOWER: Final = 0.01
+"""Share by which a revolution may take longer than its samples tell: the tolerance of a scanner's clock."""
 MISSING: Final = NO_ECHO + 1
 """Code of a beam that says nothing."""
 
@@ -98,11 +102,10 @@ def on_equal_steps(samples: BeamSamples) -> HeadTurn | None:
     """
     order = np.argsort(samples.turns, kind="stable")
     turns = samples.turns[order]
-    apart = np.diff(turns)
-    usual = float(np.median(apart)) if len(apart) >= LEAST_SAMPLES else 0.0
-    if usual <= 0.0:
+    step = _mean_step(turns)
+    if step is None:
         return None
-    count = max(round(1.0 / float(apart[apart < 1.5 * usual].mean())), 1)
+    count = max(round(1.0 / step), 1)
     phase = float(np.angle(np.exp(2j * np.pi * turns * count).mean())) / (2.0 * np.pi)
     beams = np.clip(np.rint(turns * count - phase).astype(np.intp), 0, count - 1)
     rate, begin = np.polyfit(samples.turns, samples.times, 1)
@@ -117,6 +120,42 @@ def on_equal_steps(samples: BeamSamples) -> HeadTurn | None:
     strengths[beams[shown]] = samples.intensities[order][shown]
     ranges = np.where(np.isfinite(ranges), ranges, np.where(met, 0.0, np.nan))
     return HeadTurn(phase / count, ranges, strengths, float(begin + rate * phase / count), float(rate))
+
+
+def _mean_step(turns: Array) -> float | None:
+    """Mean distance of neighbouring angles, rising, turns, gaps left out; None if they are too few."""
+    apart = np.diff(turns)
+    usual = float(np.median(apart)) if len(apart) >= LEAST_SAMPLES else 0.0
+    return float(apart[apart < GAP * usual].mean()) if usual > 0.0 else None
+
+
+class ArrivalTimes:
+    """Times the revolutions of a head whose samples carry no time, by when they came.
+
+    No sample comes before it was measured, so the promptest one of a revolution tells where it lies; and no revolution
+    begins later than the one before ended, but for what the head may have slowed down.
+
+    Args:
+        sample_time: from sample to sample, ns.
+    """
+
+    def __init__(self, sample_time: float) -> None:
+        self._sample_time = sample_time
+        self._next: float | None = None
+        """When the next revolution begins, if the head turns as before."""
+
+    def timed(self, samples: BeamSamples) -> BeamSamples:
+        """A revolution on times of its own; ``samples.times``: as if each had come at once."""
+        step = _mean_step(np.sort(samples.turns))
+        if step is None:
+            return samples
+        period = self._sample_time / step
+        turned = samples.turns * period
+        begin = float((samples.times - turned).min())
+        if self._next is not None and abs(begin - self._next) < period / 2:
+            begin = min(begin, self._next + SLOWER * period)
+        self._next = begin + period
+        return samples._replace(times=begin + turned)
 
 
 def codes_of(turn: HeadTurn, *, free: bool) -> NDArray[np.uint8]:

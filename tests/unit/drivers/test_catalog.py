@@ -57,7 +57,10 @@ def test_devices_start_behind_a_hub_in_the_order_of_their_rows():
 
 def test_kinds_are_found_by_name_and_by_role():
     assert DEVICES.named("epos") is DEVICES.named("drive_3") is DEVICES["epos"]
-    with pytest.raises(InputError, match=r"unknown device 'wheel'; known: hokuyo_urg \(lidar\), ld19 \(lidar\), epos"):
+    with pytest.raises(
+        InputError,
+        match=r"unknown device 'wheel'; known: hokuyo_urg \(lidar\), ld19 \(lidar\), rplidar",
+    ):
         DEVICES.named("wheel")
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monstertruck_drivers.scanning.turns import MISSING, BeamSamples, TurnCutter, codes_of, on_equal_steps
+from monstertruck_drivers.scanning.turns import MISSING, ArrivalTimes, BeamSamples, TurnCutter, codes_of, on_equal_steps
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM
 
 
@@ -76,6 +76,18 @@ def test_angles_that_waver_cut_no_turn_twice():
     cutter = TurnCutter()
     found = [turn for part in np.array_split(turns, 200) for turn in cutter.add(samples(part))]
     assert len(found) == 4
+
+
+def test_revolutions_without_times_lie_where_their_promptest_sample_came_from():
+    rng, times, late = np.random.default_rng(4), ArrivalTimes(1e8 / 400), []
+    for number in range(40):
+        turns = np.arange(400) / 400
+        measured = (number + turns) * 1e8
+        delay = rng.uniform(0.0, 2e7, 400) if number % 5 else np.full(400, 2e7)
+        found = times.timed(BeamSamples(turns, turns + 1.0, np.full(400, 9, np.uint8), measured + delay))
+        late.append(float((found.times - measured).mean()))
+    assert max(np.abs(late[1:])) < 2e6, "also where a whole revolution came 20 ms late"
+    assert times.timed(samples([0.1, 0.2])).times.tolist() == samples([0.1, 0.2]).times.tolist()
 
 
 def test_too_few_samples_make_no_turn():

@@ -1,0 +1,1 @@
+"""SLAMTEC RPLIDAR laser scanners."""

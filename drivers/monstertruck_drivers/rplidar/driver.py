@@ -1,0 +1,202 @@
+"""Driver of the RPLIDARs: starts the motor and the scan, and publishes every revolution."""
+
+from typing import Final
+
+import numpy as np
+
+from monstertruck_drivers.emulation import Array
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.rplidar.config import RplidarConfig
+from monstertruck_drivers.rplidar.protocol import (
+    COUNTS,
+    MODELS,
+    SIZES,
+    TURN_Q6,
+    DataType,
+    Decoded,
+    Record,
+    RecordParser,
+    ScanMode,
+    decode_capsule,
+    decode_standard,
+)
+from monstertruck_drivers.rplidar.session import RplidarSession, ScannerUnit
+from monstertruck_drivers.scanning.publishing import publish
+from monstertruck_drivers.scanning.turns import ArrivalTimes, BeamSamples, TurnCutter, on_equal_steps
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import LaserScan
+
+WAKE_PERIOD: Final = 0.01
+"""Seconds of samples worth waking for."""
+TRANSFER: Final = 0.001
+"""Seconds assumed from the end of a record on the line to its arrival."""
+STANDS: Final = ": its motor does not turn (an A1's turns with port.dtr false)"
+AGREE: Final = 0.25
+"""Share by which a record's span may differ from the usual one: else records between were lost."""
+RELEARN: Final = 5
+"""Spans in a row that disagree and make the usual one."""
+
+
+class SampleStream:
+    """From the bytes of a stream to samples, each with the time at which it was measured if it came at once.
+
+    Args:
+        mode: of the scan.
+        baud: of the line; None where it has no rate of its own.
+    """
+
+    def __init__(self, mode: ScanMode, baud: int | None) -> None:
+        self.parser = RecordParser(mode.answer)
+        self._mode = mode
+        self._latency = ((SIZES[mode.answer] * 10 / baud if baud else 0.0) + TRANSFER) * SECOND
+        self._before: tuple[Record, float] | None = None
+        self._usual: float | None = None
+        self._odd: list[float] = []
+
+    def feed(self, data: bytes, arrival: float) -> list[BeamSamples]:
+        """Samples of the records that became complete; ``arrival``: of the bytes, ns."""
+        records = self.parser.feed(data)
+        if self._mode.answer is DataType.STANDARD:
+            return [self._timed(decode_standard(record.data), arrival) for record in records]
+        found = []
+        for record in records:
+            before, self._before = self._before, (record, arrival)
+            if before is not None and not record.fresh and self._follows(before[0], record):
+                decoded = decode_capsule(self._mode.answer, before[0], record)
+                found.append(self._timed(decoded, before[1]))
+        return found
+
+    def _follows(self, record: Record, following: Record) -> bool:
+        """Whether no record was lost between the two."""
+        assert record.start is not None
+        assert following.start is not None
+        span = float((following.start - record.start) % TURN_Q6)
+        if self._usual is not None and abs(span - self._usual) <= AGREE * self._usual:
+            self._usual += (span - self._usual) / 8
+            self._odd.clear()
+            return True
+        self._odd.append(span)
+        if self._usual is None or len(self._odd) >= RELEARN:
+            self._usual = float(np.median(self._odd))
+            self._odd.clear()
+        return False
+
+    def _timed(self, decoded: Decoded, arrival: float) -> BeamSamples:
+        count = len(decoded.turns)
+        before_last: Array = np.arange(count - 1.0, -1.0, -1.0) * (self._mode.sample_time * SECOND)
+        return BeamSamples(*decoded, arrival - self._latency - before_last)
+
+
+class RplidarDriver:
+    """A RPLIDAR on a port.
+
+    Args:
+        config: model, mode, motor and patience.
+        port: where it is plugged in.
+        clock: time.
+        out: where scans go.
+        events: where readiness and its health are reported.
+        name: of the service.
+    """
+
+    def __init__(
+        self,
+        config: RplidarConfig,
+        port: Port,
+        clock: Clock,
+        out: Publisher[LaserScan],
+        events: EventSink,
+        name: str = "lidar",
+    ) -> None:
+        self.name = name
+        self._config, self._port, self._clock, self._out, self._events = config, port, clock, out, events
+
+    async def run(self, ready: Ready) -> None:
+        """One session: identify, check its health, start motor and scan; both are off when it ends.
+
+        Raises:
+            DeviceFaultError: the unit protects itself, also after a reset.
+            DeviceLostError: nothing plugged in, or unplugged.
+            DeviceTimeoutError: silence, or a head that does not turn.
+            PortBusyError: another process holds the port.
+            ProtocolError: answers against the protocol, or bytes without a sample.
+            WrongDeviceError: another device, or another unit than configured.
+        """
+        async with await self._port.open() as link:
+            session = RplidarSession(link, self._clock, self._config)
+            unit = await session.handshake()
+            if unit.health.status:
+                self._events(
+                    Reason.DEVICE_FAULT, Severity.WARNING, self.name, "unit warns", code=f"0x{unit.health.code:04x}"
+                )
+            mode = self._mode_of(unit)
+            try:
+                if unit.pwm:
+                    session.turn_motor(self._config.motor_pwm)
+                await session.start(mode)
+                await self._stream(session, unit, mode, link.baud, ready)
+            finally:
+                if not link.is_lost:
+                    session.end()
+                    if unit.pwm:
+                        session.turn_motor(0)
+
+    def _mode_of(self, unit: ScannerUnit) -> ScanMode:
+        wanted = self._config.scan_mode
+        if wanted == "typical":
+            return next((mode for mode in unit.modes if mode.number == unit.typical), unit.modes[-1])
+        for mode in unit.modes:
+            if mode.name.lower() == wanted.lower():
+                return mode
+        names = ", ".join(mode.name for mode in unit.modes)
+        raise ProtocolError(f"{self._port.name}: the unit has no scan mode {wanted!r}; it lists {names}")
+
+    async def _stream(
+        self, session: RplidarSession, unit: ScannerUnit, mode: ScanMode, baud: int | None, ready: Ready
+    ) -> None:
+        config, clock, begin = self._config, self._clock, self._clock.now()
+        stream, cutter = SampleStream(mode, baud), TurnCutter()
+        times = ArrivalTimes(mode.sample_time * SECOND)
+        records = max(WAKE_PERIOD / mode.sample_time / COUNTS[mode.answer], 1.0)
+        batch = round(records) * SIZES[mode.answer]
+        limits = MODELS[config.model].ranges.least, mode.longest
+        due, first, measured = begin + round(config.first_scan * SECOND), True, False
+        patience = config.first_scan
+        while True:
+            try:
+                data = await session.read(patience, batch)
+            except DeviceTimeoutError as error:
+                raise DeviceTimeoutError(f"{error}{STANDS if first else ''}") from None
+            arrival = clock.now()
+            for samples in stream.feed(data, float(arrival - begin)):
+                measured = True
+                for revolution in cutter.add(samples):
+                    turn = on_equal_steps(times.timed(revolution))
+                    if turn is None:
+                        continue
+                    if first:
+                        ready()
+                        self._report_ready(unit, mode)
+                    due, first, measured = clock.now() + round(config.stale * SECOND), False, False
+                    patience = config.silence
+                    publish(turn, begin, arrival, limits, config, self._out)
+            if clock.now() >= due:
+                if measured:
+                    raise DeviceTimeoutError(f"{self._port.name}: samples, but no whole revolution")
+                raise ProtocolError(f"{self._port.name}: bytes, but no sample of a RPLIDAR")
+
+    def _report_ready(self, unit: ScannerUnit, mode: ScanMode) -> None:
+        identity = unit.identity
+        self._events(
+            Reason.DEVICE_READY,
+            Severity.INFO,
+            self.name,
+            f"RPLIDAR 0x{identity.model:02x}",
+            serial=identity.serial,
+            firmware=".".join(map(str, identity.firmware)),
+            mode=mode.name,
+        )

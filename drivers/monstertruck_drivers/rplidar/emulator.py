@@ -1,0 +1,320 @@
+"""The device side of the RPLIDARs, byte for byte: start-up, health, modes, a motor that comes up to speed, streams."""
+
+import asyncio
+import struct
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import Array, BeamSource, EmulatorSetup, ReceivedBytes
+from monstertruck_drivers.rplidar.config import RplidarConfig
+from monstertruck_drivers.rplidar.protocol import (
+    COUNTS,
+    MODELS,
+    NO_QUALITY,
+    SIZES,
+    SYNC,
+    TURN_Q6,
+    ConfigKey,
+    DataType,
+    Descriptor,
+    RplidarCommand,
+    RplidarIdentity,
+    RplidarModel,
+    ScanMode,
+    build_capsule,
+    build_descriptor,
+    build_express,
+    build_info,
+    build_standard,
+    build_ultra,
+    ultra_offset,
+)
+from monstertruck_drivers.scanning.head import FAULTS as HEAD_FAULTS
+from monstertruck_drivers.scanning.head import TURNING, TurningHead
+from monstertruck_drivers.signals import SignalKind, Signals
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+BOOT: Final = SECOND // 2
+"""Nanoseconds after power-up and reset without an answer."""
+GREETING: Final = b"RP LIDAR System.\r\nFirmware Ver 1.29 - rc7, HW Ver 7\r\nModel: 18\r\n"
+"""What an A1 says when it starts."""
+ANSWER_DELAY: Final = 0.001
+"""Seconds from a request to its answer."""
+OVERSLEPT: Final = SECOND // 2
+"""Nanoseconds that it lags behind after the host's machine slept, at most."""
+IDLE: Final = 0.01
+"""Seconds between two looks at what to do."""
+GROUP: Final = 8
+"""Standard samples that are sent together."""
+DEFAULT_PWM: Final = 660
+"""Duty cycle, of 1023, at which the head turns as the data sheet says."""
+OFFSET: Final = 20
+"""Angle that is to be subtracted from express samples, 1/8 degrees; the real ones depend on the distance."""
+RANGE: Final = "range"
+"""Distances of a record, mm."""
+SCAN: Final = "scan"
+
+
+class RplidarEmulator:
+    """A RPLIDAR.
+
+    Faults (``inject``): ``silent on|off`` and ``deaf on|off``, ``health 0|1|2 CODE`` (2: protects itself until it is
+    reset), ``broken on|off`` (protects itself after a reset, too), ``bad_checksum N`` (the next so many records),
+    ``torn`` (the next record begins in its middle), and those of the head.
+
+    Args:
+        clock: time.
+        source: what it sees.
+        model: by its data sheet.
+        seed: of covers.
+        firmware: below 1.24 it does not list its modes.
+        serial: 32 hexadecimal digits.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        source: BeamSource,
+        model: RplidarModel = MODELS["a1"],
+        *,
+        seed: int = 0,
+        firmware: tuple[int, int] = (1, 29),
+        serial: str = "7DED9A87C5E392D3A5E49EF0ED383D65",
+    ) -> None:
+        self.name = "lidar"
+        self.received = ReceivedBytes()
+        """Bytes the host sent, for tests."""
+        self.mode: ScanMode | None = None
+        """In which it scans; None = idle."""
+        rng = np.random.default_rng(seed)
+        self.signals = Signals(clock.now, {RANGE: SignalKind.ARRAY, SCAN: SignalKind.SWITCH}, rng, codes={RANGE: 1})
+        self.head = TurningHead(clock, source, model.ranges, model.frequency, rng)
+        self._clock, self._model = clock, model
+        self._identity = RplidarIdentity(model.number, firmware, 7, serial)
+        self._switches = {"silent": False, "deaf": False, "broken": False}
+        self._health = (0, 0)
+        self._bad_sums = 0
+        self._torn = self._forced = self._greeting = False
+        self._input = b""
+        self._ready_at = 0
+        self._angle = 0.0
+        """Of the newest standard sample, turns."""
+        self.power_cycle()
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Serve until cancelled."""
+        end.baud = self._model.baud
+        end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
+        self.power_cycle()
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._scan(end))
+            while True:
+                data = await end.read()
+                self.received.extend(data)
+                if self._switches["deaf"] or self._clock.now() < self._ready_at:
+                    continue
+                self._input += data
+                while (taken := self._request()) is not None:
+                    await self._clock.sleep(ANSWER_DELAY)
+                    self._answer(end, *taken)
+
+    def power_cycle(self) -> None:
+        """Supply off and on: idle; a motor that the adapter board drives stands, any other turns."""
+        self.head.stop()
+        self._restart()
+        self._motor_off = self._model.adapter
+        self.head.frequency = 0.0 if self._motor_off else self._model.frequency
+
+    def _restart(self) -> None:
+        self.mode, self._input = None, b""
+        self._health = (2, 0x8001) if self._switches["broken"] else (0, 0)
+        self._ready_at = self._clock.now() + BOOT
+        self._greeting = self._model.number == MODELS["a1"].number
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        match fault, values:
+            case _, (("on" | "off") as state,) if fault in self._switches:
+                self._switches[fault] = state == "on"
+                if fault == "broken" and state == "on":
+                    self._health = (2, 0x8001)
+            case "health", (status, *code) if status in ("0", "1", "2"):
+                self._health = int(status), int(code[0], base=0) if code else 0
+            case "bad_checksum", (count,) if count.isdigit():
+                self._bad_sums = int(count)
+            case "torn", ():
+                self._torn = True
+            case _ if self.head.inject(fault, *values):
+                pass
+            case _:
+                raise InputError(
+                    f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: silent on|off | "
+                    f"deaf on|off | health 0|1|2 CODE | broken on|off | bad_checksum N | torn | {HEAD_FAULTS}"
+                )
+
+    # Requests
+
+    def _request(self) -> tuple[int, bytes] | None:
+        """The next request: command and payload; what is none is dropped."""
+        while self._input:
+            data = self._input
+            if data[0] != SYNC:
+                self._input = data[1:]
+                continue
+            if len(data) < 2:  # sync and command
+                return None
+            if data[1] < 0x80:  # no payload
+                self._input = data[2:]
+                return data[1], b""
+            if len(data) < 3 or len(data) < 4 + data[2]:  # length, payload and sum
+                return None
+            size = data[2]
+            self._input = data[4 + size :]
+            total = 0
+            for byte in data[: 3 + size]:
+                total ^= byte
+            if total == data[3 + size]:
+                return data[1], data[3 : 3 + size]
+        return None
+
+    def _answer(self, end: DeviceEnd, command: int, payload: bytes) -> None:
+        if command == RplidarCommand.MOTOR_PWM:
+            self._drive(payload)
+            return
+        self.mode = None  # every other request ends a scan
+        match command:
+            case RplidarCommand.RESET:
+                self._restart()
+            case RplidarCommand.INFO:
+                self._single(end, DataType.INFO, build_info(self._identity))
+            case RplidarCommand.HEALTH:
+                self._single(end, DataType.HEALTH, struct.pack("<BH", *self._health))
+            case RplidarCommand.SAMPLE_RATE:
+                times = [round(mode.sample_time * 1e6) for mode in (self._model.modes[0], self._model.modes[1])]
+                self._single(end, DataType.SAMPLE_RATE, struct.pack("<HH", *times))
+            case RplidarCommand.ADAPTER if self._model.number >> 4 in (2, 3):
+                self._single(end, DataType.ADAPTER, struct.pack("<I", self._model.adapter))
+            case RplidarCommand.CONFIG if self._identity.firmware >= (1, 24):
+                if (data := self._property(payload)) is not None:
+                    self._single(end, DataType.CONFIG, data)
+            case RplidarCommand.SCAN | RplidarCommand.FORCE_SCAN:
+                self._begin(end, self._model.modes[0], forced=command == RplidarCommand.FORCE_SCAN)
+            case RplidarCommand.EXPRESS_SCAN if payload:
+                modes, number = self._model.modes, payload[0] if self._identity.firmware >= (1, 24) else 0
+                if number < len(modes):
+                    self._begin(end, modes[number] if number else _first_capsules(modes), forced=False)
+
+    def _drive(self, payload: bytes) -> None:
+        """The adapter board sets the motor's speed; a scan goes on."""
+        if self._model.adapter and len(payload) == struct.calcsize("<H"):
+            (pwm,) = struct.unpack("<H", payload)
+            self.head.frequency = self._model.frequency * pwm / DEFAULT_PWM
+
+    def _begin(self, end: DeviceEnd, mode: ScanMode, *, forced: bool) -> None:
+        if self._health[0] == 2:  # protects itself
+            return
+        if not self._switches["silent"]:
+            end.write(build_descriptor(Descriptor(SIZES[mode.answer], True, mode.answer)))
+        self.mode, self._forced = mode, forced
+
+    def _single(self, end: DeviceEnd, kind: DataType, data: bytes) -> None:
+        if not self._switches["silent"]:
+            end.write(build_descriptor(Descriptor(len(data), False, kind)) + data)
+
+    def _property(self, payload: bytes) -> bytes | None:
+        (key,) = struct.unpack_from("<I", payload + bytes(4))
+        (number,) = struct.unpack_from("<H", payload[4:] + bytes(2))
+        modes = self._model.modes
+        if number >= len(modes):
+            return None
+        mode = modes[number]
+        values: dict[int, bytes] = {
+            ConfigKey.MODE_COUNT: struct.pack("<H", len(modes)),
+            ConfigKey.TYPICAL_MODE: struct.pack("<H", self._model.typical),
+            ConfigKey.SAMPLE_TIME: struct.pack("<I", round(mode.sample_time * 256e6)),
+            ConfigKey.LONGEST: struct.pack("<I", round(mode.longest * 256)),
+            ConfigKey.ANSWER_TYPE: bytes((mode.answer,)),
+            ConfigKey.NAME: mode.name.encode() + b"\0",
+        }
+        found = values.get(key)
+        return None if found is None else struct.pack("<I", key) + found
+
+    # Samples
+
+    async def _scan(self, end: DeviceEnd) -> None:
+        while True:
+            if self.mode is not None:
+                await self._stream(end, self.mode)
+                continue
+            if self._greeting and self._clock.now() >= self._ready_at:
+                self._greeting = False
+                end.write(GREETING)
+            self.head.turn(np.array([self.head.now()], np.int64))
+            await self._clock.sleep(IDLE)
+
+    async def _stream(self, end: DeviceEnd, mode: ScanMode) -> None:
+        count = GROUP if mode.answer is DataType.STANDARD else COUNTS[mode.answer]
+        period, fresh = mode.sample_time * SECOND, True
+        begin = float(self.head.now())
+        while self.mode is mode:
+            ahead = mode.answer is DataType.ULTRA  # its last samples lean on the first one of the next record
+            times = (begin + period * np.arange(1, count + 1 + ahead)).astype(np.int64)
+            last = int(times[-1])
+            await self._clock.sleep_until(self.head.world_time(last))
+            late = self.head.now() - last > OVERSLEPT
+            begin = float(self.head.now() if late else begin + period * count)
+            if self.mode is not mode or late:
+                continue
+            data = self._record(mode, times, fresh=fresh)
+            ready = self._forced or self.head.speed > TURNING * max(self._model.frequency, 0.1)
+            if not ready or self._switches["silent"]:
+                continue
+            fresh = False
+            if self._bad_sums:
+                self._bad_sums -= 1
+                data = bytes((data[0] ^ 3,)) + data[1:]
+            if self._torn:
+                self._torn, data = False, data[len(data) // 2 :]
+            end.write(data)
+
+    def _record(self, mode: ScanMode, times: NDArray[np.int64], *, fresh: bool) -> bytes:
+        turned = self.head.turn(times)
+        if mode.answer is DataType.STANDARD:
+            millimetres = self._millimetres(self.head.look(turned, times))
+            angles = np.mod(turned, 1.0)
+            starts, self._angle = np.diff(angles, prepend=self._angle) < 0.0, float(angles[-1])
+            return build_standard(turned, millimetres, np.where(millimetres > 0, NO_QUALITY, 0), starts)
+        start = round(float(turned[0]) * TURN_Q6) % TURN_Q6
+        if mode.answer is DataType.DENSE:
+            millimetres = self._millimetres(self.head.look(turned, times))
+            return build_capsule(start, millimetres.astype("<u2").tobytes(), fresh=fresh)
+        if mode.answer is DataType.EXPRESS:
+            millimetres = np.minimum(self._millimetres(self.head.look(turned - OFFSET / 8 / 360, times)), 0x3FFF)
+            return build_capsule(start, build_express(millimetres, np.full(len(times), OFFSET)), fresh=fresh)
+        guessed = self.head.look(turned - ultra_offset(np.array([3000.0])), times)
+        millimetres = self._millimetres(self.head.look(turned - ultra_offset(guessed * 1000), times))
+        return build_capsule(start, build_ultra(millimetres), fresh=fresh)
+
+    def _millimetres(self, ranges: Array) -> NDArray[np.int64]:
+        found: NDArray[np.int64] = np.rint(ranges * 1000).astype(np.int64)
+        return np.clip(self.signals.report(RANGE, found), 0, 0xFFFF)
+
+
+def _first_capsules(modes: tuple[ScanMode, ...]) -> ScanMode:
+    """Mode that an express request for mode 0 gets."""
+    return next(mode for mode in modes if mode.answer is not DataType.STANDARD)
+
+
+def emulated(setup: EmulatorSetup) -> RplidarEmulator:
+    """The lidar of a simulated robot."""
+    settings = setup.settings if isinstance(setup.settings, RplidarConfig) else RplidarConfig()
+    serial = settings.serial_number or "7DED9A87C5E392D3A5E49EF0ED383D65"
+    return RplidarEmulator(setup.clock, setup.physics.lidar, MODELS[settings.model], seed=setup.seed, serial=serial)

@@ -1,0 +1,240 @@
+"""Asking a RPLIDAR: one request at a time, from any state it may have been left in."""
+
+import struct
+from dataclasses import dataclass
+from typing import Final
+
+from monstertruck_drivers.link import Link
+from monstertruck_drivers.rplidar.config import RplidarConfig
+from monstertruck_drivers.rplidar.protocol import (
+    ANSWER,
+    DESCRIPTOR,
+    SIZES,
+    ConfigKey,
+    DataType,
+    Health,
+    RplidarCommand,
+    RplidarIdentity,
+    ScanMode,
+    config_request,
+    express_request,
+    parse_descriptor,
+    parse_info,
+    request,
+)
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import (
+    DeviceFaultError,
+    DeviceTimeoutError,
+    ProtocolError,
+    WrongDeviceError,
+)
+
+ATTEMPTS: Final = 3
+"""Requests for the identity: half a request of a dead host may swallow the first."""
+QUIET: Final = 0.1
+"""Seconds of silence that prove that a stream has ended; it ends within 1 ms of STOP (maker's protocol)."""
+ENDED: Final = 0.3
+"""Seconds in which a stream must end."""
+STOPS: Final = 5
+"""Requests to stop: half a request of a dead host may swallow the first ones."""
+ADAPTER_SUPPORTS_PWM: Final = 1
+"""Bit of the adapter board's answer."""
+LISTS_MODES_FROM: Final = (1, 24)
+"""Firmware from which on a unit lists its modes (maker's protocol, GET_LIDAR_CONF)."""
+PROTECTED: Final = 2
+"""Health of a unit that has stopped to protect itself."""
+LONGEST_ANSWER: Final = 128
+"""Bytes of the longest single answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScannerUnit:
+    """What the handshake found."""
+
+    identity: RplidarIdentity
+    health: Health
+    modes: tuple[ScanMode, ...]
+    typical: int
+    """Number of the mode that the maker recommends."""
+    pwm: bool
+    """Whether its motor obeys ``MOTOR_PWM``."""
+
+
+class RplidarSession:
+    """Requests over an open link.
+
+    Args:
+        link: open link.
+        clock: time.
+        config: patience.
+    """
+
+    def __init__(self, link: Link, clock: Clock, config: RplidarConfig) -> None:
+        self._link, self._clock, self._config = link, clock, config
+        self._heard = 0
+
+    async def handshake(self) -> ScannerUnit:
+        """Bring the unit to rest and learn who it is; one that protects itself is reset once.
+
+        Raises:
+            DeviceFaultError: it still protects itself.
+            DeviceTimeoutError: silence.
+            ProtocolError: answers against the protocol.
+            WrongDeviceError: another device, or another unit than configured.
+        """
+        await self.stop()
+        identity = await self._identify()
+        wanted = self._config.serial_number
+        if wanted is not None and identity.serial != wanted.upper():
+            raise WrongDeviceError(f"{self._link.name}: expected unit {wanted}, found {identity.serial}")
+        health = await self._health()
+        if health.status == PROTECTED:
+            await self.reset()
+            health = await self._health()
+            if health.status == PROTECTED:
+                raise DeviceFaultError(f"{self._link.name}: unit protects itself, code 0x{health.code:04x}")
+        lists = identity.firmware >= LISTS_MODES_FROM
+        modes, typical = await self._listed_modes() if lists else await self._early_modes()
+        return ScannerUnit(identity, health, modes, typical, await self._has_pwm(identity))
+
+    async def start(self, mode: ScanMode) -> None:
+        """Start scanning.
+
+        Raises:
+            DeviceTimeoutError: no answer.
+            ProtocolError: it sends another form than the mode has.
+        """
+        standard = mode.answer is DataType.STANDARD
+        self._link.write(request(RplidarCommand.SCAN) if standard else express_request(mode.number))
+        found = parse_descriptor(await self._descriptor("scan"))
+        if found.type != mode.answer or found.length != SIZES[mode.answer]:
+            raise ProtocolError(f"{self._link.name}: mode {mode.name} sends data of type 0x{found.type:02x}")
+
+    async def read(self, within: float, least: int) -> bytes:
+        """Bytes of the stream.
+
+        Raises:
+            DeviceTimeoutError: silence.
+        """
+        try:
+            return await self._link.read(within, least=least)
+        except TimeoutError:
+            raise DeviceTimeoutError(f"{self._link.name}: silent for {within:.1f} s") from None
+
+    async def stop(self) -> None:
+        """End whatever it is doing, and throw away what it still sends.
+
+        Raises:
+            WrongDeviceError: it does not fall silent.
+        """
+        for _ in range(STOPS):
+            self._link.write(request(RplidarCommand.STOP))
+            until = self._clock.now() + round(ENDED * SECOND)
+            while self._clock.now() < until:
+                try:
+                    await self._link.read(QUIET)
+                except TimeoutError:
+                    return
+        raise WrongDeviceError(f"{self._link.name}: keeps sending after STOP: no RPLIDAR, or another baud rate")
+
+    async def reset(self) -> None:
+        """Restart it, and wait until it answers again."""
+        self._link.write(request(RplidarCommand.RESET))
+        until = self._clock.now() + round(self._config.boot * SECOND)
+        while self._clock.now() < until:
+            await self._clock.sleep(QUIET)
+            try:
+                await self._health()
+            except DeviceTimeoutError:
+                continue
+            return
+
+    def turn_motor(self, pwm: int) -> None:
+        """Set the duty cycle of the motor, of 1023; 0 = off."""
+        self._link.write(request(RplidarCommand.MOTOR_PWM, struct.pack("<H", pwm)))
+
+    def end(self) -> None:
+        """Stop scanning without waiting."""
+        self._link.write(request(RplidarCommand.STOP))
+
+    # Parts
+
+    async def _identify(self) -> RplidarIdentity:
+        for _ in range(ATTEMPTS):
+            self._heard = 0
+            try:
+                return parse_info(await self._ask(request(RplidarCommand.INFO), DataType.INFO))
+            except DeviceTimeoutError:
+                continue
+        if self._heard:
+            raise WrongDeviceError(f"{self._link.name}: what answers is no RPLIDAR, or has another baud rate")
+        raise DeviceTimeoutError(f"{self._link.name}: no answer")
+
+    async def _health(self) -> Health:
+        return Health(*struct.unpack("<BH", await self._ask(request(RplidarCommand.HEALTH), DataType.HEALTH)))
+
+    async def _listed_modes(self) -> tuple[tuple[ScanMode, ...], int]:
+        (count,) = struct.unpack_from("<H", await self._property(ConfigKey.MODE_COUNT))
+        (typical,) = struct.unpack_from("<H", await self._property(ConfigKey.TYPICAL_MODE))
+        modes = []
+        for number in range(count):
+            (time,) = struct.unpack_from("<I", await self._property(ConfigKey.SAMPLE_TIME, number))
+            (far,) = struct.unpack_from("<I", await self._property(ConfigKey.LONGEST, number))
+            answer = (await self._property(ConfigKey.ANSWER_TYPE, number))[0]
+            name = (await self._property(ConfigKey.NAME, number)).rstrip(b"\0").decode("ascii", "replace")
+            if answer in SIZES and time:
+                modes.append(ScanMode(number, name, time / 256e6, far / 256, DataType(answer)))
+        if not modes:
+            raise ProtocolError(f"{self._link.name}: lists no mode that this driver can read")
+        return tuple(modes), typical
+
+    async def _early_modes(self) -> tuple[tuple[ScanMode, ...], int]:
+        """Modes of firmware that does not list them."""
+        standard, express = struct.unpack(
+            "<HH", await self._ask(request(RplidarCommand.SAMPLE_RATE), DataType.SAMPLE_RATE)
+        )
+        longest = 12.0  # of all models with such firmware
+        return (
+            ScanMode(0, "Standard", standard * 1e-6, longest, DataType.STANDARD),
+            ScanMode(0, "Express", express * 1e-6, longest, DataType.EXPRESS),
+        ), 1
+
+    async def _has_pwm(self, identity: RplidarIdentity) -> bool:
+        if identity.model >> 4 not in (2, 3):  # only the A2's and the A3's adapter board may
+            return False
+        answer = await self._ask(request(RplidarCommand.ADAPTER, bytes(4)), DataType.ADAPTER)
+        return bool(answer[0] & ADAPTER_SUPPORTS_PWM)
+
+    async def _property(self, key: ConfigKey, mode: int = 0) -> bytes:
+        data = await self._ask(config_request(key, mode), DataType.CONFIG)
+        if len(data) < 5 or struct.unpack_from("<I", data)[0] != key:  # key and at least one byte
+            raise ProtocolError(f"{self._link.name}: answered another property than {key.name}")
+        return data[4:] + bytes(4)
+
+    async def _ask(self, asked: bytes, kind: DataType) -> bytes:
+        self._link.discard()
+        self._link.write(asked)
+        found = parse_descriptor(await self._descriptor(kind.name))
+        if found.type != kind or found.repeated or not 0 < found.length <= LONGEST_ANSWER:
+            raise ProtocolError(f"{self._link.name}: {kind.name} answered with type 0x{found.type:02x}")
+        return await self._exactly(found.length, kind.name)
+
+    async def _descriptor(self, what: str) -> bytes:
+        """The next descriptor; text of a unit that starts and remains of a stream before it are passed over."""
+        head = await self._exactly(DESCRIPTOR, what)
+        passed = 0
+        while not head.startswith(ANSWER):
+            self._heard += 1
+            passed += 1
+            if passed > 4096:  # more than any unit says before it answers
+                raise WrongDeviceError(f"{self._link.name}: {passed} bytes, but no answer of a RPLIDAR")
+            head = head[1:] + await self._exactly(1, what)
+        return head
+
+    async def _exactly(self, count: int, what: str) -> bytes:
+        try:
+            data = await self._link.exactly(count, self._config.answer_timeout)
+        except TimeoutError:
+            raise DeviceTimeoutError(f"{self._link.name}: no answer to {what}") from None
+        return data
