@@ -40,10 +40,14 @@ LIMITS: Final = {"module_numbers_per_1000_lines": 6.0, "most_in_a_file_per_1000_
 CELL: Final = 200
 """Characters of a table cell of the documentation."""
 REST: Final = (
+    "drivers/monstertruck_drivers/arduino_bridge",
+    "drivers/monstertruck_drivers/bno085",
     "drivers/monstertruck_drivers/ld19",
+    "drivers/monstertruck_drivers/receiver",
     "drivers/monstertruck_drivers/roboclaw",
     "drivers/monstertruck_drivers/srf08",
     "drivers/monstertruck_drivers/steppers",
+    "drivers/monstertruck_drivers/vesc",
     "drivers/monstertruck_drivers/wt61",
     "drivers/monstertruck_sim",
     "monstertruckd/station/foxglove.py",

@@ -13,7 +13,7 @@ from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes
 from monstertruck_drivers.receiver import crsf, sbus
 from monstertruck_drivers.receiver.channels import CENTRE, CHANNELS, LOW, raw
-from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig
+from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig, SbusConfig
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
@@ -31,7 +31,7 @@ SIGNAL: Final = -60.0
 class ReceiverEmulator:
     """A receiver and its transmitter: sticks in the middle, switches off.
 
-    Faults (``inject``), besides the hand's own ``move CHANNEL POSITION``: ``transmitter on|off``, ``quality SHARE``,
+    Faults (``inject``): ``move CHANNEL POSITION`` (the hand does it), ``transmitter on|off``, ``quality SHARE``,
     ``silent on|off``, ``damage N`` (the next so many frames have a wrong byte).
 
     Args:
@@ -130,3 +130,8 @@ class ReceiverEmulator:
 def emulated(setup: EmulatorSetup) -> ReceiverEmulator:
     """The receiver of a simulated robot."""
     return ReceiverEmulator(setup.clock, setup.settings, seed=setup.seed)
+
+
+def emulated_sbus(setup: EmulatorSetup) -> ReceiverEmulator:
+    """The receiver of a simulated robot, which speaks SBUS."""
+    return ReceiverEmulator(setup.clock, setup.settings or SbusConfig(), seed=setup.seed)

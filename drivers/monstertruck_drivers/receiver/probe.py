@@ -2,7 +2,7 @@
 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.receiver.channels import position
-from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig
+from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig, SbusConfig
 from monstertruck_drivers.receiver.driver import first_frames, parser_of
 from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_runtime.clock import Clock
@@ -42,3 +42,8 @@ async def probe(port: Port, clock: Clock, settings: ReceiverConfig | None = None
         "link_quality": None if link_frame is None else link_frame.quality,
         "rssi_dbm": None if link_frame is None else link_frame.rssi,
     }
+
+
+async def probe_sbus(port: Port, clock: Clock, settings: SbusConfig | None = None) -> dict[str, object]:
+    """Listen for half a second to a receiver that speaks SBUS; see ``probe``."""
+    return await probe(port, clock, settings or SbusConfig())

@@ -100,7 +100,7 @@ def probe(
         if kind.opens == "video":
             where = str(port or "/dev/video*")
         elif port is not None:
-            where = SerialPort(port, baud or kind.baud or BAUD)
+            where = SerialPort(port, baud or kind.baud or BAUD, framing=kind.framing or "8N1")
         return await kind.probe_function()(where, clock, None)
 
     report = run_wall(main)

@@ -5,6 +5,9 @@ from crsf_parser import CRSFParser, PacketValidationStatus
 from hypothesis import given
 from hypothesis import strategies as st
 
+from monstertruck_drivers.cable import MemoryPort
+from monstertruck_drivers.catalog import DEVICES
+from monstertruck_drivers.emulation import EmulatorSetup
 from monstertruck_drivers.receiver import crsf, sbus
 from monstertruck_drivers.receiver.channels import CENTRE, CHANNELS, HIGH, LOW, pack, position, raw, unpack
 from monstertruck_drivers.receiver.config import CrsfConfig, SbusConfig
@@ -279,6 +282,22 @@ def test_the_probe_says_what_the_receiver_hears(config):
         assert not found["failsafe"]
 
     on_bench(test, config)
+
+
+@pytest.mark.parametrize("name", ["crsf", "sbus"])
+def test_without_settings_emulator_and_probe_of_a_kind_speak_its_protocol(name):
+    kind = DEVICES[name]
+
+    async def main(clock: VirtualClock) -> None:
+        port = MemoryPort("hand")
+        emulator = kind.emulator_factory()(EmulatorSetup("hand", None, clock, None, port=port))
+        async with background(emulator.run(port.device)):
+            port.plug()
+            found = await kind.probe_function()(port, clock, None)
+        assert name.upper() in found["device"]
+        assert found["channels"] is not None
+
+    run_virtual(main, start=SECOND)
 
 
 def test_every_channel_has_one_use():

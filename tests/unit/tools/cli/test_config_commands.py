@@ -44,7 +44,7 @@ def test_a_key_chooses_what_is_shown(monkeypatch: pytest.MonkeyPatch, capsys: py
     lines = capsys.readouterr().out.splitlines()[1:]
     assert [line.split()[0] for line in lines] == [
         "geometry.track",
-        *(f"gate.leases.{role}" for role in ("gamepad", "keyboard", "station", "tracker")),
+        *(f"gate.leases.{role}" for role in ("hand", "gamepad", "keyboard", "station", "tracker")),
     ]
     assert lines[0].endswith(f"{ROOT}/configs/parts/chassis.yaml:8"), "included files are named the short way"
     assert run(monkeypatch, "config", "show", robot, "--key", "geometry.track", "--json") == 0
@@ -112,7 +112,7 @@ devices:
         (TRUCK + "geometry: {length: 0.3}\n", "bad.yaml:5: geometry: impossible geometry", "less than the wheelbase"),
         (TRUCK + "geometry: {width: 0.2}\n", "bad.yaml:5: geometry: impossible geometry", "less than the track"),
         (TRUCK + "geometry: {wheel_radius: 0.2}\n", "bad.yaml:5: geometry: impossible geometry", "touch"),
-        (TRUCK.replace("hokuyo_urg", "sick"), "bad.yaml:3: devices.lidar.driver.kind: ", "hokuyo_urg"),
+        (TRUCK.replace("hokuyo_urg", "sick"), "bad.yaml:3: devices.lidar: ", "hokuyo_urg"),
         (TRUCK + "tracker: {kind: pure_pursuit}\n", "a tracker needs the devices drive and steering", ""),
         ("version: 2\ndevices: {}\nlidar_sonars: {}\n", "lidar_sonars needs the device lidar, and no device sonar", ""),
         (TRUCK + "sim: {world: {map: loop, gravity: 1}}\n", "bad.yaml:5: sim.world.gravity: unknown key", ""),
