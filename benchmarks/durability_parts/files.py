@@ -37,7 +37,7 @@ from monstertruckd.recorder.frames import MAGIC
 
 SECONDS: Final = 5.0
 MEGABYTES: Final = 500.0
-HANGS: Final = 300.0
+HANGS: Final = 1800.0
 """Elapsed seconds after which a reader is taken for hung: its stack is printed, and the run ends."""
 SHOWN: Final = 30
 """Faults that are printed, one of each kind and place."""
