@@ -66,7 +66,9 @@ def _in_archive(data: bytes, rng: random.Random) -> bytes:
 
 
 def _in_log(data: bytes, rng: random.Random) -> bytes:
-    """Mutate some messages, or an attachment, of a log."""
+    """Mutate some messages, or an attachment, of a log; one without an index is mutated as it is."""
+    if not data.endswith(MAGIC):
+        return mutated(data, rng)
     reader, out = make_reader(io.BytesIO(data)), io.BytesIO()
     writer = Writer(out, use_chunking=True)
     writer.start()

@@ -24,18 +24,22 @@ Part = tuple[str, int, int]
 
 
 def write(folder: Path, seed: int) -> Iterator[str]:
-    """Map, run after run; every part holds the numbers of its run and its save."""
-    rng, place, number = random.Random(seed), folder / "map", 0
+    """Map, run after run; every part holds the numbers of its run and its save.
+
+    Points that come before the grid of their run are acknowledged once the grid is saved as well.
+    """
+    rng, place, number, mapped = random.Random(seed), folder / "map", 0, -1
     while True:
         run = number // SAVES
         for part in rng.choices(("grid", "ground", "points"), (3, 1, 2), k=SAVES):
             number += 1
-            if part == "grid":
-                storage.save(place, _patch(run, number), _graph(run, number), str(run))
-            elif part == "ground":
+            if part == "ground":
                 _ground(run, number).save(place, str(run))
-            else:
+            elif part == "points":
                 files.save(place, _points(run, number), str(run))
+            if part == "grid" or (part == "points" and mapped != run):
+                storage.save(place, _patch(run, number), _graph(run, number), str(run))
+                mapped = run
             yield f"{part} {run} {number}"
 
 
@@ -45,8 +49,7 @@ def check(folder: Path, acknowledged: list[str], death: Death) -> str | None:
     tidy(place)
     if left := [path.name for path in place.glob("saves/*") if not path.name.isdecimal()]:
         return f"left behind: {left}"
-    grids = [part for part in parts if part[0] == "grid"]
-    if not grids:
+    if all(name == "ground" for name, _, _ in parts):
         return None  # nothing can be read without a grid
     saved = storage.load(place)
     if saved.grid.remarks:
@@ -71,7 +74,7 @@ def _compare(found: dict[str, tuple[int, int]], parts: list[Part]) -> str | None
     run = found["grid"][0]
     if mixed := {name: numbers for name, numbers in found.items() if numbers[0] != run}:
         return f"mixed: grid of run {run} with {mixed}"
-    if run < max(made for name, made, _ in parts if name == "grid"):
+    if run < max(made for name, made, _ in parts if name != "ground"):
         return f"an older run's map: {run}"
     for name in ("grid", "ground", "points"):
         newest = max((number for part, made, number in parts if (part, made) == (name, run)), default=0)
