@@ -13,9 +13,12 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, public, robot_on_ho
 from monstertruck_runtime.errors import InputError, NotFoundError
 from monstertruck_runtime.truck import Truck
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.tools.cli import options, orders
 from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.cli.orders import OrderOutcome
 
 SOCKETS = {"truck": "unixsock-stream//run/x/7447.sock", "second": "unixsock-stream//run/x/7448.sock"}
 
@@ -163,11 +166,14 @@ def test_a_station_shows_the_robot_that_it_names(reached: list, monkeypatch: pyt
 
 
 def test_an_emergency_stop_is_never_refused_and_names_who_was_not_stopped(
-    reached: list, capsys: pytest.CaptureFixture[str]
+    reached: list, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     CliRunner().invoke(app, ["estop"])
     assert reached == [("truck", SOCKETS["truck"])]
-    orders._name_others("truck", SOCKETS["truck"])
+    state = GateState(stamp=1, received=1, seq=0, mode=GateMode.ESTOPPED, nonce="n", speed_limit=0.0)
+    outcome = OrderOutcome(Order.ESTOP, Reason.OK, "", state)
+    monkeypatch.setattr(orders, "with_robot", lambda *_, **__: outcome)
+    orders.estop("truck", SOCKETS["truck"])
     assert capsys.readouterr().err == (
         "not stopped: second: monstertruckd estop --robot second --endpoint tcp/127.0.0.1:7448\n"
     )
