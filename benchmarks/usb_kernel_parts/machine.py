@@ -6,7 +6,6 @@ import re
 import shutil
 import socket
 import subprocess
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -244,31 +243,3 @@ def booted(unpacked: Path, image: Path, folder: Path, lines: dict[str, Path]) ->
     finally:
         qemu.kill()
         qemu.wait()
-
-
-class FarEnd:
-    """The far end of an adapter's line: what it hears is kept, what it says is ``reply`` of that.
-
-    Args:
-        path: QEMU's socket.
-        reply: answer to bytes heard.
-    """
-
-    def __init__(self, path: Path, reply: Any) -> None:
-        self.heard = bytearray()
-        self._path = path
-        self._reply = reply
-        threading.Thread(target=self._run, daemon=True).start()
-
-    def _run(self) -> None:
-        link = socket.socket(socket.AF_UNIX)
-        while True:
-            try:
-                link.connect(str(self._path))
-                break
-            except OSError:
-                sleep(0.1)
-        while data := link.recv(4096):
-            self.heard += data
-            if answer := self._reply(data):
-                link.sendall(answer)

@@ -31,6 +31,8 @@ from monstertruck_drivers.usb.config import CycleMethod, PowerConfig, UsbConfig,
 from monstertruck_drivers.usb.hub import HubCoordinator, UsbService
 from monstertruck_drivers.usb.port import HubPort, PortPower
 from monstertruck_drivers.usb.tree import (
+    DEVICES,
+    ancestors,
     at_present,
     parent_of,
     port_directory,
@@ -58,6 +60,7 @@ RETURN = 30.0
 USBDEVFS_DISCONNECT_CLAIM = 0x8108551B
 GADGET = "0525:a4a7"
 """Kind of the CDC-ACM device."""
+JOYSTICK = "1d6b:0104"
 DEVICE_SIDE = Path("/dev/ttyGS0")
 
 
@@ -394,8 +397,8 @@ async def unplugged_in_mid_write() -> dict[str, Any]:
     return {"ok": lost and tty_of(name) is not None, "back_s": time.monotonic() - begin}
 
 
-async def reopened_by_another_name() -> dict[str, Any]:
-    """The deaf device is enumerated again while its old port still hangs in the kernel."""
+async def replugged_while_wedged() -> dict[str, Any]:
+    """The deaf device is replugged while the kernel still closes its port: it opens again at once."""
     node = tty_of(by_id(GADGET))
     assert node is not None
     link = await SerialPort(node).open()
@@ -549,6 +552,28 @@ async def topology() -> dict[str, Any]:
     return {"ok": ok and f"ID_PATH={names[by_serial('SNs1')]}" in shown, "names": names}
 
 
+async def renumbered_buses() -> dict[str, Any]:
+    """Controllers are found again in another order: a port by topology opens on a bus with another number."""
+    sysfs = MACHINE.sysfs
+    before = by_serial("SNs1")
+    topology = topology_of(sysfs, before)
+    port = HubPort(place(topology), MACHINE, Events())
+    link = await port.open()
+    roots = [[*ancestors(name)][-1] for name in (before, by_id(JOYSTICK))]
+    controllers = [str(sysfs.text(f"{DEVICES}/{root}/serial")) for root in roots]
+    drivers = [*zip(("pci/drivers/xhci_hcd", "platform/drivers/dummy_hcd"), controllers, strict=True)]
+    for driver, controller in drivers:
+        await asyncio.to_thread(Path(f"/sys/bus/{driver}/unbind").write_text, controller)
+    await until(lambda: link.is_lost, 20)
+    for driver, controller in reversed(drivers):
+        await asyncio.to_thread(Path(f"/sys/bus/{driver}/bind").write_text, controller)
+    back = await until(lambda: tty_of(at_present(sysfs, topology)) is not None, RETURN)
+    (await port.open()).close()
+    after = by_serial("SNs1")
+    ok = before != after == at_present(sysfs, topology) and before.partition("-")[2] == after.partition("-")[2]
+    return {"ok": ok, "before": before, "after": after, "topology": topology, "back_s": back}
+
+
 async def control() -> dict[str, Any]:
     """A call of a library that sleeps for 50 ms on the loop: the measurement has to see it."""
     master, slave = pty.openpty()
@@ -562,6 +587,6 @@ async def control() -> dict[str, Any]:
 async def run_all() -> None:
     """One after the other."""
     acts = (control, tree, topology, open_and_close, udev_rules, foreign_opener, brltty, drivers, hub_pulled)
-    acts += (unplugged_in_mid_write, port_power, deaf, listens_again, reopened_by_another_name)
+    acts += (unplugged_in_mid_write, port_power, deaf, listens_again, replugged_while_wedged, renumbered_buses)
     for act in acts:
         await situation(act.__name__, act)
