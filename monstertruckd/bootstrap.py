@@ -50,7 +50,8 @@ FOUR = ("-n", "4")
 four get more of the cores than two."""
 TWO = ("-n", "2")
 """Tests on the wall clock at a time: each runs a truck and a daemon, which must not be late."""
-FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
+ALONE = ("-n", "0")
+FAILED_ALONE = (*ALONE, "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
 KERNELS: tuple[Path, str, str] = (VENV / "bin" / "python", "-m", "monstertruckd.tools.install.kernels")
 """Compiles what goals and maps need: after the first lap in the background, for nobody should wait for it before."""
 BYTECODE = ("-m", "compileall", "-q", "-j", "2", "monstertruckd", "drivers", "planners", "schemas", "tests")
@@ -197,7 +198,8 @@ def check(arguments: list[str]) -> int:
         compiling.wait()
     return steps(
         (pytest, [*FOUR, *TESTS, "-m", "not wall and not traced and not long", *arguments]),
-        (pytest, [*TWO, *TESTS, "-m", "wall and not long", *arguments]),
+        (pytest, [*TWO, *TESTS, "-m", "wall and not long and not kernel", *arguments]),
+        (pytest, [*ALONE, *TESTS, "-m", "kernel", *arguments]),
     )
 
 

@@ -226,7 +226,7 @@ async def tree() -> dict[str, Any]:
         "ok": nodes == ["ttyACM0", "ttyUSB0", "ttyUSB1", "ttyUSB2"] and Path("/dev/input/js0").exists(),
         "nodes": nodes,
         "hubs": hubs,
-        "joystick": MACHINE.sysfs.text(f"bus/usb/devices/{by_id('1d6b:0104')}:1.0/uevent"),
+        "joystick": MACHINE.sysfs.text(f"bus/usb/devices/{by_id(JOYSTICK)}:1.0/uevent"),
         "latency_ms": sorted({node.latency_ms for device in devices.values() for node in device.nodes} - {None}),
     }
 

@@ -179,7 +179,7 @@ def test_tests_that_failed_beside_others_are_run_once_more_alone(steps):
     ran, codes = steps
     codes += [0, 1, 0]
     assert bootstrap.check([]) == 0
-    assert len(ran) == 4
+    assert len(ran) == 5
     assert ran[2] == (*ran[1], *bootstrap.FAILED_ALONE)
 
 
@@ -204,9 +204,10 @@ def test_every_test_but_the_long_ones_belongs_to_one_step(steps):
     chosen = [arguments[arguments.index("-m") + 1] for arguments in ran]
     for wall in (True, False):
         for traced in (True, False):
-            marks = {"wall": wall, "traced": traced, "long": False}
-            assert sum(eval(expression, {}, marks) for expression in chosen) == 1
-    long = {"wall": False, "traced": False, "long": True}
+            for kernel in (True, False) if wall and not traced else (False,):
+                marks = {"wall": wall, "traced": traced, "long": False, "kernel": kernel}
+                assert sum(eval(expression, {}, marks) for expression in chosen) == 1
+    long = {"wall": False, "traced": False, "long": True, "kernel": False}
     assert not any(eval(expression, {}, long) for expression in chosen)
 
 
