@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from monstertruck_runtime import client, robots
@@ -19,6 +20,7 @@ from monstertruckd.station.address import RobotAddress
 from monstertruckd.tools.cli import options, orders
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.cli.orders import OrderOutcome
+from tests.unit.tools.cli.test_shared_options import commands
 
 SOCKETS = {"truck": "unixsock-stream//run/x/7447.sock", "second": "unixsock-stream//run/x/7448.sock"}
 
@@ -46,7 +48,17 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(
-    "line", ["arm", "disarm", "reset", "goto 1 2 0", "path lap", "explore --arm", "set gate.speed 0.1"]
+    "line",
+    [
+        "arm",
+        "disarm",
+        "reset",
+        "goto 1 2 0",
+        "track configs/paths/bend.csv",
+        "path lap",
+        "explore",
+        "set gate.speed 0.1",
+    ],
 )
 def test_a_command_that_could_mean_two_robots_is_refused_with_the_list(line: str, reached: list):
     done = CliRunner().invoke(app, line.split())
@@ -56,6 +68,15 @@ def test_a_command_that_could_mean_two_robots_is_refused_with_the_list(line: str
         "--robot second --endpoint tcp/127.0.0.1:7448"
     )
     assert reached == []
+
+
+def test_every_command_that_reaches_a_robot_looks_first_which_there_are():
+    blind = {
+        name
+        for name, command in commands(typer.main.get_command(app))
+        if any("--endpoint" in parameter.opts and parameter.callback is None for parameter in command.params)
+    }
+    assert blind == {"replay", "security check"}, "one is a robot itself, the other has to be told where"
 
 
 @pytest.mark.parametrize(
