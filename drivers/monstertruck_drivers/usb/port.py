@@ -207,6 +207,8 @@ def why_no_node(device: UsbDevice, kind: str, interface: int) -> str:
 OPEN_TIMEOUT: Final = 2.0
 """Seconds a fresh node may refuse: it is announced before its driver and permissions are in place."""
 RETRY: Final = 0.05
+BUSY_RETRY: Final = 0.5
+"""Seconds until the next attempt at a port that another program holds; each looks through all processes for it."""
 SHORT_SESSION: Final = 10 * SECOND
 
 
@@ -316,12 +318,13 @@ class HubPort:
                 link = await self._open(node)
             except DeviceWedgedError:
                 raise
-            except (DeviceLostError, PortBusyError):
+            except (DeviceLostError, PortBusyError) as error:
                 if self._machine.clock.now() >= give_up:
                     raise
+                pause = BUSY_RETRY if isinstance(error, PortBusyError) else RETRY
             else:
                 break
-            await self._machine.clock.sleep(RETRY)
+            await self._machine.clock.sleep(pause)
         self._opened_at = self._machine.clock.now()
         try:
             await self._judge_latency(node)

@@ -2,6 +2,7 @@
 
 import asyncio
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -117,8 +118,10 @@ def test_a_fresh_node_may_refuse_for_a_while(tmp_path: Path):
             await bench.ports["drive"].open()
         holder = await bench.cables["compass"].open()
         start = bench.clock.now()
-        with pytest.raises(PortBusyError):
-            await bench.ports["compass"].open()
+        with patch.object(bench.cables["compass"], "open", wraps=bench.cables["compass"].open) as attempts:
+            with pytest.raises(PortBusyError):
+                await bench.ports["compass"].open()
+            assert attempts.call_count == 5, "each looks through the processes of the computer for the holder"
         assert (bench.clock.now() - start) / SECOND == pytest.approx(OPEN_TIMEOUT, abs=0.2)
         holder.close()
 
