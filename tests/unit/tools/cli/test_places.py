@@ -76,7 +76,7 @@ def test_every_command_that_reaches_a_robot_looks_first_which_there_are():
         for name, command in commands(typer.main.get_command(app))
         if any("--endpoint" in parameter.opts and parameter.callback is None for parameter in command.params)
     }
-    assert blind == {"replay", "security check"}, "one is a robot itself, the other has to be told where"
+    assert blind == {"replay", "security check"}, "replay is a robot itself; security check requires an endpoint"
 
 
 @pytest.mark.parametrize(
