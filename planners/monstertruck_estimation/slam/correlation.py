@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_estimation.slam.budget import CELL, DRAWN
+from monstertruck_estimation.slam.budget import CELL, DRAWN, Pieces, finished
 from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
@@ -35,6 +35,8 @@ DOUBT: Final = 0.002
 """Penalty of a squared standard deviation from the guess, as share of the score."""
 WORK: Final = 400_000
 """Blocks evaluated, unless the caller says otherwise."""
+PIECE: Final = 2e6
+"""Look-ups of one piece of a search: 4 to 6 ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +88,18 @@ def look_ups(points: Array, window: tuple[float, float], levels: int) -> float:
     return 2 * window[1] / RESOLUTION * _lever(points) * (2 * window[0] / block + 1) ** 2 * len(points)
 
 
+@dataclass(frozen=True, slots=True)
+class RivalSearch:
+    """What to know of the best pose that is clearly different from the best of all."""
+
+    apart: float
+    """Its distance is at least this, m; or that arc at the typical range."""
+    least: float = 0.8
+    """Rivals scoring less than this share of the best score do not matter."""
+    enough: float = math.inf
+    """Nor does how much more than this share a rival scores."""
+
+
 def correlate(
     grid: LikelihoodGrid,
     points: Array,
@@ -96,7 +110,22 @@ def correlate(
     apart: float = 0.0,
     work: int = WORK,
 ) -> Peak | None:
-    """Best pose of ``points`` in the grid.
+    """Search at once; see ``correlation``. ``apart`` is that of a ``RivalSearch``; 0: do not look for rivals."""
+    rival = RivalSearch(apart) if apart > 0 else None
+    return finished(correlation(grid, points, guess, window, deviation, least, rival, work))
+
+
+def correlation(
+    grid: LikelihoodGrid,
+    points: Array,
+    guess: Array,
+    window: tuple[float, float],
+    deviation: tuple[float, float],
+    least: float,
+    rival: RivalSearch | None = None,
+    work: float = math.inf,
+) -> Pieces[Peak | None]:
+    """Search the best pose of ``points`` in the grid, in pieces.
 
     Args:
         grid: where the surfaces are.
@@ -105,8 +134,8 @@ def correlate(
         window: half width of the translation (m) and of the yaw (rad).
         deviation: standard deviation of the guess (m, rad), which breaks ties (``DOUBT``).
         least: poses scoring less are no result.
-        apart: a rival is at least this far (m; or that arc at the typical range) from the best; 0: do not look.
-        work: blocks evaluated before the search ends with what it has.
+        rival: look for a rival, too.
+        work: blocks evaluated before the search, and that for the rival, ends with what it has.
     """
     if not len(points):
         return None
@@ -117,19 +146,59 @@ def correlate(
     cells = math.ceil(window[0] / RESOLUTION)
     offsets = _rotated(points, guess, turns, grid.origin[0], grid.origin[1])
     penalty = (DOUBT * (RESOLUTION / deviation[0]) ** 2, DOUBT / deviation[1] ** 2)
-    zone = (10**9, 10**9, 10**9, -1.0, -1.0)
-    blocks, bounds = _coarsest(grid.levels, offsets, turns, cells, *penalty)
-    place = offsets, turns, cells, *penalty, blocks, bounds
-    score, k, ix, iy, _ = _search(grid.levels, *place, least, work, *zone)
-    if k < 0:
+    top = _top(len(grid.levels), cells)
+    at_once = max(int(PIECE / (_per_axis(cells, top) ** 2 * len(points))), 1)
+    parts = []
+    for first in range(0, len(turns), at_once):
+        yield float(_per_axis(cells, top) ** 2 * len(points) * len(turns[first : first + at_once]))
+        parts.append(_coarsest(grid.levels[top], offsets, turns, first, at_once, top, cells, *penalty, least))
+    blocks, bounds = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+    order = np.argsort(-bounds, kind="stable")
+    place = grid.levels, offsets, turns, cells, *penalty, blocks[order], bounds[order]
+    best = yield from _searched(place, least, math.inf, NOWHERE, work)
+    if best.turn < 0:
         return None
-    rival = unseen = 0.0
-    if apart > 0:
-        zone = (k, ix, iy, apart / RESOLUTION, apart / lever / step)
-        best, *_, unseen = _search(grid.levels, *place, 0.8 * score, work, *zone)
-        rival = max(best, 0.0)
-    pose = guess + np.array((ix * RESOLUTION, iy * RESOLUTION, turns[k]))
-    return Peak(pose, float(score), float(rival), float(unseen))
+    other = None
+    if rival is not None:
+        zone = (best.turn, best.x, best.y, rival.apart / RESOLUTION, rival.apart / lever / step)
+        other = yield from _searched(place, rival.least * best.score, rival.enough * best.score, zone, work)
+    pose = guess + np.array((best.x * RESOLUTION, best.y * RESOLUTION, turns[best.turn]))
+    if other is None:
+        return Peak(pose, best.score, 0.0)
+    return Peak(pose, best.score, other.score if other.turn >= 0 else 0.0, other.left)
+
+
+_Place = tuple[Pyramid, Blocks, Array, int, float, float, Blocks, Array]
+"""Arguments of ``_search`` that say where to look."""
+_Zone = tuple[int, float, float, float, float]
+"""Those that say where not to: turn, x and y of the middle, cells and turns round it."""
+NOWHERE: Final[_Zone] = (10**9, 10.0**9, 10.0**9, -1.0, -1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _SearchEnd:
+    score: float
+    turn: int
+    """Index; -1 if nothing was found."""
+    x: int
+    y: int
+    left: float
+    """What a pose not evaluated may score; 0 after a search that came to its end."""
+
+
+def _searched(place: _Place, least: float, enough: float, zone: _Zone, work: float) -> Pieces[_SearchEnd]:
+    """Search best first, in pieces."""
+    count = place[1].shape[1]
+    state: _State = (least, -1, 0, 0, 0, 0, np.empty(1024), np.empty((1024, 4), np.int32))
+    left = work
+    while True:
+        most = int(min(PIECE / count, left))
+        yield float(most * count)
+        state, bound, done = _search(*place, *zone, enough, most, state)
+        left -= most
+        best, turn, x, y = state[:4]
+        if done or left <= 0:
+            return _SearchEnd(float(best) if turn >= 0 else 0.0, turn, x, y, 0.0 if done else float(bound))
 
 
 def _lever(points: Array) -> float:
@@ -189,14 +258,36 @@ def _rotated(points: Array, guess: Array, turns: Array, x0: float, y0: float) ->
 
 
 @njit(cache=True)
-def _bound(level: Pyramid, offsets: Blocks, ix: int, iy: int) -> float:
+def _bound(level: Pyramid, offsets: Blocks, ix: int, iy: int, least: float) -> float:
+    """Bound of the scores of a block; of one that cannot reach ``least``, some number below."""
     rows, columns = level.shape
-    total = 0
-    for i in range(offsets.shape[0]):
+    count = offsets.shape[0]
+    total, missed = np.int64(0), np.int64(0)
+    most = int(255.0 * count * (1.0 - least)) + 255
+    for i in range(count):
         x, y = offsets[i, 0] + ix, offsets[i, 1] + iy
         if 0 <= x < columns and 0 <= y < rows:
-            total += level[y, x]
-    return float(total / (255.0 * offsets.shape[0]))
+            value = np.int64(level[y, x])
+            total += value
+            missed += 255 - value
+        else:
+            missed += 255
+        if missed > most:
+            break
+    return float(total / (255.0 * count))
+
+
+def _top(levels: int, cells: int) -> int:
+    """The level whose blocks a search begins with."""
+    top = levels - 1
+    while top > 0 and (1 << top) > 2 * cells:
+        top -= 1
+    return top
+
+
+def _per_axis(cells: int, top: int) -> int:
+    """Blocks of level ``top`` along each axis of a window."""
+    return (2 * cells + (1 << top)) // (1 << top)
 
 
 @njit(cache=True)
@@ -212,49 +303,51 @@ def _least_square(low: int, width: int) -> int:
 
 @njit(cache=True)
 def _coarsest(
-    levels: Pyramid, offsets: Blocks, turns: Array, cells: int, by_cell: float, by_turn: float
-) -> tuple[Blocks, Array]:
-    """Blocks of the coarsest level (turn index, x, y, level), the greatest bound first, and their bounds."""
-    top = levels.shape[0] - 1
-    while top > 0 and (1 << top) > 2 * cells:
-        top -= 1
+    level: Pyramid, offsets: Blocks, turns: Array, first: int, most: int, top: int, cells: int, by_cell: float,
+    by_turn: float, least: float,
+) -> tuple[Blocks, Array]:  # fmt: skip
+    """Blocks (turn index, x, y, level) of the coarsest level for ``most`` turns from ``first`` on, and their bounds."""
     width = 1 << top
     per_axis = (2 * cells + width) // width
-    count = turns.size * per_axis * per_axis
+    last = min(first + most, turns.size)
+    count = (last - first) * per_axis * per_axis
     bounds = np.empty(count)
     blocks = np.empty((count, 4), np.int32)
     n = 0
-    for k in range(turns.size):
+    for k in range(first, last):
         for by in range(per_axis):
             for bx in range(per_axis):
                 ix, iy = -cells + bx * width, -cells + by * width
                 doubt = by_turn * turns[k] ** 2
                 doubt += by_cell * (_least_square(ix, width) + _least_square(iy, width))
-                bounds[n] = _bound(levels[top], offsets[k], ix, iy) - doubt
+                bounds[n] = _bound(level, offsets[k], ix, iy, least + doubt) - doubt
                 blocks[n, 0], blocks[n, 1], blocks[n, 2], blocks[n, 3] = k, ix, iy, top
                 n += 1
-    order = np.argsort(-bounds, kind="mergesort")
-    return blocks[order], bounds[order]
+    return blocks, bounds
+
+
+_State = tuple[float, int, int, int, int, int, Array, Blocks]
+"""Of a search: best score, its turn index, x and y, blocks of the coarsest level taken, and the heap of the others."""
 
 
 @njit(cache=True)
 def _search(
     levels: Pyramid, offsets: Blocks, turns: Array, cells: int, by_cell: float, by_turn: float, blocks: Blocks,
-    bounds: Array, least: float, most: int, shut_k: int, shut_x: float, shut_y: float, shut_cells: float,
-    shut_turns: float,
-) -> tuple[float, int, int, int, float]:  # fmt: skip
-    """Best-first branch and bound: score, turn index, x cells, y cells, and what a pose not evaluated may score.
+    bounds: Array, shut_k: int, shut_x: float, shut_y: float, shut_cells: float, shut_turns: float, enough: float,
+    most: int, state: _State,
+) -> tuple[_State, float, bool]:  # fmt: skip
+    """Best-first branch and bound: the state after it, what a pose not evaluated may score, and whether it is done.
 
-    The turn index is -1 if nothing reached ``least``. The search begins with the sorted ``blocks`` of the coarsest
-    level, and ends early when more than ``most`` below it were evaluated. The block of the greatest bound is next,
+    The turn index is -1 if nothing reached the first ``best``. The search begins with the sorted ``blocks`` of the
+    coarsest level, and pauses when more than ``most`` below it were evaluated. The block of the greatest bound is next,
     whatever its size: depth first, a search that ends early would have seen one corner of a great window, and not the
     place that fits.
-    Poses within ``shut_cells`` and ``shut_turns`` of (shut_x, shut_y, shut_k) do not count.
+    Poses within ``shut_cells`` and ``shut_turns`` of (shut_x, shut_y, shut_k) do not count. One that scores more than
+    ``enough`` ends the search.
     """
-    best, best_k, best_x, best_y = least, -1, 0, 0
-    work, taken = 0, 0
+    best, best_k, best_x, best_y, taken, size, keys, heap = state
+    work, done = 0, False
     # Blocks below the coarsest level wait in a heap.
-    keys, heap, size = np.empty(1024), np.empty((1024, 4), np.int32), 0
     while work <= most:
         if size and (taken == bounds.size or keys[0] >= bounds[taken]):
             bound, block = keys[0], heap[0]
@@ -266,8 +359,10 @@ def _search(
             k, x, y, level = block[0], block[1], block[2], block[3]
             taken += 1
         else:
+            done = True
             break
-        if bound <= best:
+        if bound <= best or best > enough:
+            done = True
             break
         if level == 0:
             near = math.hypot(x - shut_x, y - shut_y) <= shut_cells and abs(k - shut_k) <= shut_turns
@@ -279,7 +374,7 @@ def _search(
             cx, cy = x + (q & 1) * half, y + (q >> 1) * half
             doubt = by_turn * turns[k] ** 2
             doubt += by_cell * (_least_square(cx, half) + _least_square(cy, half))
-            bound = _bound(levels[level - 1], offsets[k], cx, cy) - doubt
+            bound = _bound(levels[level - 1], offsets[k], cx, cy, best + doubt) - doubt
             work += 1
             if bound <= best:
                 continue
@@ -287,10 +382,8 @@ def _search(
                 keys, heap = np.concatenate((keys, np.empty(size))), np.concatenate((heap, np.empty_like(heap)))
             _float(keys, heap, size, bound, k, cx, cy, level - 1)
             size += 1
-    left = 0.0
-    if work > most:
-        left = max(keys[0] if size else 0.0, bounds[taken] if taken < bounds.size else 0.0)
-    return best if best_k >= 0 else 0.0, best_k, best_x, best_y, left
+    left = max(keys[0] if size else 0.0, bounds[taken] if taken < bounds.size else 0.0)
+    return (best, best_k, best_x, best_y, taken, size, keys, heap), left, done
 
 
 @njit(cache=True)

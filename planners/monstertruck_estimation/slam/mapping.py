@@ -151,7 +151,8 @@ class Mapper:
             match = self._matched(scan, delta, noise)
         self._since_key = _moved(*self._since_key, delta, noise)
         if self._submap is not None:
-            led = self._led_over_gap(match, delta, *_moved(self._pose, self._covariance, delta, noise))
+            gap = self._loss.after_gap or self._loss.sparse
+            led = gap and self._led(match, delta, *_moved(self._pose, self._covariance, delta, noise))
             driven = math.hypot(delta[0], delta[1]) / self.config.key_distance
             moved = (driven, self._key_share(delta)) if self._motion.by_wheels(delta) else (0.0, 0.0)
             self._loss.take(match, moved, led=led)
@@ -199,7 +200,7 @@ class Mapper:
             return rejected(guess, covariance, MatchStatus.EMPTY)
         match = self._front.match(scan, delta, guess, covariance, self._submap)
         suspect, after_gap = self._loss.suspects(match, guess, covariance), self._loss.after_gap and match.accepted
-        if self._led_over_gap(match, delta, guess, covariance):
+        if self._loss.after_gap and self._led(match, delta, guess, covariance):
             return match
         most = PART_CONTRADICTION if suspect else CONTRADICTION
         if match.accepted and (off := self._motion.off(between(self._pose, match.pose))):
@@ -213,10 +214,9 @@ class Mapper:
             return rejected(guess, covariance, MatchStatus.UNSURE)
         return match
 
-    def _led_over_gap(self, match: ScanMatch, delta: Array, guess: Array, covariance: Array) -> bool:
-        """Whether ``match`` is where the wheels led over a gap in the scans: ``guess``, of ``covariance``."""
-        found = self._loss.after_gap and match.accepted and self._motion.by_wheels(delta)
-        return found and led_there(match, guess, covariance)
+    def _led(self, match: ScanMatch, delta: Array, guess: Array, covariance: Array) -> bool:
+        """Whether ``match`` is where the wheels led: ``guess``, of ``covariance``."""
+        return match.accepted and self._motion.by_wheels(delta) and led_there(match, guess, covariance)
 
     def finish(self) -> bool:
         """Search for open submaps and remaining loop closures, register all keyframes jointly: seconds of work.

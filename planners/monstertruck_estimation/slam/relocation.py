@@ -82,11 +82,15 @@ class LossDetector:
         return float(off @ np.linalg.solve(covariance, off)) > GATE_LOW_OVERLAP**2
 
     @property
+    def sparse(self) -> bool:
+        """Whether scans come a keyframe's distance apart by wheels that agree with them."""
+        return self._spacing >= 1.0
+
+    @property
     def lost(self) -> bool:
         """Whether scans have not fitted for ``LOST_AFTER``."""
         since = (self._stamp or 0) - self.fitted
-        sparse = self._spacing >= 1.0 and not self.after_gap
-        far = not sparse or self._path >= LOST_PATH
+        far = not self.sparse or self.after_gap or self._path >= LOST_PATH
         return self._misfits >= LOST_SCANS and since >= LOST_AFTER * SECOND and far
 
     def arrive(self, stamp: int) -> None:
@@ -104,12 +108,14 @@ class LossDetector:
             match: the match.
             moved: distance, and motion, since the scan before by wheels that agree with the scans, as multiples of
                 those between keyframes; 0 without such wheels.
-            led: the match is where the wheels led over a gap.
+            led: the match is where the wheels led over a gap, or between sparse scans: it fits, however little of what
+                it sees is known.
         """
-        if led:
-            self._misfits, self.after_gap, self._path = 0, False, 0.0
         self._path += moved[0]
         self._spacing += (moved[1] - self._spacing) * PERIOD_GAIN
+        if led:
+            self.restart()
+            return
         doubt = self._misfits or self.after_gap
         least = max(LOW_OVERLAP, self._usual - OVERLAP_DROP) if doubt else LOW_OVERLAP
         if not match.accepted or match.overlap < least or (self.after_gap and match.degenerate):

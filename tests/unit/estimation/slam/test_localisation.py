@@ -2,11 +2,12 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam import localisation
+from monstertruck_estimation.slam import global_search, localisation
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.localisation import LocalisationEstimator
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch
@@ -17,7 +18,7 @@ from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import LocalisationStatus
 from tests.unit.estimation.slam.kit import LIDAR, ROOM, box, ranges, rounds
-from tests.unit.estimation.slam.test_map_evidence import drawn
+from tests.unit.estimation.slam.test_map_evidence import ORIGIN, drawn
 
 PLACED = {LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE, LocalisationStatus.LOST}
 ACCEPTED = MatchStatus.ACCEPTED
@@ -84,6 +85,25 @@ def test_a_room_that_only_fits_is_outside_the_map(odom: bool):
     assert not PLACED & {estimate.status for estimate in estimates}
     assert estimates[99].status is LocalisationStatus.SEARCHING
     assert estimates[-1].status is LocalisationStatus.OUTSIDE
+
+
+def test_of_twin_rooms_neither_is_taken():
+    east = [((a + 7.0, b), (c + 7.0, d)) for (a, b), (c, d) in ROOM]
+    cells = np.concatenate((drawn().cells[:, 10:150], drawn().cells[:, 10:150]), axis=1)
+    twins = replace(drawn(), cells=cells, origin=(ORIGIN[0] + 0.5, ORIGIN[1]))
+    estimates = followed(SavedMap(twins, None), [*ROOM, *east], rounds(120, laps=1.0))
+    assert not PLACED & {estimate.status for estimate in estimates}
+    assert estimates[-1].status is LocalisationStatus.SEARCHING, "on the map, at one of two places"
+
+
+def test_a_search_that_takes_many_scans_finds_where_the_robot_is_when_it_ends(monkeypatch):
+    """With one piece of a search at each scan."""
+    monkeypatch.setattr(global_search, "SHARE", 1e-3)
+    truth = rounds(160, laps=1.2)
+    estimates = followed(SavedMap(drawn(), None), ROOM, truth)
+    found = next(k for k, estimate in enumerate(estimates) if estimate.status in PLACED)
+    for estimate, pose in zip(estimates[found:], truth[found:], strict=True):
+        assert math.hypot(*(np.array(estimate.pose) - pose)[:2]) < 0.1
 
 
 def test_a_robot_that_stands_still_outside_the_map_is_reported():

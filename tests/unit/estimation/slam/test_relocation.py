@@ -211,6 +211,24 @@ def watched(matches, period=0.1):
     return loss
 
 
+@pytest.mark.parametrize(("off", "mapped"), [(0.0, True), (0.3, False)])
+def test_where_the_wheels_lead_sparse_scans_grow_the_map_into_new_rooms(off, mapped):
+    """Scans of a new room, half a metre apart, overlap what is known by half."""
+    way, rng = rounds(31, 1.0, 3.6, 2.2), np.random.default_rng(3)
+    mapper, known = Mapper(start=tuple(way[0].tolist())), 20
+
+    def match(_scan, _delta, guess, covariance, _submap):
+        overlap = 0.9 if len(mapper.map) < known else 0.5
+        place = guess if overlap > 0.5 else guess + np.array((0.0, off, 0.0))
+        return dataclasses.replace(fit(overlap), pose=place, covariance=np.diag((1e-4, 1e-4, 1e-4)))
+
+    mapper._front = SimpleNamespace(match=match)
+    for k, pose in enumerate(way if mapped else way[: known + 3]):
+        step = mapper.step(scan(HALL, pose, noise=0.01, rng=rng), 2 * (k + 1) * SECOND, pose)
+        assert (MappingEvent.KEY in step.events) is (mapped or k < known)
+    assert not mapper.lost
+
+
 def test_single_misfits_are_no_loss():
     assert watched([fit(0.95), NONE, NONE, fit(0.9)]).fits
     assert not watched([*[fit(0.95)] * 5, *[NONE] * 12]).lost

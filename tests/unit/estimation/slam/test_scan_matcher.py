@@ -3,7 +3,15 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.correlation import LikelihoodGrid, Submap, correlate, merged
+from monstertruck_estimation.slam.correlation import (
+    PIECE,
+    LikelihoodGrid,
+    RivalSearch,
+    Submap,
+    correlate,
+    correlation,
+    merged,
+)
 from monstertruck_estimation.slam.kiss_matcher import KissMatcher
 from monstertruck_estimation.slam.registration import Cloud, Fit, register
 from monstertruck_estimation.slam.scan_matcher import (
@@ -124,6 +132,25 @@ def test_a_search_that_ends_early_has_looked_at_the_most_promising_places_of_the
     assert near is not None
     assert near.rival < near.unseen < near.score
     assert correlate(grid, query, place, (11.0, 0.1), (1e6, 1e6), 0.3, apart=1.0).unseen == 0.0
+
+
+def test_a_search_in_pieces_knows_the_real_rival_and_no_piece_is_long():
+    rng = np.random.default_rng(3)
+    points, place = rng.uniform((-10, -10), (10, 10), (1200, 2)), np.array((6.0, -5.0, 1.0))
+    seen = transform(inverse(place), points)
+    query = seen[np.hypot(*seen.T) < 4.0]
+    grid, window = LikelihoodGrid.of(dots(points), 7), (11.0, math.pi)
+    pieces, costs = correlation(grid, query, np.zeros(3), window, (1e6, 1e6), 0.6, RivalSearch(1.0, 0.85, 0.97)), []
+    while True:
+        try:
+            costs.append(next(pieces))
+        except StopIteration as end:
+            peak = end.value
+            break
+    assert peak.pose == pytest.approx(place, abs=0.05)
+    assert (peak.rival, peak.unseen) == (0.0, 0.0), "no other place scores 0.85 of it"
+    assert len(costs) > 20
+    assert max(costs) <= PIECE
 
 
 def test_a_square_room_is_its_own_rival():
