@@ -155,6 +155,7 @@ FIELDS: dict[t.Topic[Any], dict[str, Any]] = {
     t.SONAR: {"sonars": echoes},
     t.STAND_POSE: {"pose": poses},
     t.IMU: {"angular_velocity": vectors, "linear_acceleration": vectors},
+    t.HAND: {"speed": st.floats(-1, 1), "steer": st.floats(-1, 1), "link_quality": st.none() | st.floats(0, 1)},
     t.STABILISER: {"pitch_joint": joints, "roll_joint": joints},
     t.EVENT: {
         "values": st.dictionaries(
