@@ -38,7 +38,7 @@ def robots_here() -> list[tuple[str, str]]:
 
 
 def only_robot(name: str | None, choice: Callable[[str, str], str]) -> str:
-    """Endpoint where none is named: the default port, unless robots of other ports could be meant.
+    """Endpoint where none is named: the default port, unless several robots, or one of another port, could be meant.
 
     Args:
         name: of the robot; None if it is not named either.
@@ -48,7 +48,8 @@ def only_robot(name: str | None, choice: Callable[[str, str], str]) -> str:
         InputError: several robots could be meant, or none answers at the default port; lists those that answer.
     """
     default = nearest(DEFAULT_ENDPOINT)
-    if set(local_endpoints()) <= {default}:
+    endpoints = local_endpoints()
+    if not endpoints or (name is not None and endpoints == [default]):
         return default
     there = [row for row in robots_here() if name in (None, row[0])]
     rows = ", ".join(choice(robot, public(endpoint)) for robot, endpoint in there)

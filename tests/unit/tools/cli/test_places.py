@@ -100,11 +100,24 @@ def test_robots_of_one_name_are_listed_with_their_endpoints(reached: list, monke
     assert reached == []
 
 
-def test_one_robot_needs_no_name_and_no_question(reached: list, monkeypatch: pytest.MonkeyPatch):
+def test_one_robot_needs_no_name_and_a_named_one_no_question(reached: list, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(robots, "local_endpoints", lambda: [SOCKETS["truck"]])
-    monkeypatch.setattr(robots, "robots_here", lambda: pytest.fail("asked for nothing"))
+    monkeypatch.setattr(robots, "robots_here", lambda: [("truck", SOCKETS["truck"])])
     CliRunner().invoke(app, ["disarm"])
     assert reached == [("truck", SOCKETS["truck"])]
+    monkeypatch.setattr(robots, "robots_here", lambda: pytest.fail("asked for nothing"))
+    CliRunner().invoke(app, ["disarm", "--robot", "truck"])
+    assert reached == 2 * [("truck", SOCKETS["truck"])]
+
+
+def test_several_robots_behind_one_endpoint_are_refused_too(reached: list, monkeypatch: pytest.MonkeyPatch):
+    """It is that of a fleet's router, or of a robot that is connected to one."""
+    monkeypatch.setattr(robots, "local_endpoints", lambda: [SOCKETS["truck"]])
+    monkeypatch.setattr(robots, "robots_here", lambda: [("ann", SOCKETS["truck"]), ("truck", SOCKETS["truck"])])
+    done = CliRunner().invoke(app, ["disarm"])
+    assert done.exit_code == Reason.BAD_INPUT.exit_code
+    assert "2 robots answer on this computer; choose one: --robot ann" in " ".join(done.output.split())
+    assert reached == []
 
 
 @pytest.mark.parametrize("listens", [False, True], ids=["no program", "another program"])
@@ -182,7 +195,7 @@ def test_a_station_that_could_mean_two_robots_is_refused_with_the_list(reached: 
 def test_a_station_shows_the_robot_that_it_names(reached: list, monkeypatch: pytest.MonkeyPatch):
     assert RobotAddress.parse("second") == RobotAddress("second", SOCKETS["second"])
     assert RobotAddress.parse("nobody") == RobotAddress("nobody", SOCKETS["truck"])
-    monkeypatch.setattr(robots, "local_endpoints", lambda: [SOCKETS["truck"]])
+    monkeypatch.setattr(robots, "robots_here", lambda: [("truck", SOCKETS["truck"])])
     assert RobotAddress.default() == RobotAddress("truck", SOCKETS["truck"])
 
 
