@@ -38,6 +38,8 @@ LABELS = {
     "left_out_by": "left out because",
     "odometry": "path by odometry",
     "lost_share": "path lost",
+    "lidar_yaw_off": "lidar yaw off, rad",
+    "lidar_yaw_deviation": "its deviation, rad",
     "path_m": "path, m",
     "standing": "status of scans",
     "odometry_ahead_s": "odometry ahead, s",
@@ -147,6 +149,7 @@ def build(
     from monstertruck_runtime.errors import InputError
     from monstertruck_schemas.reasons import Reason
     from monstertruckd.tools.logs.map_quality import PathQuality
+    from monstertruckd.tools.logs.mount_check import MountCheck
     from monstertruckd.tools.logs.trajectory import LINES, write_trajectory
 
     scans = _read(log, options)
@@ -171,6 +174,11 @@ def build(
         "lost_share": quality.lost_share,
         "lost_poses": int(quality.lost.sum()),
     }
+    mount = MountCheck.of(scans.scans, done.trajectory)
+    if mount is not None:
+        facts |= {"lidar_yaw_off": mount.yaw, "lidar_yaw_deviation": mount.deviation}
+        if mount.fault is not None:
+            remark(f"{log}: {mount.fault}")
     rows, columns = done.whole.cells.shape
     facts["poses"] = "joint registration" if done.joint else "graph"
     facts |= {"map": output, "width_m": columns * done.whole.resolution, "height_m": rows * done.whole.resolution}
