@@ -6,7 +6,8 @@ One argument for each controller, all stopped at once. Without a KIND it is an E
 NODE and BAUD must equal ``driver.node`` and ``port.baud`` of the configuration's drive; left out they are those of the
 controller as delivered. Of a VESC WORDS are ``AMPERES:ERPM:ID,...``: it is braked by that current until all motors are
 slower than ERPM; an empty ID is the controller that is connected. Steppers (quick stop, then coils off) and boards with
-ROSArduinoBridge (voltage off) have no WORDS. Needs nothing but Python's standard library and the codecs installed with
+ROSArduinoBridge (voltage off) have no WORDS, those of a speed controller on a Maestro are ``CHANNEL:QUARTERS`` of its
+neutral pulse. Needs nothing but Python's standard library and the codecs installed with
 it. Exit code 0 once every controller has stopped, 1 if one did not within five seconds, for whatever reason.
 """
 
@@ -27,6 +28,7 @@ sys.path += [str(HERE.parents[1] / "drivers"), str(HERE.parents[2])]  # a checko
 
 from monstertruck_drivers.arduino_bridge import protocol as board
 from monstertruck_drivers.epos.protocol import BAUD, Frame, FrameError, decode_body, stop_frames
+from monstertruck_drivers.maestro import protocol as maestro
 from monstertruck_drivers.steppers import protocol as steppers
 from monstertruck_drivers.vesc import protocol as vesc
 
@@ -71,7 +73,7 @@ def job(argument: str) -> tuple[str, Callable[[], None]]:
     if not colon:
         return port, partial(stop, *drive(argument))
     words, _, baud = rest.partition("@")
-    others = {"vesc": stop_vesc, "steppers": stop_steppers, "arduino_bridge": stop_board}
+    others = {"vesc": stop_vesc, "steppers": stop_steppers, "arduino_bridge": stop_board, "maestro_esc": stop_esc}
     return port, partial(others[kind], port, words, int(baud))
 
 
@@ -204,6 +206,24 @@ def stop_board(port: str, words: str, baud: int) -> None:
                 if board.OK in lines.feed(some(line)):
                     return
     raise NotStoppedError("no answer")
+
+
+def stop_esc(port: str, words: str, baud: int) -> None:
+    """Send the neutral pulse to the speed controller on a Maestro, and read it back.
+
+    Raises:
+        OSError: the port cannot be used.
+        NotStoppedError: the unit is silent, or sends another pulse.
+    """
+    channel, quarters = map(int, words.split(":"))
+    encode = maestro.Encoder()
+    with opened(port, baud) as line:
+        os.write(line, encode.set_target(channel, quarters))
+        time.sleep(AGAIN)
+        os.write(line, encode.get_position(channel))
+        (position,) = maestro.words(receive(line, 2))
+    if position != quarters:
+        raise NotStoppedError(f"the pulse is {position / 4} us")
 
 
 def step_rates(line: int, verb: str) -> list[float]:

@@ -9,12 +9,15 @@ from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
 from monstertruck_drivers.arduino_bridge.driver import ArduinoBridgeDriver
 from monstertruck_drivers.arduino_bridge.emulator import ArduinoBridgeEmulator
 from monstertruck_drivers.epos.firmware import FreeMotor
+from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
+from monstertruck_drivers.maestro.esc_driver import MaestroEscDriver
+from monstertruck_drivers.maestro.esc_emulator import MaestroEscEmulator
 from monstertruck_drivers.vesc.config import VescConfig, VescMotorConfig
 from monstertruck_drivers.vesc.driver import VescDriver
 from monstertruck_drivers.vesc.emulator import VescEmulator
 from monstertruck_runtime.clock import SECOND, VirtualClock
 from monstertruck_runtime.mailbox import Mailbox, latest
-from monstertruck_schemas.cmd import DriveAction, DriveCommand
+from monstertruck_schemas.cmd import DriveAction, DriveCommand, SteeringCommand
 from monstertruck_schemas.sensor import DriveFeedback
 
 NAMES = ("", "_2", "_3", "_4")
@@ -30,6 +33,7 @@ class DriveBench(Bench):
         emulator: makes the emulated controller of two rotors.
         driver: makes the driver from port, events and the ends of its topics.
         rate: that is commanded, rad/s.
+        motors: the controller has.
     """
 
     def __init__(
@@ -38,13 +42,16 @@ class DriveBench(Bench):
         emulator: Callable[[tuple[FreeMotor, ...]], Any],
         driver: Callable[..., Any],
         rate: float,
+        motors: int = 2,
     ) -> None:
-        self.rotors = (FreeMotor(), FreeMotor())
+        self.rotors = tuple(FreeMotor() for _ in range(motors))
+        self.steering: Mailbox[SteeringCommand] = Mailbox(latest(), lambda _: None)
         self.rate = rate
         self.commands: list[Mailbox[DriveCommand]] = [Mailbox(latest(), lambda _: None) for _ in NAMES]
         self.outs: list[Newest[DriveFeedback]] = [Newest() for _ in NAMES]
         ends: dict[str, Any] = {f"commands{n}": box for n, box in zip(NAMES, self.commands, strict=True)}
         ends |= {f"out{n}": out for n, out in zip(NAMES, self.outs, strict=True)}
+        ends["steering_commands"] = self.steering
         super().__init__(clock, emulator(self.rotors), lambda port, events: driver(port, events, ends))
 
     async def command(self) -> None:
@@ -62,6 +69,9 @@ class DriveBench(Bench):
                         motor_velocity=self.rate,
                     )
                 )
+            self.steering.put(
+                SteeringCommand(stamp=now, received=now, seq=0, front=0.0, rear=0.0, front_servo=0.0, rear_servo=0.0)
+            )
             await self.clock.sleep(0.02)
 
     @property
@@ -72,7 +82,9 @@ class DriveBench(Bench):
     def healthy(self) -> bool:
         """Whether both rotors turn as commanded, and that is reported."""
         slow = [abs(r.reading(self.clock.now()).rpm * RPM - self.rate) > 0.05 * self.rate for r in self.rotors]
-        fresh = all(self.clock.now() - out.kept[-1].received < 0.2 * SECOND for out in self.outs[:2] if out.kept)
+        fresh = all(
+            self.clock.now() - out.kept[-1].received < 0.2 * SECOND for out in self.outs[: len(self.rotors)] if out.kept
+        )
         return not any(slow) and fresh
 
 
@@ -104,25 +116,41 @@ async def clock_error(bench: DriveBench) -> float:
         return max(map(abs, errors)) * 1000
 
 
-def row(make: Callable[[VirtualClock], DriveBench], foreign: str) -> dict[str, Any]:
-    """All measurements of one controller."""
+STALLS = ("silent on", "silent off"), ("noise 9", "noise 0")
+
+
+def row(
+    make: Callable[[VirtualClock], DriveBench],
+    foreign: str,
+    stalls: tuple[tuple[str, str], ...] = STALLS,
+    *,
+    measures: bool = True,
+) -> dict[str, Any]:
+    """All measurements of one controller.
+
+    Args:
+        make: makes the bench.
+        foreign: where another implementation is compared.
+        stalls: faults of the emulator, the first of which silences it: how to start and end each.
+        measures: whether it measures its motors at all.
+    """
     stands = [on_bench(make, lambda bench, i=i: stand(bench, i * 0.0037)) for i in range(TRIES)]
 
     async def trouble(bench: DriveBench) -> dict[str, bool]:
         async with running(bench.command(), bench.serve()):
             await bench.clock.sleep(4.0)
-            return await survived(bench, bench.healthy, ("silent on", "silent off"), ("noise 9", "noise 0"))
+            return await survived(bench, bench.healthy, *stalls)
 
     found = on_bench(make, trouble)
 
     async def refused(bench: DriveBench) -> bool:
-        bench.emulator.inject("silent", "on")
+        bench.emulator.inject(*stalls[0][0].split())
         return await stranger_refused(bench)
 
     found["stranger"] = on_bench(make, refused)
     return {
         "stand_ms": round(max(stands), 1),
-        "clock_ms": round(on_bench(make, clock_error), 2),
+        "clock_ms": round(on_bench(make, clock_error), 2) if measures else None,
         "trouble": score(found),
         "foreign": foreign,
     }
@@ -139,7 +167,6 @@ def vesc() -> dict[str, Any]:
                 config,
                 port,
                 clock,
-                steering_commands=none,
                 drive=none,
                 steering=None,
                 battery=None,
@@ -163,6 +190,7 @@ def arduino_bridge() -> dict[str, Any]:
 
     def driver(clock: VirtualClock) -> Callable[..., Any]:
         def make(port: Any, events: Any, ends: dict[str, Any]) -> ArduinoBridgeDriver:
+            ends.pop("steering_commands")
             return ArduinoBridgeDriver(config, port, clock, events=events, **ends)
 
         return make
@@ -176,4 +204,31 @@ def arduino_bridge() -> dict[str, Any]:
     )
 
 
-ROWS = {"vesc": vesc, "arduino_bridge": arduino_bridge}
+def maestro_esc() -> dict[str, Any]:
+    """A speed controller without feedback on a Maestro with a serial time-out of 0.2 s, at 40 rad/s."""
+    config = MaestroEscConfig()
+
+    def make(clock: VirtualClock) -> DriveBench:
+        def driver(port: Any, events: Any, ends: dict[str, Any]) -> MaestroEscDriver:
+            none: Any = Mailbox(latest(), lambda _: None)
+            out: Any = Newest()
+            return MaestroEscDriver(
+                config,
+                port,
+                clock,
+                drive=none,
+                steering=out,
+                battery=None,
+                events=events,
+                **ends,
+            )
+
+        return DriveBench(
+            clock, lambda rotors: MaestroEscEmulator(clock, rotors[0], None, config), driver, 40.0, motors=1
+        )
+
+    stalls = (("mute on", "mute off"), ("mode uart", "mode dual_port"), ("brown_out 0.5", "error 3"))
+    return row(make, "none: its protocol has no client in use here", stalls, measures=False)
+
+
+ROWS = {"maestro_esc": maestro_esc, "vesc": vesc, "arduino_bridge": arduino_bridge}

@@ -408,6 +408,16 @@ DEVICES: Final = DeviceCatalog(
         usb=UsbIdentity("0483:5740", "ChibiOS/RT Virtual COM Port", "ttyACM"),
     ),
     DeviceKind(
+        name="maestro_esc",
+        doc="Radio-control speed controller on a Pololu Maestro that steers as well",
+        roles=(ACTUATORS,),
+        settings="monstertruck_drivers.maestro.esc_config:MaestroEscConfig",
+        implementation="monstertruck_drivers.maestro.esc_driver:MaestroEscDriver",
+        emulator="monstertruck_drivers.maestro.esc_emulator:emulated",
+        probe="monstertruck_drivers.maestro.probe:probe_esc",
+        usb=UsbIdentity("1ffb:0089", "Pololu Micro Maestro 6-Servo Controller", "ttyACM"),
+    ),
+    DeviceKind(
         name="maestro",
         doc="Pololu Micro Maestro 6 servo controller with battery input",
         roles=(STEERING,),

@@ -13,6 +13,7 @@ from monstertruck_drivers.config import Devices, Monitors
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
 from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
 from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_drivers.vesc.config import VescConfig
@@ -79,6 +80,7 @@ UNATTENDED: Final[dict[type[Schema], tuple[str, ...]]] = {
     ArduinoBridgeConfig: ("command_timeout", "auto_stop"),
     VescConfig: ("command_timeout", "watchdog"),
     MaestroConfig: ("command_timeout",),
+    MaestroEscConfig: ("command_timeout",),
 }
 """Times in which the truck drives on whatever happens."""
 
@@ -132,6 +134,8 @@ def weakened_devices(devices: Devices, monitors: Monitors) -> Iterator[str]:
             yield from _weaker(place, driver, type(driver)())
         if isinstance(driver, StepperConfig):
             yield f"{place}: steppers report the steps commanded: a wheel that is held or slips is not noticed"
+        if isinstance(driver, MaestroEscConfig):
+            yield f"{place}: nothing measures the motor: a wheel that is held, slips or rolls on is not noticed"
         if isinstance(driver, ArduinoBridgeConfig):
             yield f"{place}: its lines have no sum: a damaged command runs the motors until the next one"
         if isinstance(driver, MaestroConfig):

@@ -75,6 +75,46 @@ def test_it_drives_its_bend_without_a_compass(tmp_path: Path, imu: str, gate: st
     run_virtual(main, start=SECOND)
 
 
+ESC_CAR = """\
+include: {robots}/ackermann.yaml
+version: 2
+geometry: {{ drive_ratio: 12.0 }}
+devices:
+  drive: null
+  steering: null
+  compass: null
+  actuators:
+    driver:
+      kind: maestro_esc
+      esc: {{ channel: 2, max_rate: 60.0, deceleration: 400.0, quick_deceleration: 500.0 }}
+      unit: {{ dead_time: 0.012, lag: 0.0 }}
+gate: {{ attitude: {{ stale_after: 0.25, critical: false }} }}
+sim:
+  world:
+    truck:
+      motor: {{ ratio: 12.0, inverted: false, coast_rpm_s: 500.0, drivetrain_lag: 0.03, torque_constant: 0.05 }}
+"""
+
+
+def test_a_car_with_a_speed_controller_without_feedback_drives_its_bend(tmp_path: Path):
+    file = tmp_path / "car.yaml"
+    file.write_text(ESC_CAR.format(robots=ROBOTS))
+    config = load_config(file, SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
+    assert any("nothing measures the motor" in text for text in config.weakened())
+
+    async def main(clock: VirtualClock) -> None:
+        rig = VirtualRig(config, clock)
+        async with rig.running():
+            lap = await drive_lap(LocalOperator(rig.daemon, clock), clock, limit=40)
+            await clock.sleep(0.5)
+        assert lap.outcome is Reason.GOAL_REACHED
+        truth = rig.truth.array()
+        assert not truth[:, 5].any()
+        assert math.dist(truth[-1, 1:3], (2.4, 4.15)) < 0.1
+
+    run_virtual(main, start=SECOND)
+
+
 def test_unplugged_in_full_drive_it_stands_by_its_own_watchdog(tmp_path: Path):
     config = car(tmp_path)
 

@@ -102,7 +102,7 @@ class MaestroDriver:
                 await self._serve(session)
             finally:
                 with contextlib.suppress(DeviceLostError):
-                    session.send(*self._line(session, high=False))
+                    session.send(*self._line(session, high=False), *self._more(session, rest=True))
 
     async def _serve(self, session: MaestroSession) -> None:
         schedule = Schedule(self._clock, self._config.poll_rate, POLLING)
@@ -122,7 +122,8 @@ class MaestroDriver:
         def pass_on(command: SteeringCommand) -> bool:
             if self._is_fresh(command):
                 self._command = self._fresh = command
-                session.send(*self._targets(session, command), *self._line(session, high=command.deadman))
+                line = self._line(session, high=command.deadman)
+                session.send(*self._targets(session, command), *line, *self._more(session))
             return True
 
         while (waiting := await self._commands.next_within((until - self._clock.now()) / SECOND, pass_on)) is not None:
@@ -135,7 +136,7 @@ class MaestroDriver:
         """Release the deadman when commands stop."""
         if self._fresh is not None and not self._is_fresh(self._fresh):
             self._fresh = None
-            session.send(*self._line(session, high=False))
+            session.send(*self._line(session, high=False), *self._more(session, rest=True))
             text = f"no steering command for {self._config.command_timeout} s: servos hold"
             self._events(Reason.TICK_STALLED, Severity.WARNING, self.name, text)
 
@@ -148,6 +149,14 @@ class MaestroDriver:
         # 4000: targets of a digital output, quarter microseconds: on either side of the device's threshold
         return [] if channel is None else [session.encode.set_target(channel, LINE_HIGH if high else 4000)]
 
+    def _more(self, session: MaestroSession, *, rest: bool = False) -> list[bytes]:
+        """Commands to what else hangs on the unit; ``rest`` brings it to rest."""
+        del session, rest
+        return []
+
+    def _polled(self, stamp: int, received: int) -> None:
+        """Publish what else is known after a poll."""
+
     def _restore(self, session: MaestroSession) -> None:
         """Send everything a Maestro forgets at power-up or loses by an error."""
         packets: list[bytes] = []
@@ -157,7 +166,7 @@ class MaestroDriver:
         if self._command is not None:
             packets += self._targets(session, self._command)
         alive = self._fresh is not None and self._fresh.deadman
-        session.send(*packets, *self._line(session, high=alive))
+        session.send(*packets, *self._line(session, high=alive), *self._more(session, rest=not alive))
 
     async def _poll(self, session: MaestroSession, battery: "BatteryInput | None") -> None:
         config = self._config
@@ -175,6 +184,7 @@ class MaestroDriver:
         received = self._clock.now()
         stamp = (asked + received) // 2
         self._report(session, stamp, received, positions, errors)
+        self._polled(stamp, received)
         if battery is not None:
             battery.take(stamp, received, positions[-1])
 

@@ -2,6 +2,7 @@
 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
 from monstertruck_drivers.maestro.protocol import CHANNELS, Encoder, error_names
 from monstertruck_drivers.maestro.session import MaestroSession
 from monstertruck_runtime.clock import Clock
@@ -35,3 +36,8 @@ async def probe(port: Port, clock: Clock, settings: MaestroConfig | None = None)
             for channel, word in enumerate(positions)
         ],
     }
+
+
+async def probe_esc(port: Port, clock: Clock, settings: MaestroEscConfig | None = None) -> dict[str, object]:
+    """Identify the Maestro that a speed controller hangs on; see ``probe``."""
+    return await probe(port, clock, None if settings is None else settings.unit)

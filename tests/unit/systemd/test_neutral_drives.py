@@ -11,6 +11,8 @@ import pytest
 from monstertruck_drivers.arduino_bridge.emulator import ArduinoBridgeEmulator
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.epos.firmware import FreeMotor
+from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
+from monstertruck_drivers.maestro.esc_emulator import MaestroEscEmulator
 from monstertruck_drivers.steppers.emulator import StepperEmulator
 from monstertruck_drivers.vesc.config import VescConfig, VescMotorConfig
 from monstertruck_drivers.vesc.emulator import VescEmulator
@@ -66,6 +68,16 @@ async def test_a_board_that_restarts_when_its_port_is_opened_is_waited_for(tmp_p
         done = await neutral(f"{tmp_path / 'board'}=arduino_bridge:@57600")
     assert done.returncode == 0, done.stderr
     assert rotors[0].reading(clock.now()).rpm == 0.0
+
+
+async def test_a_speed_controller_on_a_maestro_gets_its_neutral_pulse(tmp_path):
+    clock, config, rotor = WallClock(), MaestroEscConfig(), FreeMotor()
+    unit = MaestroEscEmulator(clock, rotor, None, config)
+    async with plugged_in(unit, tmp_path / "unit"):
+        unit.inject("pulse", str(config.esc.channel), "1700")
+        done = await neutral(f"{tmp_path / 'unit'}=maestro_esc:{config.stop_words}@115200")
+        assert unit.pulse_us(config.esc.channel, clock.now()) == config.esc.neutral_us
+    assert done.returncode == 0, done.stderr
 
 
 async def test_a_motor_that_disobeys_and_a_silent_controller_are_reported(tmp_path):
