@@ -156,11 +156,14 @@ class ShaftWatch:
         self.bounds = ShaftBounds()
         self.moves = False
         """Whether velocity or position show motion, by the newest feedback."""
+        self.still_since: int | None = None
+        """Since which feedback neither shows motion, ns."""
         self.driven = False
         """Whether the newest feedback shows a motor that may turn the shaft."""
         self._name = name
         self._before: DriveFeedback | None = None
-        self._measures_current = False
+        self.measures_current = False
+        """Whether its current shows that the motor may turn the shaft."""
         self._current: float | None = None
         """Newest current in the present mode, A."""
         self._rested = False
@@ -194,11 +197,11 @@ class ShaftWatch:
         driven = self.driven = self._is_driven(feedback, config)
         if before is None or feedback.stamp <= before.stamp:
             self._begin(velocity)
-            self.moves = abs(velocity) >= standstill
+            self._note_motion(feedback, moves=abs(velocity) >= standstill)
             return None
         dt = (feedback.stamp - before.stamp) / SECOND
         step = (feedback.position - before.position) * metres
-        self.moves = max(abs(velocity), abs(step) / dt) >= standstill
+        self._note_motion(feedback, moves=max(abs(velocity), abs(step) / dt) >= standstill)
         if not driven:
             self._begin(velocity)
             return None
@@ -216,19 +219,26 @@ class ShaftWatch:
             config: limits.
             fresh: the drive is heard.
         """
-        if not fresh or not self._measures_current:
+        if not fresh or not self.measures_current:
             return self._before is not None and self._before.mode in POWERED
         return self._current is not None and abs(self._current) > config.idle_current
+
+    def _note_motion(self, feedback: DriveFeedback, *, moves: bool) -> None:
+        self.moves = moves
+        if moves:
+            self.still_since = None
+        elif self.still_since is None:
+            self.still_since = feedback.stamp
 
     def _take_current(self, feedback: DriveFeedback, before: DriveFeedback | None) -> None:
         if before is None or before.mode is not feedback.mode:
             self._current = None
         if feedback.current is not None:
-            self._measures_current, self._current = True, feedback.current
+            self.measures_current, self._current = True, feedback.current
 
     def _is_driven(self, feedback: DriveFeedback, config: RunawayConfig) -> bool:
         """Whether the motor may turn the shaft; a current that is not measured yet in this mode does not show it."""
-        if feedback.mode in POWERED or not self._measures_current:
+        if feedback.mode in POWERED or not self.measures_current:
             return True
         return self._current is not None and abs(self._current) > config.idle_current
 
@@ -303,12 +313,13 @@ class BodyWatch:
             driven: a motor may be what moves the robot.
         """
         before, self._stamp = self._stamp, stamp
-        self.runs = driven and abs(speed) >= standstill
-        if before is None or not standing or not self.runs:
+        moves = abs(speed) >= standstill
+        self.runs = driven and moves
+        if before is None or not standing or not moves:
             self._travel = 0.0
             return None
-        self._travel += abs(speed) * (stamp - before) / SECOND
-        if self._travel <= config.body_distance:
+        self._travel += abs(speed) * (stamp - before) / SECOND  # a current may be measured later than the motion
+        if not driven or self._travel <= config.body_distance:
             return None
         self._travel = 0.0
         return Runaway(RunawayKind.BODY_MOVES, self._source, speed, 0.0, 0.0)
@@ -316,7 +327,7 @@ class BodyWatch:
     def observe_window(
         self, since: int, stamp: int, moved: float, config: RunawayConfig, *, stood: int, now: int, driven: bool
     ) -> Runaway | None:
-        """Take the motion over a time that follows the one before; returns what nobody commanded.
+        """Take a proven motion over a time that follows the one before; returns what nobody commanded.
 
         A motion that is published again is passed over.
 
@@ -336,7 +347,7 @@ class BodyWatch:
         if not goes_on or not driven:
             self._travel = 0.0
         self._travel += speed * max(0, stamp - max(since, stood)) / SECOND
-        if not driven or self._travel + speed * (now - max(stamp, stood)) / SECOND <= config.body_distance:
+        if not driven or self._travel + speed * (now - max(stamp, stood)) / SECOND <= config.distance:
             return None
         self._travel = 0.0
         return Runaway(RunawayKind.BODY_MOVES, self._source, speed, 0.0, 0.0)
@@ -382,6 +393,8 @@ class RunawayCheck(Check):
         self._scans = BodyWatch(DeviceRole.LIDAR.value, SCAN.fresh_for())
         self._bodies = self._wheels, self._gyro, self._scans
         self._encoders: WheelEncoders | None = None
+        self._unjudged: UnshownMotion | None = None
+        """Proven motion of the body, until a current shows whether a motor makes it."""
         self._strays = 0
         """Of the joints of the lidar's mount, as they count them."""
         self._commanded = 0
@@ -390,6 +403,8 @@ class RunawayCheck(Check):
         """Since when every command has been a quick stop, ns."""
         self._step = Escalation.NONE
         self._found: Runaway | None = None
+        self._found_at = 0
+        """When it was found, ns."""
         self._count = 0
 
     # What it sees
@@ -428,6 +443,8 @@ class RunawayCheck(Check):
         metres = self.view.chassis.drivetrain.distance(1.0)
         found = watch.observe(feedback, metres, self._config, limits.reaction, limits.deceleration, limits.standstill)
         self._take(found, feedback.received)
+        if self._unjudged is not None:
+            self._take_unshown(self._unjudged, feedback.received)
 
     def _take_encoders(self, encoders: WheelEncoders) -> None:
         before, self._encoders = self._encoders, encoders
@@ -443,17 +460,38 @@ class RunawayCheck(Check):
         limits = self.view.config
         return self._commanded + round((limits.reaction + limits.speed / limits.deceleration) * SECOND)
 
+    @property
+    def _stood(self) -> int:
+        """Since when the robot is to stand: all drives have had the time to obey, or read standstill already, ns.
+
+        Drives without a measured current must have had the time: their motors may be what scans with late stamps show.
+        """
+        still = [watch.still_since for watch in self._shafts if watch.measures_current]
+        known = [since for since in still if since is not None]
+        return max(self._commanded, *known) if len(known) == len(self._shafts) else self._obeyed
+
     def _take_body(self, watch: BodyWatch, seen: Message, speed: float) -> None:
         standstill, now = self.view.config.standstill, seen.received
         found = watch.observe(
-            seen.stamp, speed, self._config, standstill, standing=now > self._obeyed, driven=self._pulled(now)
+            seen.stamp, speed, self._config, standstill, standing=now > self._stood, driven=self._pulled(now)
         )
         self._take(found, now)
 
     def _take_unshown(self, motion: UnshownMotion, now: int) -> None:
+        driven = self._pulled(now)
+        # Currents are read less often than velocities: one that is read soon may show that a motor made the motion.
+        self._unjudged = None if driven or now - motion.stamp > SCAN.fresh_for() * SECOND else motion
+        if self._unjudged is not None:
+            return
         moved = max(motion.distance, abs(motion.turn) * self.view.footprint.half_width)
         found = self._scans.observe_window(
-            motion.since, motion.stamp, moved, self._config, stood=self._obeyed, now=now, driven=self._pulled(now)
+            motion.since,
+            motion.stamp,
+            moved,
+            self._config,
+            stood=max(self._stood, self._found_at),
+            now=now,
+            driven=driven,
         )
         self._take(found, now)
 
@@ -476,7 +514,7 @@ class RunawayCheck(Check):
     def _take(self, found: Runaway | None, now: int) -> None:
         if found is None or self._step is Escalation.PORT_OFF:
             return
-        self._found = found
+        self._found, self._found_at = found, now
         self._count += 1
         stopped = now - self._halted > self.view.config.reaction * SECOND
         # A drive that reads standstill while the body moves cannot confirm a quick stop either.

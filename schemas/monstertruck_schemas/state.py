@@ -148,11 +148,13 @@ class DoubtKind(StrEnum):
     """Its content is older than its stamps."""
     REPEATS = "repeats"
     """It repeats its values to the digit."""
+    SCALE = "scale"
+    """All its values have changed by one factor."""
 
     @property
     def lasting(self) -> bool:
         """Whether it lasts until the robot is armed again: a robot that stands shows nothing about motion."""
-        return self is not DoubtKind.REPEATS
+        return self in {DoubtKind.MOTION, DoubtKind.DELAY}
 
 
 class Doubt(Schema):
@@ -168,7 +170,7 @@ class Doubt(Schema):
     against: str | None = None
     """Role of the other device."""
     difference: float = 0.0
-    """m, rad, s or number of equal values."""
+    """m, rad, s, number of equal values or fraction of the values."""
     limit: float = 0.0
     """Tolerated difference, in the same unit."""
 

@@ -31,6 +31,15 @@ def test_measures_of_a_wrong_scale(case):
     assert outcome.reason == Reason.SENSORS_DISAGREE
 
 
+@pytest.mark.parametrize("case", ["doubled", "halved"])
+@pytest.mark.parametrize("seed", [0, 1], ids=["at rest", "while it drives"])
+def test_a_scale_that_changes_is_noticed_by_the_next_revolution(case, seed):
+    outcome = trial(CASES[case], "rooms", seed)
+    assert not outcome.contact
+    assert outcome.reason == Reason.SENSORS_DISAGREE
+    assert outcome.driven <= 0.05
+
+
 def test_a_frozen_compass():
     outcome = trial(CASES["compass"], "loop", 1)
     assert outcome.noticed is not None

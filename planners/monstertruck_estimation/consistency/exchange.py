@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
-from monstertruck_estimation.consistency.delay import Delay, LagQuestion
+from monstertruck_estimation.consistency.delay import SIGMAS, Delay, LagQuestion
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.se2 import Pose2
 
@@ -34,7 +34,7 @@ class StepInput:
     claim: Claim | None = None
     lag: LagQuestion | None = None
     rest: Claim | None = None
-    """That the robot stands."""
+    """That the robot stands, as far as its wheels do."""
 
 
 REFUTING: Final = 12
@@ -66,6 +66,21 @@ class ScanVerdict:
 
 
 @dataclass(frozen=True, slots=True)
+class RestEvidence:
+    """Motion of the body that its wheels do not show."""
+
+    motion: Pose2 = (0.0, 0.0, 0.0)
+    """Base at the newest scan, in base where the claim puts it, m and rad."""
+    sigmas: float = 0.0
+    """How improbable it is of a robot at rest, as standard deviations of a normal distribution."""
+
+    @property
+    def proven(self) -> bool:
+        """Whether chance does not explain it."""
+        return self.sigmas >= SIGMAS
+
+
+@dataclass(frozen=True, slots=True)
 class StepOutput:
     """Result of one scan."""
 
@@ -84,8 +99,10 @@ class StepOutput:
     """Share of the points that fit the scan before."""
     verdict: ScanVerdict | None = None
     """Of the claim; None without one, and where the earlier scan is not known any more."""
-    rest: ScanVerdict | None = None
-    """Of the claim that the robot stands, likewise."""
+    rest: RestEvidence | None = None
+    """Against the claim that the robot stands, likewise."""
+    scale: float | None = None
+    """Factor by which all ranges are longer than shortly before, where no motion explains them."""
     front: str = ""
     """Scan odometry that is used."""
     delay: Delay | None = None

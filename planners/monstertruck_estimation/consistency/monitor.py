@@ -3,7 +3,7 @@
 Motions are compared at every scan, over windows of half a second to some seconds; without a lidar at every reading of
 the wheels. A difference must last for two comparisons, and where the scans take part in it, they must refute the other
 motion: see ``ScanVerdict``. A finding about motion lasts until the robot is armed again, for a robot that stands shows
-nothing; one about a repeated value ends with the repetition.
+nothing; one about a repeated value ends with the repetition, one about a changed scale when it has changed back.
 """
 
 import math
@@ -102,10 +102,15 @@ class ConsistencyMonitor:
         self._active_since: int | None = None
         self._doubted: frozenset[Measure] = frozenset()
         """At the comparison before."""
-        self._resting = RestWatch(self._tracks[Measure.SCANS]) if Measure.SCANS in sensors else None
+        self._resting: RestWatch | None = None
+        if {Measure.WHEELS, Measure.SCANS} <= sensors.keys():
+            self._resting = RestWatch(self._tracks[Measure.WHEELS], config.slip)
         self._pending: _OpenDisagreement | None = None
         self._asked = 0
         self._found: dict[str, Doubt] = {}
+        self._scale = 1.0
+        """Factor by which the lidar's ranges are longer than at first."""
+        self._scaled: Doubt | None = None
         self._values: dict[str, dict[str, RepeatDetector]] = {}
         self._wholes: dict[str, WholeRepeats] = {}
         self._whole_moved: dict[str, int] = {}
@@ -171,6 +176,10 @@ class ConsistencyMonitor:
         before = self._sampled.get(Measure.SCANS, output.stamp)
         self._intervals.append((output.stamp - before) / SECOND)
         self._sampled[Measure.SCANS] = output.stamp
+        if output.scale is not None:
+            self._take_scale(output.stamp, output.scale)
+        elif output.stamp - before > IN_USE:
+            self._scale, self._scaled = 1.0, None  # a lidar that was restarted
         track = self._tracks[Measure.SCANS]
         if output.since is None:
             track.begin(output.stamp)
@@ -186,7 +195,7 @@ class ConsistencyMonitor:
                 self._steps.popleft()
         self._scans.append(output.stamp)
         if self._resting is not None:
-            self._resting.observe(output, still=self.still(output.stamp))
+            self._resting.observe(output)
         if output.verdict is not None and self._pending is not None:
             if output.verdict.refuted:
                 self._accuse(output.stamp, self._pending.found)
@@ -233,9 +242,9 @@ class ConsistencyMonitor:
         ways = self._errors[pending.claimant].way is not None
         return Claim(pending.since, motion[:2] if ways else None, motion[2], pending.errors)
 
-    def rest_claim(self) -> Claim | None:
-        """That the robot stands as its wheels do, where the scans are to judge it."""
-        return None if self._resting is None else self._resting.claim()
+    def rest_claim(self, stamp: int) -> Claim | None:
+        """That the robot stands as its wheels do, up to the next scan, at ``stamp`` (ns)."""
+        return None if self._resting is None else self._resting.claim(stamp)
 
     @property
     def unshown(self) -> UnshownMotion | None:
@@ -244,7 +253,8 @@ class ConsistencyMonitor:
 
     def findings(self) -> tuple[Doubt, ...]:
         """What is wrong at present."""
-        return (*self._found.values(), *self._frozen.values())
+        scaled = () if self._scaled is None else (self._scaled,)
+        return (*self._found.values(), *scaled, *self._frozen.values())
 
     def in_use(self, now: int) -> tuple[Measure, ...]:
         """Measures with samples of late."""
@@ -384,6 +394,23 @@ class ConsistencyMonitor:
                 limit=self._config.delay,
             ),
         )
+
+    def _take_scale(self, stamp: int, factor: float) -> None:
+        """Note a change of all ranges by one factor; it ends when the ranges have changed back."""
+        errors = self._errors[Measure.SCANS].way
+        tolerated = 0.0 if errors is None else errors[0]
+        self._scale *= factor
+        self._scaled = None
+        if abs(self._scale - 1.0) > tolerated:
+            text = f"its ranges became {self._scale:.2f} times as long from one revolution to the next"
+            self._scaled = Doubt(
+                sensor=self._sensors[Measure.SCANS],
+                kind=DoubtKind.SCALE,
+                since=stamp,
+                text=text,
+                difference=abs(self._scale - 1.0),
+                limit=tolerated,
+            )
 
     def _accuse(self, stamp: int, found: dict[Measure, Disagreement]) -> None:
         for measure, difference in found.items():

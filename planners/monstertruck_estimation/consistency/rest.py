@@ -1,8 +1,6 @@
 """Detects motion of the body by scans while the wheels show standstill.
 
-The newest scan is compared with the first one since the wheels stopped, or one ``OVER`` earlier. Scan odometry alone
-proves nothing where people walk by: the claim that the body stands must leave points unexplained that its motion
-explains, see ``ScanVerdict``.
+The newest scan is compared with the first one since the wheels stopped, or one ``OVER`` earlier.
 """
 
 import math
@@ -16,31 +14,29 @@ from monstertruck_schemas.state import UnshownMotion
 
 OVER: Final = 4 * SECOND
 """Maximum time between the two scans that are compared, ns."""
-ASKED: Final = 2.0
-"""Motion beyond this many standard deviations of the registration is judged by points."""
 
 
 class RestWatch:
     """Compares the newest scan with an earlier one since the wheels stopped.
 
     Args:
-        track: motion by the scans.
+        wheels: motion that the wheels show.
+        slip: tolerated share of it by which the body moves otherwise.
     """
 
-    def __init__(self, track: MotionTrack) -> None:
-        self._track = track
+    def __init__(self, wheels: MotionTrack, slip: float) -> None:
+        self._wheels, self._slip = wheels, slip
         self._rest: deque[int] = deque()
         """Stamps of the scans since the wheels stopped, ns."""
-        self._deviations = 1.0, 1.0
-        self._asked: int | None = None
-        """Stamp of the earlier scan of the open claim, ns."""
+        self._asked: Claim | None = None
         self.motion: UnshownMotion | None = None
         """Motion of the body that the newest scan proves, or None."""
 
-    def observe(self, output: StepOutput, *, still: bool) -> None:
-        """Take the motion between two scans, and what the points say of the claim; ``still``: the wheels stand."""
+    def observe(self, output: StepOutput) -> None:
+        """Take the newest scan, and its evidence against the claim."""
         asked, self._asked = self._asked, None
         self.motion = None
+        still = self._wheels.rests(output.stamp)
         if not still or output.since is None:
             self._rest.clear()
         if not still:
@@ -48,22 +44,17 @@ class RestWatch:
         self._rest.append(output.stamp)
         while output.stamp - self._rest[0] > OVER:
             self._rest.popleft()
-        self._deviations = output.errors
-        if asked is None or output.rest is None or not output.rest.refuted:
+        if asked is None or asked.way is None or output.rest is None or not output.rest.proven:
             return
-        motion = self._track.motion(asked, output.stamp)
-        if motion is not None:
-            distance = math.hypot(motion[0], motion[1])
-            self.motion = UnshownMotion(since=asked, stamp=output.stamp, distance=distance, turn=motion[2])
-            self._rest = deque([output.stamp])  # what is proven next is new motion
+        x, y, turn = output.rest.motion
+        distance = max(0.0, math.hypot(x, y) - self._slip * math.hypot(*asked.way))
+        self.motion = UnshownMotion(since=asked.since, stamp=output.stamp, distance=distance, turn=turn)
+        self._rest = deque([output.stamp])  # what is proven next is new motion
 
-    def claim(self) -> Claim | None:
-        """Return the claim that the body stands, if scan odometry shows otherwise."""
-        motion = self._track.motion(self._rest[0], self._rest[-1]) if len(self._rest) > 1 else None
-        if motion is None:
+    def claim(self, stamp: int) -> Claim | None:
+        """Return the claim that the body moves no more than its wheels up to a scan at ``stamp``, ns."""
+        if not self._rest or not self._wheels.rests(stamp):
             return None
-        least = [ASKED * deviation for deviation in self._deviations]
-        if math.hypot(motion[0], motion[1]) <= least[0] and abs(motion[2]) <= least[1]:
-            return None
-        self._asked = self._rest[0]
-        return Claim(self._asked, (0.0, 0.0), 0.0, (0.0, 0.0))
+        motion = self._wheels.motion(self._rest[0], stamp)
+        self._asked = None if motion is None else Claim(self._rest[0], motion[:2], motion[2], (0.0, 0.0))
+        return self._asked

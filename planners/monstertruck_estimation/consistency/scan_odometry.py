@@ -15,7 +15,9 @@ from typing import Final
 import numpy as np
 
 from monstertruck_estimation.consistency.delay import scan_delay
-from monstertruck_estimation.consistency.exchange import Claim, ScanVerdict, StepInput, StepOutput
+from monstertruck_estimation.consistency.exchange import Claim, RestEvidence, ScanVerdict, StepInput, StepOutput
+from monstertruck_estimation.consistency.rest_proof import rest_evidence
+from monstertruck_estimation.consistency.scale import Revolution, scale_change
 from monstertruck_estimation.consistency.tracks import KEPT
 from monstertruck_estimation.slam.registration import Cloud, Fit, fitting, measure, register
 from monstertruck_estimation.slam.scans import Scan, prepare_input
@@ -90,6 +92,8 @@ class ScanMotionStep:
         self._changes: deque[tuple[float, float]] = deque(maxlen=SCATTERED)
         """From one motion to the next, m^2 and rad^2."""
         self._last: tuple[int, Cloud] | None = None
+        self._fitting: tuple[int, Revolution] | None = None
+        """Newest revolution that fitted the one before, with its stamp: the scale is compared with it."""
         self._reference: tuple[Cloud, Array] | None = None
         """The scan that others are registered to, and its pose."""
         self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=REMEMBERED)
@@ -123,13 +127,16 @@ class ScanMotionStep:
             found = self._found(front, scan, whole, last[1], lasting)
         cloud = Cloud.of(whole)
         self._last = stamp, cloud
+        factor = self._scale_change(
+            inputs, whole, [lasting if found is None else found[0], np.zeros(3)], found is not None
+        )
         if found is None or last is None:
             self._begin(front, scan, self._pose)
             self._motions.clear()
             self._changes.clear()
             self._kept.clear()
             self._kept.append((stamp, whole, self._pose))
-            return StepOutput(stamp, None, front=name)
+            return StepOutput(stamp, None, scale=factor, front=name)
         motion, overlap, deviations = found
         self._pose = compose(self._pose, motion)
         self._keep(front, scan)
@@ -140,10 +147,20 @@ class ScanMotionStep:
         self._kept.append((stamp, whole, self._pose))
         while stamp - self._kept[0][0] > KEPT:
             self._kept.popleft()
-        verdict, rest = (self._judged(whole, claim) for claim in (inputs.claim, inputs.rest))
+        verdict, rest = self._judged(whole, inputs.claim), self._evidence(whole, inputs)
         x, y, yaw = motion.tolist()
         scatter = scatter_of(self._changes)
-        return StepOutput(stamp, last[0], (x, y, yaw), deviations, scatter, overlap, verdict, rest, name)
+        return StepOutput(stamp, last[0], (x, y, yaw), deviations, scatter, overlap, verdict, rest, factor, name)
+
+    def _scale_change(self, inputs: StepInput, whole: Scan, motions: list[Array], fits: bool) -> float | None:
+        stamp, known = inputs.scan.stamp, None if inputs.anew else self._fitting
+        if known is not None and not 0.0 < (stamp - known[0]) / SECOND < GAP:
+            known = None
+        newest = Revolution(inputs.scan.ranges, whole, inputs.scan.mount[:2])
+        factor = None if known is None else scale_change(newest, known[1], motions)
+        if fits or known is None or factor is not None:
+            self._fitting = stamp, newest
+        return factor
 
     def _begin(self, front: KissFront | None, scan: Scan, pose: Array) -> None:
         self._reference = Cloud.of(scan), pose
@@ -185,11 +202,18 @@ class ScanMotionStep:
         self._begin(front, scan, compose(self._pose, best.pose))
         return best.pose, best.overlap, deviations_of(best)
 
-    def _judged(self, scan: Scan, claim: Claim | None) -> ScanVerdict | None:
-        if claim is None:
+    def _since(self, claim: Claim | None) -> tuple[int, Scan, Array] | None:
+        return None if claim is None else next((kept for kept in self._kept if kept[0] == claim.since), None)
+
+    def _evidence(self, scan: Scan, inputs: StepInput) -> RestEvidence | None:
+        claim, earlier = inputs.rest, self._since(inputs.rest)
+        if claim is None or earlier is None:
             return None
-        earlier = next((kept for kept in self._kept if kept[0] == claim.since), None)
-        if earlier is None:
+        return rest_evidence(scan, earlier[1], between(earlier[2], self._pose), claim, inputs.scan.mount[:2])
+
+    def _judged(self, scan: Scan, claim: Claim | None) -> ScanVerdict | None:
+        earlier = self._since(claim)
+        if claim is None or earlier is None:
             return None
         cloud = Cloud.of(earlier[1])
         own = between(earlier[2], self._pose)

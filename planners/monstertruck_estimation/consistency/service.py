@@ -251,7 +251,8 @@ class ConsistencyService:
         monitor = self.monitor
         if anew:
             return StepInput(inputs, front, anew=True)
-        return StepInput(inputs, front, claim=monitor.claim(scan.stamp), lag=monitor.lag(), rest=monitor.rest_claim())
+        claim, rest = monitor.claim(scan.stamp), monitor.rest_claim(scan.stamp)
+        return StepInput(inputs, front, claim=claim, lag=monitor.lag(), rest=rest)
 
     # What follows
 

@@ -94,6 +94,15 @@ class MotionTrack:
         seconds = (at - since) / SECOND
         return (motion[0] ** 2 + motion[1] ** 2) ** 0.5 / seconds, abs(motion[2]) / seconds
 
+    def rests(self, at: int) -> bool:
+        """Whether the samples on both sides of the instant ``at``, ns, or the newest two, show no motion."""
+        if len(self._stamps) < 2 or not self.covers(at, at):
+            return False
+        after = min(max(bisect_left(self._stamps, at), 1), len(self._stamps) - 1)
+        seconds = (self._stamps[after] - self._stamps[after - 1]) / SECOND
+        x, y, turn = between(self._poses[after - 1], self._poses[after])
+        return (x**2 + y**2) ** 0.5 < STILL[0] * seconds and abs(turn) < STILL[1] * seconds
+
     def _at(self, stamp: int) -> Pose2:
         stamps, poses = self._stamps, self._poses
         after = min(max(bisect_left(stamps, stamp), 1), len(stamps) - 1)

@@ -51,7 +51,7 @@ DELIVERED = {
         "open_ground": False,
     },
     "contact": {"current": 0.15, "rolling": 0.25, "share": 0.3, "within": 0.15, "back_off": 0.03},
-    "runaway": {"distance": 0.01, "body_distance": 0.05, "idle_current": 0.05},
+    "runaway": {"distance": 0.01, "body_distance": 0.03, "idle_current": 0.05},
     "sonar": {"stale_after": 0.3, "core": 0.2, "unseen_speed": 0.1},
     "yaw_acceleration": 6.0,
     "unwitnessed": 0.5,

@@ -504,7 +504,7 @@ def test_short_motions_of_the_scans_that_follow_each_other_count_together():
         for _ in range(3):
             rig.tick(15)
             stamp = rig.now
-            shown(rig, since + apart, 0.02)
+            shown(rig, since + apart, 0.006)
             since = stamp
         rig.tick()
         assert bool(rig.reported(Reason.UNCOMMANDED_MOTION)) is (apart == 0)
@@ -515,7 +515,7 @@ def test_a_motion_of_the_scans_that_is_published_again_counts_once():
     rig = Rig().armed()
     rig.current, rig.driver = 0.3, {"speed": 0.0}
     rig.tick(30)
-    motion = UnshownMotion(since=rig.now - SECOND, stamp=rig.now, distance=0.02, turn=0.0)
+    motion = UnshownMotion(since=rig.now - SECOND, stamp=rig.now, distance=0.006, turn=0.0)
     for _ in range(5):
         rig.gate.observe(Consistency(**header(rig.now), measures=("wheels",), unshown=motion), topics.CONSISTENCY)
         rig.tick(50)
@@ -527,11 +527,56 @@ def test_a_motion_that_the_scans_prove_late_is_taken_to_go_on(late):
     rig = Rig().armed()
     rig.current, rig.driver = 0.3, {"speed": 0.0}
     rig.tick(50)
-    motion = UnshownMotion(since=rig.now - SECOND // 2, stamp=rig.now, distance=0.03, turn=0.0)
+    motion = UnshownMotion(since=rig.now - SECOND // 2, stamp=rig.now, distance=0.006, turn=0.0)
     rig.tick(late)
     rig.gate.observe(Consistency(**header(rig.now), measures=("wheels",), unshown=motion), topics.CONSISTENCY)
     rig.tick()
     assert bool(rig.reported(Reason.UNCOMMANDED_MOTION)) is bool(late)
+
+
+@pytest.mark.parametrize("current", [0.3, None])
+def test_a_drive_that_reads_rest_need_not_obey_any_further_if_its_current_shows_what_pulls(current):
+    rig = Rig().driving()
+    rig.current = current
+    rig.tick(10)
+    rig.driver = {"speed": 0.0}
+    rig.order(Order.ESTOP)
+    rig.tick(9)
+    since = rig.now
+    rig.tick(5)
+    shown(rig, since, 0.015)
+    rig.tick()
+    assert bool(rig.reported(Reason.UNCOMMANDED_MOTION)) is (current is not None)
+
+
+def test_a_motion_that_is_proven_before_the_current_is_measured_is_judged_by_it():
+    rig = Rig().armed()
+    rig.current, rig.driver = 0.3, {"speed": 0.0}
+    rig.tick(30)
+    rig.mode, rig.current = DriveMode.QUICK_STOP, None
+    since = rig.now
+    rig.tick(10)
+    shown(rig, since, 0.02)
+    rig.tick(2)
+    assert not rig.reported(Reason.UNCOMMANDED_MOTION)
+    rig.current = 0.3
+    rig.tick(3)
+    assert rig.reported(Reason.UNCOMMANDED_MOTION)
+
+
+def test_one_motion_of_the_scans_takes_one_step():
+    """The power stage is off as soon as it is found; the window of the next proof holds motion from before."""
+    rig = Rig().armed()
+    rig.current, rig.driver = 0.3, {"speed": 0.0}
+    rig.tick(30)
+    since = rig.now
+    rig.tick(10)
+    shown(rig, since, 0.02)
+    rig.tick(3)
+    shown(rig, since, 0.025)
+    rig.tick()
+    (step,) = {event.text for event in rig.reported(Reason.UNCOMMANDED_MOTION)}
+    assert step.endswith("power stage off")
 
 
 def test_motion_from_before_the_drives_obeyed_does_not_count():
@@ -541,7 +586,7 @@ def test_motion_from_before_the_drives_obeyed_does_not_count():
     rig.tick(40)
     rig.driver = {"speed": 0.0}
     rig.tick(30)
-    shown(rig, since, 0.04 * (rig.now - since) / SECOND)
+    shown(rig, since, 0.012 * (rig.now - since) / SECOND)
     rig.tick()
     assert not rig.reported(Reason.UNCOMMANDED_MOTION)
 

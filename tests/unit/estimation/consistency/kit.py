@@ -77,11 +77,8 @@ def drive(walls, poses, lies=None, front="own", sensors=SENSORS, config=None, gy
                 range_max=30.0,
             )
             monitor.observe_whole("lidar", stamp, beams.tobytes() if np.isfinite(beams).sum() > 20 else None)
-            monitor.observe_scan(
-                odometry.step(
-                    StepInput(scan, front, claim=monitor.claim(stamp), lag=monitor.lag(), rest=monitor.rest_claim())
-                )
-            )
+            claim, rest = monitor.claim(stamp), monitor.rest_claim(stamp)
+            monitor.observe_scan(odometry.step(StepInput(scan, front, claim=claim, lag=monitor.lag(), rest=rest)))
         for doubt in monitor.findings():
             trial.found.setdefault(doubt.sensor, doubt)
             trial.at.setdefault(doubt.sensor, way)

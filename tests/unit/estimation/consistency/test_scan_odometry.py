@@ -74,7 +74,7 @@ def watched(poses, walls=HALL, crowd=None):
             range_min=0.02,
             range_max=30.0,
         )
-        monitor.observe_scan(odometry.step(StepInput(scan, "own", rest=monitor.rest_claim())))
+        monitor.observe_scan(odometry.step(StepInput(scan, "own", rest=monitor.rest_claim(stamp))))
         shown.append(monitor.unshown)
     return shown
 

@@ -1,0 +1,95 @@
+"""Evidence that a body has moved although its wheels stand: the motion between two scans and how sure it is.
+
+The newest scan is registered to an earlier one of the robot at rest. Two covariances must reject standstill. One is
+that of the noise that the ranges state. The other is the jackknife's (Efron 1982): the motion is estimated again
+without each sector of the view, and what these estimates scatter is its uncertainty. So what moves by itself in one
+sector (a person, a door, a curtain) contradicts the other sectors instead of proving a motion. And scan odometry, which
+went through all the scans in between, must be nearer to that motion than to rest.
+"""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc, fdtrc, ndtri
+
+from monstertruck_estimation.consistency.exchange import Claim, RestEvidence
+from monstertruck_estimation.slam.registration import CORRELATION, Cloud, Fit, measure, normal_equations, register
+from monstertruck_estimation.slam.scans import Scan
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between
+
+SECTOR: Final = math.radians(15)
+"""Angle of view that one person at a distance of 2 m covers, rad."""
+DIMENSIONS: Final = 3
+"""Of a planar motion."""
+LEAST: Final = np.finfo(float).tiny
+"""Smallest probability that has a number of standard deviations."""
+
+
+class _Sector(NamedTuple):
+    """Normal equations of the points in one direction."""
+
+    information: Array
+    """Shape (3, 3)."""
+    gradient: Array
+    """Shape (3,)."""
+
+
+def rest_evidence(scan: Scan, earlier: Scan, own: Array, claim: Claim, origin: tuple[float, float]) -> RestEvidence:
+    """Return the motion since an earlier scan that a claim does not contain.
+
+    Args:
+        scan: newest scan.
+        earlier: scan at the beginning of the claim.
+        own: motion between both by scan odometry, shape (3,): where the registration begins.
+        claim: motion that the wheels show.
+        origin: place of the sensor in base, m.
+    """
+    cloud, claimed = Cloud.of(earlier), np.array((*(claim.way or (0.0, 0.0)), claim.turn))
+    fit = register(scan, cloud, own)
+    if measure(scan, cloud, claimed).cost <= fit.cost or _is_nearer(own, claimed, fit):
+        return RestEvidence()
+    x, y, turn = between(claimed, fit.pose).tolist()
+    sectors, moved = _sectors(scan, cloud, fit.pose, origin), fit.pose - claimed
+    chance = max(_by_noise(sectors, moved), _by_sectors(sectors, moved))
+    return RestEvidence((x, y, turn), -float(ndtri(max(chance, LEAST))))
+
+
+def _is_nearer(own: Array, claimed: Array, fit: Fit) -> bool:
+    """Whether the scan odometry is nearer to the claim than to the registered motion."""
+    to_claim, to_fit = own - claimed, own - fit.pose
+    return bool(to_claim @ fit.information @ to_claim <= to_fit @ fit.information @ to_fit)
+
+
+def _sectors(scan: Scan, cloud: Cloud, pose: Array, origin: tuple[float, float]) -> list[_Sector]:
+    directions = np.arctan2(scan.points[:, 1] - origin[1], scan.points[:, 0] - origin[0])
+    numbers = np.floor(directions / SECTOR)
+    parts = (normal_equations(scan.chosen(numbers == one), cloud, pose) for one in np.unique(numbers))
+    return [_Sector(information, gradient) for information, gradient, pairs in parts if pairs]
+
+
+def _by_noise(sectors: list[_Sector], motion: Array) -> float:
+    """Probability that the noise of the ranges, each beam's by itself, shows this motion or a greater one."""
+    information = np.sum([one.information for one in sectors], axis=0) / CORRELATION
+    return float(chdtrc(DIMENSIONS, motion @ information @ motion))
+
+
+def _by_sectors(sectors: list[_Sector], motion: Array) -> float:
+    """Probability of this motion or a greater one where every sector shows one of its own.
+
+    Hotelling's test with the covariance of the jackknife. A weak prior, 1 m and 1 rad about rest, bounds what no sector
+    constrains: a direction that only one of them constrains is not certain.
+    """
+    count, prior = len(sectors), np.eye(DIMENSIONS)
+    freedom = count - DIMENSIONS
+    if freedom < 1:
+        return 1.0
+    information = np.sum([one.information for one in sectors], axis=0) + prior
+    gradient = np.sum([one.gradient for one in sectors], axis=0) + prior @ motion
+    without = np.stack([information - one.information for one in sectors])
+    steps = np.stack([one.gradient - gradient for one in sectors])
+    shifts = np.linalg.solve(without, steps[..., None])[..., 0]
+    covariance = (count - 1) / count * shifts.T @ shifts
+    squared = float(motion @ np.linalg.pinv(covariance, hermitian=True) @ motion)
+    return float(fdtrc(DIMENSIONS, freedom, squared * freedom / (DIMENSIONS * (count - 1))))

@@ -1,0 +1,54 @@
+"""All ranges change by one factor from one revolution to the next."""
+
+import numpy as np
+import pytest
+
+from monstertruck_estimation.consistency.comparison import Measure
+from monstertruck_estimation.consistency.config import ConsistencyConfig
+from monstertruck_estimation.consistency.exchange import StepOutput
+from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.state import DoubtKind
+from tests.unit.estimation.consistency.kit import PERIOD, SENSORS, Lies, drive, straight
+from tests.unit.estimation.slam.kit import HALL
+
+LANE = straight(start=(-4.5, 2.0, 0.0))
+
+
+def changed(factor, at=40):
+    return lambda k, seen: seen[k] * (factor if k >= at else 1.0)
+
+
+@pytest.mark.parametrize("front", ["own", "kiss"])
+@pytest.mark.parametrize("factor", [0.3, 0.5, 0.8, 1.3, 2.0])
+def test_a_change_is_found_at_once(factor, front):
+    trial = drive(HALL, LANE, Lies(scan=changed(factor)), front=front)
+    doubt = trial.found["lidar"]
+    assert doubt.kind is DoubtKind.SCALE
+    assert doubt.difference == pytest.approx(abs(factor - 1.0), abs=0.03)
+    assert f"{factor:.1f}" in doubt.text or doubt.difference
+    assert trial.at["lidar"] == pytest.approx(21 * 0.025, abs=0.03), "at the first revolution"
+
+
+def test_a_change_at_rest_is_found_though_the_robot_is_not_armed():
+    trial = drive(HALL, LANE, Lies(scan=changed(0.5, at=10)), armed=1000)
+    assert trial.found["lidar"].kind is DoubtKind.SCALE
+    assert trial.at["lidar"] == 0.0
+
+
+def test_a_part_of_the_view_that_a_hand_covers_is_no_change():
+    def covered(k, seen):
+        return np.where(np.arange(len(seen[k])) < 100, seen[k] * (0.2 if k >= 40 else 1.0), seen[k])
+
+    found = drive(HALL, LANE, Lies(scan=covered)).found
+    assert not any(doubt.kind is DoubtKind.SCALE for doubt in found.values())
+
+
+def test_it_ends_when_the_ranges_change_back_or_the_lidar_has_been_silent():
+    for end in (StepOutput(SECOND + PERIOD, None, scale=2.0), StepOutput(4 * SECOND, None)):
+        monitor = ConsistencyMonitor(ConsistencyConfig(), SENSORS)
+        monitor.observe_scan(StepOutput(SECOND, None, scale=0.5))
+        monitor.activate(SECOND + 1)
+        assert [doubt.sensor for doubt in monitor.findings()] == [SENSORS[Measure.SCANS]]
+        monitor.observe_scan(end)
+        assert monitor.findings() == ()
