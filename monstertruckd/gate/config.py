@@ -162,8 +162,7 @@ class RunawayConfig(Schema):
     """When a motor turns as nobody commanded."""
 
     distance: Annotated[float, Field(gt=0, le=0.05)] = 0.01
-    """Distance that a shaft may turn beyond what its orders and its drive's ramps explain, or that scans may prove of
-    a body whose drives read rest, m."""
+    """Tolerated distance of a shaft beyond its orders and ramps, and of the body by proven motion of the scans, m."""
     body_distance: Annotated[float, Field(gt=0, le=0.2)] = 0.03
     """Distance that free wheels or the turning body may move after all drives were to rest, m: gears unwind."""
     idle_current: Annotated[float, Field(gt=0, le=0.5)] = 0.05

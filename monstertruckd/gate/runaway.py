@@ -157,7 +157,7 @@ class ShaftWatch:
         self.moves = False
         """Whether velocity or position show motion, by the newest feedback."""
         self.still_since: int | None = None
-        """Since which feedback neither shows motion, ns."""
+        """Stamp of the first feedback without motion, ns; None = the shaft moves."""
         self.driven = False
         """Whether the newest feedback shows a motor that may turn the shaft."""
         self._name = name
@@ -318,7 +318,7 @@ class BodyWatch:
         if before is None or not standing or not moves:
             self._travel = 0.0
             return None
-        self._travel += abs(speed) * (stamp - before) / SECOND  # a current may be measured later than the motion
+        self._travel += abs(speed) * (stamp - before) / SECOND  # also before a current is measured
         if not driven or self._travel <= config.body_distance:
             return None
         self._travel = 0.0
@@ -394,7 +394,7 @@ class RunawayCheck(Check):
         self._bodies = self._wheels, self._gyro, self._scans
         self._encoders: WheelEncoders | None = None
         self._unjudged: UnshownMotion | None = None
-        """Proven motion of the body, until a current shows whether a motor makes it."""
+        """Proven motion of the body without a motor current so far."""
         self._strays = 0
         """Of the joints of the lidar's mount, as they count them."""
         self._commanded = 0
@@ -462,9 +462,10 @@ class RunawayCheck(Check):
 
     @property
     def _stood(self) -> int:
-        """Since when the robot is to stand: all drives have had the time to obey, or read standstill already, ns.
+        """Start of the time in which motion of the body counts, ns.
 
-        Drives without a measured current must have had the time: their motors may be what scans with late stamps show.
+        It starts when all drives read standstill. Drives without a measured current get the full time to obey: scans
+        with late stamps may still show their braking.
         """
         still = [watch.still_since for watch in self._shafts if watch.measures_current]
         known = [since for since in still if since is not None]
@@ -479,7 +480,7 @@ class RunawayCheck(Check):
 
     def _take_unshown(self, motion: UnshownMotion, now: int) -> None:
         driven = self._pulled(now)
-        # Currents are read less often than velocities: one that is read soon may show that a motor made the motion.
+        # The drive polls its current less often than its velocity: keep the motion until a newer current decides.
         self._unjudged = None if driven or now - motion.stamp > SCAN.fresh_for() * SECOND else motion
         if self._unjudged is not None:
             return

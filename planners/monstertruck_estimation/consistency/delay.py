@@ -24,8 +24,8 @@ SHIFT: Final = SECOND // 10
 LONGEST: Final = 16
 """Greatest lag that is tried, in ``SHIFT``; only shorter ones are found."""
 SIGMAS: Final = 5.0
-"""Standard deviations that prove a finding, here by which all tolerated lags and the longest are rejected: chance shows
-them once in 3 million looks."""
+"""Significance of a finding, in standard deviations: a false alarm in 3 million looks. Here it rejects all tolerated
+lags and the longest."""
 GREATEST: Final = 2.0
 """Greatest errors of a measure that works, in standard deviations."""
 FEWEST: Final = 12

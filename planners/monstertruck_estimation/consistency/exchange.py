@@ -70,13 +70,13 @@ class RestEvidence:
     """Motion of the body that its wheels do not show."""
 
     motion: Pose2 = (0.0, 0.0, 0.0)
-    """Base at the newest scan, in base where the claim puts it, m and rad."""
+    """Pose of base at the newest scan, relative to the claimed pose, m and rad."""
     sigmas: float = 0.0
-    """How improbable it is of a robot at rest, as standard deviations of a normal distribution."""
+    """Significance against standstill, in standard deviations of a normal distribution."""
 
     @property
     def proven(self) -> bool:
-        """Whether chance does not explain it."""
+        """Whether the motion is significant."""
         return self.sigmas >= SIGMAS
 
 
@@ -100,9 +100,9 @@ class StepOutput:
     verdict: ScanVerdict | None = None
     """Of the claim; None without one, and where the earlier scan is not known any more."""
     rest: RestEvidence | None = None
-    """Against the claim that the robot stands, likewise."""
+    """Evidence against the claim of standstill; None like ``verdict``."""
     scale: float | None = None
-    """Factor by which all ranges are longer than shortly before, where no motion explains them."""
+    """Change of scale since an earlier revolution, as a factor on the ranges; None = no change."""
     front: str = ""
     """Scan odometry that is used."""
     delay: Delay | None = None

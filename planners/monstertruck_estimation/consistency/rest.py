@@ -21,7 +21,7 @@ class RestWatch:
 
     Args:
         wheels: motion that the wheels show.
-        slip: tolerated share of it by which the body moves otherwise.
+        slip: tolerated slip, as a fraction of that motion.
     """
 
     def __init__(self, wheels: MotionTrack, slip: float) -> None:

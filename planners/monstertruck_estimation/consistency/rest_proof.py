@@ -1,10 +1,9 @@
 """Evidence that a body has moved although its wheels stand: the motion between two scans and how sure it is.
 
-The newest scan is registered to an earlier one of the robot at rest. Two covariances must reject standstill. One is
-that of the noise that the ranges state. The other is the jackknife's (Efron 1982): the motion is estimated again
-without each sector of the view, and what these estimates scatter is its uncertainty. So what moves by itself in one
-sector (a person, a door, a curtain) contradicts the other sectors instead of proving a motion. And scan odometry, which
-went through all the scans in between, must be nearer to that motion than to rest.
+The newest scan is registered to an earlier one of the robot at rest. Two tests must reject standstill: one with the
+covariance of the stated range noise, one with the jackknife covariance (Efron 1982) over sectors of the view. A person,
+door or curtain that moves in one sector contradicts the other sectors and proves no motion. Scan odometry over the
+scans in between must also be nearer to the registered motion than to standstill.
 """
 
 import math
@@ -24,7 +23,7 @@ SECTOR: Final = math.radians(15)
 DIMENSIONS: Final = 3
 """Of a planar motion."""
 LEAST: Final = np.finfo(float).tiny
-"""Smallest probability that has a number of standard deviations."""
+"""Lower bound of a p-value before its conversion to standard deviations."""
 
 
 class _Sector(NamedTuple):
@@ -37,13 +36,13 @@ class _Sector(NamedTuple):
 
 
 def rest_evidence(scan: Scan, earlier: Scan, own: Array, claim: Claim, origin: tuple[float, float]) -> RestEvidence:
-    """Return the motion since an earlier scan that a claim does not contain.
+    """Return the motion since an earlier scan relative to a claimed motion.
 
     Args:
         scan: newest scan.
         earlier: scan at the beginning of the claim.
         own: motion between both by scan odometry, shape (3,): where the registration begins.
-        claim: motion that the wheels show.
+        claim: motion by the wheels.
         origin: place of the sensor in base, m.
     """
     cloud, claimed = Cloud.of(earlier), np.array((*(claim.way or (0.0, 0.0)), claim.turn))
@@ -70,16 +69,16 @@ def _sectors(scan: Scan, cloud: Cloud, pose: Array, origin: tuple[float, float])
 
 
 def _by_noise(sectors: list[_Sector], motion: Array) -> float:
-    """Probability that the noise of the ranges, each beam's by itself, shows this motion or a greater one."""
+    """P-value of the motion under independent range noise (chi-square test)."""
     information = np.sum([one.information for one in sectors], axis=0) / CORRELATION
     return float(chdtrc(DIMENSIONS, motion @ information @ motion))
 
 
 def _by_sectors(sectors: list[_Sector], motion: Array) -> float:
-    """Probability of this motion or a greater one where every sector shows one of its own.
+    """P-value of the motion with the jackknife covariance over sectors (Hotelling's test).
 
-    Hotelling's test with the covariance of the jackknife. A weak prior, 1 m and 1 rad about rest, bounds what no sector
-    constrains: a direction that only one of them constrains is not certain.
+    A weak prior, 1 m and 1 rad about standstill, keeps unconstrained directions finite: a direction constrained by a
+    single sector stays uncertain.
     """
     count, prior = len(sectors), np.eye(DIMENSIONS)
     freedom = count - DIMENSIONS

@@ -1,7 +1,7 @@
-"""Change of a lidar's scale from one revolution to another: all ranges become longer or shorter by one factor.
+"""Detects a change of the lidar's scale between two revolutions: one factor on all ranges.
 
-A motion of the robot changes every range by another factor. That one factor changes hundreds of them alike is no
-chance, however large it is: what decides is which points one of both explanations fits alone, see ``ScanVerdict``.
+Motion of the robot changes every range by a different factor. The points decide between motion and scale by which of
+them fit one explanation alone, see ``ScanVerdict``.
 """
 
 import math
@@ -15,7 +15,7 @@ from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
 
 LEAST_PAIRS: Final = 30
-"""Beams with a range in both revolutions whose factor is looked at."""
+"""Minimum number of beams with a range in both revolutions."""
 
 
 class Revolution(NamedTuple):
@@ -30,12 +30,12 @@ class Revolution(NamedTuple):
 
 
 def scale_change(newest: Revolution, earlier: Revolution, motions: list[Array]) -> float | None:
-    """Return the factor by which the newest ranges are longer than the earlier ones, where no motion explains them.
+    """Return the factor from the earlier ranges to the newest ones, or None if motion explains the newest scan.
 
     Args:
-        newest: revolution.
-        earlier: one that is not old.
-        motions: that the robot may have made meanwhile, at least one, each of shape (3,): where registrations begin.
+        newest: newest revolution.
+        earlier: reference revolution.
+        motions: initial guesses of the registration, at least one, each of shape (3,), m and rad.
     """
     cloud = Cloud.of(earlier.scan)
     moved = max((_fits(newest.scan, cloud, motion) for motion in motions), key=np.count_nonzero)

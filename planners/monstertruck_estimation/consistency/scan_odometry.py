@@ -93,7 +93,7 @@ class ScanMotionStep:
         """From one motion to the next, m^2 and rad^2."""
         self._last: tuple[int, Cloud] | None = None
         self._fitting: tuple[int, Revolution] | None = None
-        """Newest revolution that fitted the one before, with its stamp: the scale is compared with it."""
+        """Reference of the scale: newest revolution that fitted the one before, with its stamp (ns)."""
         self._reference: tuple[Cloud, Array] | None = None
         """The scan that others are registered to, and its pose."""
         self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=REMEMBERED)
