@@ -35,6 +35,8 @@ class StepInput:
     lag: LagQuestion | None = None
     rest: Claim | None = None
     """That the robot stands, as far as its wheels do."""
+    rolled: Pose2 | None = None
+    """Motion by the wheels since the scan before; None = not known."""
 
 
 REFUTING: Final = 12

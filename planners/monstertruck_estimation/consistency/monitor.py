@@ -242,6 +242,11 @@ class ConsistencyMonitor:
         ways = self._errors[pending.claimant].way is not None
         return Claim(pending.since, motion[:2] if ways else None, motion[2], pending.errors)
 
+    def rolled(self, stamp: int) -> Pose2 | None:
+        """Return the motion by the wheels from the newest scan to the next one, at ``stamp`` (ns)."""
+        track, before = self._tracks.get(Measure.WHEELS), self._sampled.get(Measure.SCANS)
+        return None if track is None or before is None else track.motion(before, stamp)
+
     def rest_claim(self, stamp: int) -> Claim | None:
         """That the robot stands as its wheels do, up to the next scan, at ``stamp`` (ns)."""
         return None if self._resting is None else self._resting.claim(stamp)

@@ -46,8 +46,9 @@ def scale_change(newest: Revolution, earlier: Revolution, motions: list[Array]) 
         return None
     rescaled = _rescaled(newest.scan, newest.origin, 1.0 / factor)
     scaled = max((_fits(rescaled, cloud, motion) for motion in motions), key=np.count_nonzero)
-    alone, scaled_alone, misfits = map(np.count_nonzero, (moved & ~scaled, scaled & ~moved, ~scaled))
-    return factor if ScanVerdict(claimed=int(alone), own=int(scaled_alone), misfits=int(misfits)).refuted else None
+    # Nothing else changes with the scale: every point that does not fit the rescaled revolution speaks for motion.
+    alone, misfits = int(np.count_nonzero(scaled & ~moved)), int(np.count_nonzero(~scaled))
+    return factor if ScanVerdict(claimed=misfits, own=alone, misfits=misfits).refuted else None
 
 
 def _fits(scan: Scan, cloud: Cloud, motion: Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

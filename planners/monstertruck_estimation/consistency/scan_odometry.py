@@ -92,8 +92,8 @@ class ScanMotionStep:
         self._changes: deque[tuple[float, float]] = deque(maxlen=SCATTERED)
         """From one motion to the next, m^2 and rad^2."""
         self._last: tuple[int, Cloud] | None = None
-        self._fitting: tuple[int, Revolution] | None = None
-        """Reference of the scale: newest revolution that fitted the one before, with its stamp (ns)."""
+        self._revolution: Revolution | None = None
+        """Newest revolution, the reference of the next one's scale."""
         self._reference: tuple[Cloud, Array] | None = None
         """The scan that others are registered to, and its pose."""
         self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=REMEMBERED)
@@ -120,16 +120,14 @@ class ScanMotionStep:
         whole = prepare_input(inputs.scan, LONGEST_RANGE, (vx, vy, wz))
         scan = whole.downsampled(THINNED, MOST_POINTS)
         if len(whole) < MIN_POINTS:
-            self._last = None
+            self._last = self._revolution = None
             return StepOutput(stamp, None, front=name)
         found = None
         if last is not None and 0.0 < dt < GAP:
             found = self._found(front, scan, whole, last[1], lasting)
         cloud = Cloud.of(whole)
         self._last = stamp, cloud
-        factor = self._scale_change(
-            inputs, whole, [lasting if found is None else found[0], np.zeros(3)], found is not None
-        )
+        factor = self._scale_change(inputs, whole, dt, [lasting if found is None else found[0], np.zeros(3)])
         if found is None or last is None:
             self._begin(front, scan, self._pose)
             self._motions.clear()
@@ -152,15 +150,11 @@ class ScanMotionStep:
         scatter = scatter_of(self._changes)
         return StepOutput(stamp, last[0], (x, y, yaw), deviations, scatter, overlap, verdict, rest, factor, name)
 
-    def _scale_change(self, inputs: StepInput, whole: Scan, motions: list[Array], fits: bool) -> float | None:
-        stamp, known = inputs.scan.stamp, None if inputs.anew else self._fitting
-        if known is not None and not 0.0 < (stamp - known[0]) / SECOND < GAP:
-            known = None
-        newest = Revolution(inputs.scan.ranges, whole, inputs.scan.mount[:2])
-        factor = None if known is None else scale_change(newest, known[1], motions)
-        if fits or known is None or factor is not None:
-            self._fitting = stamp, newest
-        return factor
+    def _scale_change(self, inputs: StepInput, whole: Scan, dt: float, motions: list[Array]) -> float | None:
+        before, self._revolution = self._revolution, Revolution(inputs.scan.ranges, whole, inputs.scan.mount[:2])
+        if before is None or inputs.rolled is None or not 0.0 < dt < GAP:
+            return None
+        return scale_change(self._revolution, before, [np.array(inputs.rolled), *motions])
 
     def _begin(self, front: KissFront | None, scan: Scan, pose: Array) -> None:
         self._reference = Cloud.of(scan), pose

@@ -252,7 +252,8 @@ class ConsistencyService:
         if anew:
             return StepInput(inputs, front, anew=True)
         claim, rest = monitor.claim(scan.stamp), monitor.rest_claim(scan.stamp)
-        return StepInput(inputs, front, claim=claim, lag=monitor.lag(), rest=rest)
+        rolled = monitor.rolled(scan.stamp)
+        return StepInput(inputs, front, claim=claim, lag=monitor.lag(), rest=rest, rolled=rolled)
 
     # What follows
 
