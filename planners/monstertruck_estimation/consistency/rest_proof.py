@@ -1,9 +1,9 @@
 """Evidence that a body has moved although its wheels stand: the motion between two scans and how sure it is.
 
-The newest scan is registered to an earlier one of the robot at rest. Two tests must reject standstill: one with the
-covariance of the stated range noise, one with the jackknife covariance (Efron 1982) over sectors of the view. A person,
-door or curtain that moves in one sector contradicts the other sectors and proves no motion. Scan odometry over the
-scans in between must also be nearer to the registered motion than to standstill.
+The newest scan is registered to an earlier one of the robot at rest. The jackknife over sectors of the view (Efron
+1982) gives the significance of that motion: a person, door or curtain that moves in one sector contradicts the other
+sectors and proves no motion. The stated range noise, an upper bound of the true one, must be an unlikely explanation.
+Scan odometry over the scans in between must also be nearer to the registered motion than to standstill.
 """
 
 import math
@@ -22,6 +22,8 @@ SECTOR: Final = math.radians(15)
 """Angle of view that one person at a distance of 2 m covers, rad."""
 DIMENSIONS: Final = 3
 """Of a planar motion."""
+UNLIKELY: Final = 1e-3
+"""Largest p-value of a motion under the stated range noise that the jackknife judges."""
 LEAST: Final = np.finfo(float).tiny
 """Lower bound of a p-value before its conversion to standard deviations."""
 
@@ -51,8 +53,9 @@ def rest_evidence(scan: Scan, earlier: Scan, own: Array, claim: Claim, origin: t
         return RestEvidence()
     x, y, turn = between(claimed, fit.pose).tolist()
     sectors, moved = _sectors(scan, cloud, fit.pose, origin), fit.pose - claimed
-    chance = max(_by_noise(sectors, moved), _by_sectors(sectors, moved))
-    return RestEvidence((x, y, turn), -float(ndtri(max(chance, LEAST))))
+    if _by_noise(sectors, moved) > UNLIKELY:
+        return RestEvidence((x, y, turn))
+    return RestEvidence((x, y, turn), -float(ndtri(max(_by_sectors(sectors, moved), LEAST))))
 
 
 def _is_nearer(own: Array, claimed: Array, fit: Fit) -> bool:

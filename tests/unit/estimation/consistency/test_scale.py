@@ -5,11 +5,10 @@ import pytest
 
 from monstertruck_estimation.consistency.comparison import Measure
 from monstertruck_estimation.consistency.config import ConsistencyConfig
-from monstertruck_estimation.consistency.exchange import StepInput, StepOutput
+from monstertruck_estimation.consistency.exchange import StepOutput
 from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
-from monstertruck_estimation.consistency.scan_odometry import ScanMotionStep
-from monstertruck_estimation.slam.worker_io import ScanInput
-from monstertruck_estimation.wheel_motion import WheelIncrement
+from monstertruck_estimation.consistency.scale import Revolution, scale_change
+from monstertruck_estimation.slam.scans import prepare
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.state import DoubtKind
 from tests.unit.estimation.consistency.kit import PERIOD, SENSORS, Lies, drive, straight
@@ -46,21 +45,13 @@ def test_a_part_of_the_view_that_a_hand_covers_is_no_change():
     assert not any(doubt.kind is DoubtKind.SCALE for doubt in found.values())
 
 
-@pytest.mark.parametrize("speed", [3.0, 5.0])
-def test_a_robot_that_drives_far_between_two_revolutions_changes_no_scale(speed):
-    """The wheels lead the registration, which does not reach so far by itself."""
-    monitor, found = ConsistencyMonitor(ConsistencyConfig(), SENSORS), []
-    poses = straight(speed=speed, seconds=1.2, start=(-4.5, 2.0, 0.0))
-    rng, odometry = np.random.default_rng(1), ScanMotionStep()
-    for k, pose in enumerate(poses):
-        stamp, moved = SECOND + k * PERIOD, 0.0 if k < 20 else speed
-        monitor.observe_wheels(WheelIncrement(stamp - PERIOD, stamp, (moved, 0.0, 0.0), moved / 10, (), ()))
-        seen = ranges(HALL, pose, noise=0.01, rng=rng)
-        scan = ScanInput(stamp, seen, LIDAR.start_angle, LIDAR.angle_increment, 0.02, 30.0)
-        output = odometry.step(StepInput(scan, "own", rolled=monitor.rolled(stamp)))
-        monitor.observe_scan(output)
-        found.append(output.scale)
-    assert found == [None] * len(poses)
+def test_a_wall_that_the_robot_approaches_far_between_two_revolutions_changes_no_scale():
+    """All ranges shrink by one factor; the wheels lead the registration, which does not reach so far by itself."""
+    wall, moved = [((2.0, -20.0), (2.0, 20.0))], np.array((0.5, 0.0, 0.0))
+    before, after = (ranges(wall, pose) for pose in (np.array((-2.0, 0.0, 0.0)), np.array((-1.5, 0.0, 0.0))))
+    earlier, newest = (Revolution(seen, prepare(seen, LIDAR), (0.0, 0.0)) for seen in (before, after))
+    assert scale_change(newest, earlier, [np.zeros(3)]) == pytest.approx(0.875, abs=0.01)
+    assert scale_change(newest, earlier, [moved, np.zeros(3)]) is None
 
 
 def test_it_ends_when_the_ranges_change_back_or_the_lidar_has_been_silent():
