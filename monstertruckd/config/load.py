@@ -27,6 +27,7 @@ from monstertruck_runtime.endpoints import emulated_ports
 from monstertruck_runtime.errors import ConfigError, UnusableFileError
 from monstertruck_runtime.map_folders import SAVES, folder_of
 from monstertruck_runtime.map_folders import YAML as MAP_YAML
+from monstertruck_runtime.outside import reading
 from monstertruck_runtime.plugins import models_in
 from monstertruck_runtime.small_files import make_folder, replace_file, require_file
 from monstertruck_runtime.yaml_files import DEEPEST, MOST_BYTES, bounded_yaml
@@ -343,8 +344,10 @@ def _with_includes(own: Tree, path: Path, including: tuple[Path, ...], version: 
         raise ConfigError(f"{where}: include: expected a file name or a list of file names")
     merged = Tree({}, files=[path.resolve()])
     for name in names:
-        target = included(path, name)
-        if not target.is_file():
+        with reading(f"{where}: include", "a file name", ConfigError):
+            target = included(path, name)
+            there = target.is_file()
+        if not there:
             raise ConfigError(f"{where}: include: no such file: {target}")
         tree = _load(target, (*including, path.resolve()), version)
         _merge(merged, tree)
@@ -676,21 +679,31 @@ def _locate_files(tree: Tree, keys: tuple[tuple[str, ...], ...]) -> None:
         name = section.get(key[-1]) if isinstance(section, dict) else None
         if not isinstance(name, str):
             continue
-        origin = tree.origins[key]
-        file = (origin.file.parent / name).resolve()
-        ours = origin.file.resolve() in tree.files and not Path(name).is_absolute()
-        saved = folder_of(file) if key[-1] == "map" else None
-        if saved is not None and ((saved / SAVES).is_dir() or (saved / MAP_YAML).is_file()):
-            section[key[-1]] = str(saved)
-            tree.maps += [saved] if ours else []
-            continue
-        if not file.is_file():
-            in_folder = "expected a file, found a folder" if saved is None else "no saved map in this folder"
-            problem = in_folder if file.is_dir() else "no such file"
-            raise ConfigError(f"{origin}: {'.'.join(key)}: {problem}: {file}")
-        section[key[-1]] = str(file)
-        if ours:
-            (tree.maps if key[-1] == "map" else tree.files).append(file)
+        with reading(f"{tree.origins[key]}: {'.'.join(key)}", "a file name", ConfigError):
+            section[key[-1]] = str(_located(tree, key, name))
+
+
+def _located(tree: Tree, key: tuple[str, ...], name: str) -> Path:
+    """Absolute path of the file ``name`` at ``key``, or of the folder of a saved map; noted if it is of the robot.
+
+    Raises:
+        ConfigError: it is not there, or is a folder.
+        OSError, ValueError: no file can have this name.
+    """
+    origin = tree.origins[key]
+    file = (origin.file.parent / name).resolve()
+    ours = origin.file.resolve() in tree.files and not Path(name).is_absolute()
+    saved = folder_of(file) if key[-1] == "map" else None
+    if saved is not None and ((saved / SAVES).is_dir() or (saved / MAP_YAML).is_file()):
+        tree.maps += [saved] if ours else []
+        return saved
+    if not file.is_file():
+        in_folder = "expected a file, found a folder" if saved is None else "no saved map in this folder"
+        problem = in_folder if file.is_dir() else "no such file"
+        raise ConfigError(f"{origin}: {'.'.join(key)}: {problem}: {file}")
+    if ours:
+        (tree.maps if key[-1] == "map" else tree.files).append(file)
+    return file
 
 
 def _give_ports(data: dict[str, Any]) -> None:
