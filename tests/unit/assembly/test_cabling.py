@@ -9,7 +9,7 @@ import pytest
 
 from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.config import PortConfig
-from monstertruck_drivers.link import Port
+from monstertruck_drivers.link import Framing, Port
 from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruckd.assembly import devices
@@ -21,22 +21,37 @@ from tests.unit.drivers.usb.rig import emulated_truck
 @pytest.mark.parametrize(
     "place", [{"path": Path("/dev/ttyUSB0")}, {"hub": "1-1", "port": 1}], ids=["by path", "by hub and port"]
 )
-@pytest.mark.parametrize(("dtr", "rts"), [(False, True), (True, False)])
+@pytest.mark.parametrize(
+    ("dtr", "rts", "framing"), [(False, True, None), (True, False, "8E2")], ids=["DTR low", "RTS low, 8E2"]
+)
 def test_the_control_lines_of_a_port_are_those_of_its_settings(
-    place: dict[str, Any], dtr: bool, rts: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    place: dict[str, Any],
+    dtr: bool,
+    rts: bool,
+    framing: Framing | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ):
-    """An RPLIDAR's motor stops while DTR is raised."""
-    made: list[tuple[bool, bool]] = []
+    """An RPLIDAR's motor stops while DTR is raised; SBUS has a parity bit."""
+    made: list[tuple[bool, bool, Framing]] = []
 
-    def serial(path: Path, baud: int, *, dtr: bool = True, rts: bool = True, low_latency: bool = False) -> Port:
-        made.append((dtr, rts))
+    def serial(
+        path: Path,
+        baud: int,
+        *,
+        dtr: bool = True,
+        rts: bool = True,
+        low_latency: bool = False,
+        framing: Framing = "8N1",
+    ) -> Port:
+        made.append((dtr, rts, framing))
         cable = MemoryPort(str(path))
         cable.plug()
         return cable
 
     monkeypatch.setattr(devices, "SerialPort", serial)
     kind = UsbPortConfig if "hub" in place else PortConfig
-    lidar = SimpleNamespace(port=kind(**place, dtr=dtr, rts=rts))
+    lidar = SimpleNamespace(port=kind(**place, dtr=dtr, rts=rts, framing=framing))
     config: Any = SimpleNamespace(devices=SimpleNamespace(present=lambda: {"lidar": lidar}), usb=UsbConfig())
 
     async def opened(clock: VirtualClock) -> None:
@@ -46,4 +61,4 @@ def test_the_control_lines_of_a_port_are_those_of_its_settings(
         (await Cabling(config, computer, Bus(clock), {}).port("lidar").open()).close()
 
     run_virtual(opened)
-    assert made == [(dtr, rts)]
+    assert made == [(dtr, rts, framing or "8N1")]

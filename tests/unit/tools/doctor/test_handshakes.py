@@ -150,4 +150,4 @@ async def test_a_port_is_probed_with_the_control_lines_of_its_settings():
     kind = Mock(opens="serial", probe_function=lambda: AsyncMock())
     device = Mock(port=PortConfig(path=node, baud=9600, dtr=False, rts=False))
     await module._probe(context, "lidar", device, kind, node)
-    serial.assert_called_once_with(node, 9600, dtr=False, rts=False)
+    serial.assert_called_once_with(node, 9600, dtr=False, rts=False, framing="8N1")
