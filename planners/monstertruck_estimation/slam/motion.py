@@ -237,7 +237,7 @@ class MotionPredictor:
         self._by_motion = np.zeros(3), np.zeros((3, 3))
         self._delta = np.zeros(3)
         self._dt = 0.0
-        self._seen = False
+        self._given, self._seen = False, False
         self._fitted = False
         self._missing = 0.0
         self.check = OdometryCheck()
@@ -251,9 +251,9 @@ class MotionPredictor:
     @property
     def use(self) -> OdometryUse:
         """Whether odometry predicts the motion."""
-        if not self._seen:
+        if not self._given:
             return OdometryUse.NONE
-        if self._missing >= MISSING_AFTER:
+        if not self._seen or self._missing >= MISSING_AFTER:
             return OdometryUse.MISSING
         return OdometryUse.CONTRADICTED if self.check.contradicted else OdometryUse.USED
 
@@ -288,6 +288,7 @@ class MotionPredictor:
         """Motion in base over the last ``dt`` seconds, and its covariance (3, 3)."""
         config = self._config
         now = None if odom is None or not np.isfinite(odom).all() else np.array(odom, dtype=float)
+        self._given |= odom is not None
         self._seen |= now is not None
         self._missing = self._missing + dt if now is None else 0.0
         delta = None if now is None or self._odom is None else between(self._odom, now)
@@ -453,7 +454,9 @@ class ClockOffsetEstimator:
         """Seconds by which odometry runs ahead of the scans; None = not known, or none."""
 
     def add(self, stamp: int, matched: float, odom: float) -> None:
-        """Take the yaw of an accepted match and that of odometry, both rad at ``stamp``, ns."""
+        """Take the yaw of an accepted match and that of odometry, both rad at ``stamp``, ns; not finite: ignored."""
+        if not math.isfinite(odom):
+            return
         self._samples.append((stamp, matched, odom))
         self._seen += 1
         if self._seen % OFFSET_PERIOD == 0 and len(self._samples) >= OFFSET_LEAST_SCANS:

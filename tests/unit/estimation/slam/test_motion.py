@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.motion import MotionPredictor, OdometryCheck, ScanOdometry
+from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, OdometryCheck, ScanOdometry
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch, rejected
 from monstertruck_kinematics.se2 import between, compose
+from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import OdometryUse
 
 INFORMATION = np.diag((1e4, 1e5, 1e6))
@@ -256,3 +257,21 @@ def test_the_first_odometry_after_a_gap_is_no_motion():
     delta, _ = model.predict(0.1, np.array((1.1, 0.0, 0.5)))
     assert np.hypot(*delta[:2]) == pytest.approx(0.1)
     assert model.use is OdometryUse.USED
+
+
+def test_odometry_that_was_never_a_number_is_missing():
+    motion = MotionPredictor(MapperConfig())
+    motion.predict(0.1, None)
+    assert motion.use is OdometryUse.NONE
+    motion.predict(0.1, np.full(3, np.nan))
+    assert motion.use is OdometryUse.MISSING
+    motion.predict(0.1, np.zeros(3))
+    assert motion.use is OdometryUse.USED
+
+
+def test_a_yaw_that_is_no_number_makes_no_time_offset():
+    clocks, yaw = ClockOffsetEstimator(), 0.0
+    for k in range(240):
+        yaw += 0.05 * math.sin(k / 7)
+        clocks.add((k + 1) * SECOND // 10, yaw, math.nan if k == 100 else yaw)
+    assert clocks.offset is None
