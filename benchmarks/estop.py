@@ -42,6 +42,7 @@ import numpy as np
 
 from benchmarks.estop_parts.processes import (
     ORDER_TIMEOUT,
+    TO_AND_FRO,
     OtherLoad,
     on_stderr,
     order,
@@ -301,10 +302,9 @@ async def press(
 async def trials(clock: Clock, folder: Path, kind: str, count: int) -> dict[str, Any]:
     """All trials of one flood."""
     endpoint = free_endpoint()
-    base = ROOT / "configs" / "demo.yaml"
-    if kind == "forged":
-        shown, base = base, folder / "access_control.yaml"
-        base.write_text(yaml_text({"include": str(shown), "version": VERSION, "zenoh": {"access_control": True}}))
+    base, access = folder / "to_and_fro.yaml", {"zenoh": {"access_control": True}} if kind == "forged" else {}
+    demo = {"include": str(ROOT / "configs" / "demo.yaml"), "version": VERSION}
+    base.write_text(yaml_text(demo | TO_AND_FRO | access))
     config = write_overlay(base, folder, endpoint)
     cores = sorted(os.sched_getaffinity(0))
     own, other = cores[0], cores[-1]

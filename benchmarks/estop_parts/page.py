@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from playwright.async_api import Page
 
-from benchmarks.estop_parts.processes import ORDER_TIMEOUT, on_stderr, order, process
+from benchmarks.estop_parts.processes import ORDER_TIMEOUT, TO_AND_FRO, on_stderr, order, process
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import FrameError, Opcode, decode_body, join
@@ -259,7 +259,7 @@ async def measure(clock: Clock, folder: Path, count: int) -> dict[str, dict[str,
     """
     endpoint = free_endpoint()
     config = write_overlay(ROOT / "configs" / "slam.yaml", folder, endpoint)
-    config.write_text(yaml_text(read_yaml(config) | {"path": None, "tracker": None}))
+    config.write_text(yaml_text(read_yaml(config) | TO_AND_FRO | {"path": None, "tracker": None}))
     port = free_endpoint().rpartition(":")[2]
     cores = sorted(os.sched_getaffinity(0))
     own, other = cores[0], cores[-1]
