@@ -6,6 +6,7 @@ packed again, with sound checksums. A file depends on its number and the seed al
 
 The time of a file is what it takes on a computer that does nothing else: the larger of the processor time of the
 process and the elapsed time without that for which its main thread waited for a processor, as the kernel counts it.
+Its memory is what reading adds to that of a command: this process has the libraries of all commands.
 """
 
 import faulthandler
@@ -37,6 +38,8 @@ from monstertruckd.recorder.frames import MAGIC
 
 SECONDS: Final = 5.0
 MEGABYTES: Final = 500.0
+LOADED: Final = 170.0
+"""Memory of the process of `map build` before it reads a file (MB)."""
 HANGS: Final = 1800.0
 """Elapsed seconds after which a reader is taken for hung: its stack is printed, and the run ends."""
 SHOWN: Final = 30
@@ -230,7 +233,7 @@ def _made(kind: Kind, folder: Path) -> dict[str, bytes]:
 def _try(kind: Kind, folder: Path) -> tuple[str | None, float, float]:
     """What a library raised ("" = a refusal of ours, None = it was read), seconds, and greatest memory (MB)."""
     reset_peak()
-    begin, fault = Spent.now(), None
+    loaded, begin, fault = peak(), Spent.now(), None
     try:
         kind.read(folder)
     except TruckError:
@@ -239,7 +242,7 @@ def _try(kind: Kind, folder: Path) -> tuple[str | None, float, float]:
         last = traceback.extract_tb(error.__traceback__)
         ours = [frame for frame in last if "site-packages" not in frame.filename][-1]
         fault = f"{type(error).__name__}: {str(error)[:120]} at {ours.filename[-50:]}:{ours.lineno}"
-    return fault, Spent.now().since(begin), peak()
+    return fault, Spent.now().since(begin), LOADED + peak() - loaded
 
 
 def run_apart(count: int, seed: int, work: Path, first: int = 0) -> dict[str, Any]:
