@@ -68,8 +68,6 @@ from monstertruckd.recorder.recordings import Recordings
 
 STOPPED: Final = "the emergency stop is latched until you clear it"
 """Consequence of a file that is left out."""
-LONGEST_WARNING: Final = 200
-"""Characters of a warning that is acknowledged."""
 
 
 class Daemon:
@@ -473,11 +471,12 @@ def recording(bus: Bus, clock: Clock) -> Callable[[str, str, str, Reason, str], 
 
 def acknowledging(events: EventSink) -> Handler:
     """Remote call ``acknowledge``: an operator has seen a warning (``text``), which becomes an event in the log."""
+    longest_warning = 200  # characters of a warning that is acknowledged
 
     async def acknowledge(payload: dict[str, Any]) -> dict[str, Any]:
         text, by = payload.get("text"), str(payload.get("source", ""))
-        if not isinstance(text, str) or not text or len(text) > LONGEST_WARNING or not text.isprintable():
-            raise InputError(f"text: expected 1 to {LONGEST_WARNING} printable characters")
+        if not isinstance(text, str) or not text or len(text) > longest_warning or not text.isprintable():
+            raise InputError(f"text: expected 1 to {longest_warning} printable characters")
         events(Reason.ACKNOWLEDGED, Severity.INFO, "operator", f"{by} has seen: {text}", by=by)
         return {}
 

@@ -15,7 +15,6 @@ from monstertruck_drivers.usb.tree import ancestors, is_topology, sort_key
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
-HUB_PORTS = 7
 OTHER = UsbIdentity("1a86:7523", "USB Serial", "ttyUSB")
 """A device whose kind says nothing of USB hangs on an adapter."""
 DISK = Disk(total=64_000_000_000, free=32_000_000_000)
@@ -99,7 +98,7 @@ class EmulatedComputer:
         }
         hubs = {hub for port, _ in places.values() for hub in (port.hub, *ancestors(port.hub)) if "-" in hub}
         for hub in sorted(hubs):
-            self.usb.add_hub(hub, ports=HUB_PORTS)
+            self.usb.add_hub(hub, ports=7)
         for role, (port, kind) in places.items():
             identity = kind.usb or OTHER
             self.usb.add_device(

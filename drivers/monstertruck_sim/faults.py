@@ -35,11 +35,8 @@ SERIAL: Final = ("drive", "steering", "lidar", "compass", "stabiliser", *MORE_DR
 """Roles of devices on a serial line."""
 VITAL: Final = ("drive", "steering", "lidar", "compass", *MORE_DRIVES, "wheels", "sonar")
 """The robot stops when one of these sends nothing; the sonars where they guard it, without a lidar."""
-COOL: Final = 48.0
 SHORT_WRITES: Final = 19
 """Maximum number of consecutive writes cut in half."""
-POST_RADIUS: Final = 0.1
-"""Radius of an obstacle, m."""
 ALL_ROUND: Final = "-135 135"
 """Directions of all the lidar's beams, degrees."""
 UNKNOWN_CODES: Final = (*range(3, 20),)
@@ -241,12 +238,13 @@ def exchange_cables(one: str, other: str) -> Action[SimContext]:
 
 def place_obstacle(gap: float) -> Action[SimContext]:
     """A post ``gap`` metres before the front bumper."""
+    post_radius = 0.1  # radius of an obstacle, m
 
     def place(context: SimContext) -> None:
         now = context.clock.now()
         truth = context.robot.world.truth(now)
-        ahead = context.config.world.truck.length / 2 + gap + POST_RADIUS
-        post = Disc(truth.x + ahead * math.cos(truth.yaw), truth.y + ahead * math.sin(truth.yaw), POST_RADIUS)
+        ahead = context.config.world.truck.length / 2 + gap + post_radius
+        post = Disc(truth.x + ahead * math.cos(truth.yaw), truth.y + ahead * math.sin(truth.yaw), post_radius)
         context.robot.world.add(now, post)
 
     return place
@@ -647,7 +645,7 @@ def _rail_12v(rng: np.random.Generator) -> CatalogFault:
 
     def give(context: SimContext) -> None:
         context.command("stabiliser", "power on")
-        context.monitored("host", "temperature", str(COOL))
+        context.monitored("host", "temperature", str(48.0))  # degrees Celsius
 
     return _fault(FaultKind.RAIL_12V, "", lose, give, _hold(rng))
 

@@ -31,7 +31,6 @@ from monstertruckd.bus.local import Bus
 DEPTH: Final = 64
 """Requests of one topic that may wait for the loop."""
 
-MAX_VALUES: Final = 16_384
 
 MAX_OWNERS: Final = 64
 """Owners whose rates are known; the least recent one is dropped for a new one."""
@@ -254,7 +253,7 @@ class Intake:
             return
         # 512: commas, and brackets, braces and quotes, of one request: many small objects would take tens of
         # milliseconds
-        if data.count(b",") > MAX_VALUES or sum(map(data.count, (b"[", b"{", b'"'))) > 512:
+        if data.count(b",") > 16_384 or sum(map(data.count, (b"[", b"{", b'"'))) > 512:  # commas of a request at most
             self._refusals.add(Reason.BAD_INPUT, source, f"{name}: request of too many parts")
             return
         try:

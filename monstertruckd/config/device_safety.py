@@ -89,8 +89,6 @@ BY_CELLS: Final = (
     *("max_compensation", "plausible_max"),
 )
 """Voltages of a pack, which are compared cell by cell."""
-EMPTY: Final = 3.0
-"""Volts of a lithium-polymer cell at which it has nothing left."""
 
 
 def unattended_times(devices: Devices) -> Iterator[tuple[str, float]]:
@@ -170,10 +168,11 @@ def packs(devices: Devices, monitors: Monitors) -> Iterator[tuple[str, PackConfi
 
 
 def _beyond_cells(place: str, pack: PackConfig) -> Iterator[str]:
+    empty = 3.0  # volts of a lithium-polymer cell at which it has nothing left
     for name in ("low", "critical", "collapsed"):
         volts = getattr(pack, name)
-        if volts < EMPTY * pack.cells:
-            yield f"{place}.{name} {volts:g} V: at least {EMPTY * pack.cells:g}, where {pack.cells} cells are empty"
+        if volts < empty * pack.cells:
+            yield f"{place}.{name} {volts:g} V: at least {empty * pack.cells:g}, where {pack.cells} cells are empty"
     # 4.5: volts of one that no charger reaches
     # 0.5: volts of a cell, the most that a motor's current may explain
     for name, most in (("plausible_max", 4.5), ("max_compensation", 0.5)):

@@ -42,8 +42,6 @@ DAY: Final = 86_400 * SECOND
 """ns."""
 PERIOD: Final = 1.0
 """Seconds between two checks of the drive's position: half of it at most is missing of every reversal."""
-PUBLISH: Final = 60
-"""Periods between two messages, and between two writings of the odometer."""
 
 
 _UNKNOWN: Final[Mapping[str, str]] = MappingProxyType({})
@@ -234,6 +232,7 @@ class CalibrationWatch:
         self._expired = frozenset()
         self._look()
         ready()
+        publish = 60  # periods between two messages, and between two writings of the odometer
         with self._bus.subscribe(DRIVE, latest()) as drive, self._bus.subscribe(USB, latest()) as usb:
             before: float | None = None
             try:
@@ -246,9 +245,9 @@ class CalibrationWatch:
                         before = here
                     serials = self._serials if usb.latest is None else self._serials | serials_of(usb.latest)
                     replaced, self._serials = serials != self._serials, serials
-                    if replaced or count % PUBLISH == 0:
+                    if replaced or count % publish == 0:
                         self._look()
-                    if count % PUBLISH == 0:
+                    if count % publish == 0:
                         await self._keep()
             finally:
                 await self._keep()

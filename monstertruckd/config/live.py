@@ -26,8 +26,6 @@ T = TypeVar("T", bound=TruckConfig)
 
 LIST: Final = "settings"
 SET: Final = "set"
-MOST: Final = 32
-"""Settings changed by one call."""
 
 
 def with_settings(config: T, values: Mapping[str, Any]) -> T:
@@ -114,8 +112,9 @@ def _values(given: Any) -> dict[str, LiveValue]:
     Raises:
         InputError: there are none, or too many; what the values may be is said by their models.
     """
-    if not isinstance(given, dict) or not 0 < len(given) <= MOST:
-        raise InputError(f"values: expected 1 to {MOST} settings by their dotted names")
+    most = 32  # settings changed by one call
+    if not isinstance(given, dict) or not 0 < len(given) <= most:
+        raise InputError(f"values: expected 1 to {most} settings by their dotted names")
     for key, value in given.items():
         if not isinstance(value, float | int | bool | str):
             raise InputError(f"{key}: expected a plain value, got {type(value).__name__}")

@@ -46,10 +46,6 @@ PLACEHOLDER = "{robot}"
 HEAD: Final = (
     "Settings changed while the robot ran (monstertruckd set --save); they replace those of the configuration."
 )
-MOST_VALUES = 20_000
-"""Values of one file at most; a full configuration has a few hundred."""
-MOST_MISTAKES = 50
-"""Named at once."""
 YAML_1_1 = ("yes", "no", "on", "off")
 """Booleans of YAML 1.1 in lower case: text since 1.2."""
 
@@ -403,8 +399,9 @@ def _build(node: Node, builder: _Builder, key: Key) -> Any:
     where = Origin(builder.path, node.start_mark.line + 1)
     builder.origins.setdefault(key, where)
     builder.count += 1
-    if builder.count > MOST_VALUES:
-        raise ConfigError(f"{where}: more than {MOST_VALUES} values, those that aliases repeat included")
+    most_values = 20_000  # values of one file at most; a full configuration has a few hundred
+    if builder.count > most_values:
+        raise ConfigError(f"{where}: more than {most_values} values, those that aliases repeat included")
     if node in builder.around:
         raise ConfigError(f"{where}: an alias in its own anchor: the value would contain itself")
     if isinstance(node, ScalarNode):
@@ -725,11 +722,12 @@ def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError
         # entries that are wrong are not counted, so a list of them is "too short"
         if detail["type"] != "too_short" or detail["loc"] not in wrong:
             mistakes.setdefault(_data_key(tree.data, detail["loc"]), detail)  # of a union the first member's
-    for key, detail in list(mistakes.items())[:MOST_MISTAKES]:
+    most_mistakes = 50  # named at once
+    for key, detail in list(mistakes.items())[:most_mistakes]:
         origin = tree.origin(key) or f"{path}:1"
         dotted = ".".join(map(str, key)) or "configuration"
         yield f"{origin}: {dotted}: {_sentence(detail, model, key)}"
-    if (more := len(mistakes) - MOST_MISTAKES) > 0:
+    if (more := len(mistakes) - most_mistakes) > 0:
         yield f"{path}: {more} more mistakes"
 
 

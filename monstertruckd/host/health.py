@@ -21,11 +21,7 @@ from monstertruckd.recorder.recorder import Recorder
 log = logging.getLogger(__name__)
 
 PERIOD = 1.0
-SUMMARY_AFTER: Final = 5
-"""Periods after the start at which the log says what is there and what is not."""
 
-SAY_AGAIN: Final = 60.0
-"""Seconds until it says so again."""
 PASSING: Final = frozenset({Reason.SLOW_LINK})
 """Reasons of a service that works, but badly: its warning says so, its information that it is over."""
 LASTING: Final = frozenset({Reason.FILE_DAMAGED, Reason.LOG_DAMAGED})
@@ -134,11 +130,12 @@ class HealthBoard:
         """Publish the table once a second; log what is not ready after the start, and once that all are."""
         ready()
         complete = False
+        summary_after = 5  # periods after the start at which the log says what is there and what is not
         for periods in count(1):
             await self._clock.sleep(PERIOD)
             self._publish()
-            if periods >= SUMMARY_AFTER and not complete:
-                complete = self._summarise(missing=periods == SUMMARY_AFTER)
+            if periods >= summary_after and not complete:
+                complete = self._summarise(missing=periods == summary_after)
 
     def _summarise(self, *, missing: bool) -> bool:
         """Log that all services are ready, or, with ``missing``, which are not; whether all are."""
@@ -213,7 +210,7 @@ class ClockService:
 class MeterService:
     """Publishes the control tick's punctuality and the recorder's state once a second.
 
-    A disk too slow for the recorder is an event, at most once in ``SAY_AGAIN``.
+    A disk too slow for the recorder is an event, at most once a minute.
     """
 
     name = ServiceName.METER.value
@@ -273,7 +270,7 @@ class MeterService:
         self._lost, self._lost_said = health.drops, health.stamp
 
     def _say_busy(self, health: LoopHealth) -> None:
-        """Log that the computer is busy once it lasts, at most once in ``SAY_AGAIN``."""
+        """Log that the computer is busy once it lasts, at most once a minute."""
         self._late = self._late + 1 if health.busy else max(0, self._late - 1)
         # 3: seconds with late ticks after which the log says that the computer is busy: a start has some
         if health.busy and self._late >= 3 and _again(self._said, health.stamp):
@@ -283,4 +280,4 @@ class MeterService:
 
 def _again(said: int | None, now: int) -> bool:
     """Whether what was said at ``said``, ns, is to be said again."""
-    return said is None or now - said > SAY_AGAIN * SECOND
+    return said is None or now - said > 60.0 * SECOND  # seconds until it says so again

@@ -21,8 +21,6 @@ PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logg
 
 LONGEST: Final = 16_384
 """Characters of one record; what is beyond is cut off."""
-MARGIN: Final = 1024
-"""Characters beyond the cut that are searched as well, so that no secret is cut in half and missed."""
 
 _KEYS: Final = r"(?:password|passwd|passphrase|secret|token|authorization|(?<![a-z])psk|api[_-]?key)"
 _NAMES: Final = ("passw", "passphrase", "secret", "token", "authorization", "psk", "api")
@@ -57,8 +55,9 @@ def redacted(text: str) -> str:
 
 def shown(text: str) -> str:
     """What of a record's ``text`` is shown: no secrets, and ``LONGEST`` characters at most."""
-    safe = redacted(text[: LONGEST + MARGIN])
-    beyond = len(safe) - LONGEST + max(0, len(text) - LONGEST - MARGIN)
+    margin = 1024  # characters beyond the cut that are searched as well, so that no secret is cut in half and missed
+    safe = redacted(text[: LONGEST + margin])
+    beyond = len(safe) - LONGEST + max(0, len(text) - LONGEST - margin)
     return f"{safe[:LONGEST]} ... {beyond} characters more" if beyond > 0 else safe
 
 

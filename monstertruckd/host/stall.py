@@ -17,10 +17,6 @@ from monstertruck_schemas.roles import ServiceName
 
 log = logging.getLogger(__name__)
 
-STALL: Final = 0.2
-"""Seconds without a tick that are worth a dump."""
-INTERVAL: Final = 60.0
-"""Least seconds between two dumps."""
 KEPT: Final = 20
 """Dumps kept in the folder."""
 
@@ -40,8 +36,8 @@ class StallWatch:
         clock: time; readable from any thread.
         ticks: how many ticks there were; readable from any thread.
         folder: for the files.
-        stall: seconds, see ``STALL``.
-        interval: seconds, see ``INTERVAL``.
+        stall: seconds without a tick that are worth a dump.
+        interval: least seconds between two dumps.
     """
 
     name = ServiceName.STALLS.value
@@ -52,8 +48,8 @@ class StallWatch:
         ticks: Callable[[], int],
         folder: Path,
         *,
-        stall: float = STALL,
-        interval: float = INTERVAL,
+        stall: float = 0.2,
+        interval: float = 60.0,
     ) -> None:
         self._clock = clock
         self._ticks = ticks

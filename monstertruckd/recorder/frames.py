@@ -54,7 +54,6 @@ _UNSUMMED: Final = struct.calcsize("<I8s")
 HEAD: Final = struct.Struct("<BQ")
 """Head of a record: opcode, length of the content."""
 CHECKSUM: Final = struct.Struct("<I")
-_PIECE: Final = 1 << 20
 
 READERS: Final[dict[int, Any]] = {
     Opcode.HEADER: Header,
@@ -103,8 +102,9 @@ def _checksum(file: BinaryIO, begin: int, end: int) -> int:
     """CRC-32 of the bytes from ``begin`` up to ``end``, read in pieces."""
     file.seek(begin)
     value = 0
-    for at in range(begin, end, _PIECE):
-        value = zlib.crc32(file.read(min(_PIECE, end - at)), value)
+    piece = 1 << 20
+    for at in range(begin, end, piece):
+        value = zlib.crc32(file.read(min(piece, end - at)), value)
     return value
 
 

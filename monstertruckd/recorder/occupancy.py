@@ -7,9 +7,6 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
 
-_GROW = 32
-"""Cells of margin added at a time, so that growing is rare."""
-
 
 @dataclass(frozen=True, slots=True)
 class Area:
@@ -80,7 +77,8 @@ class OccupancyRaster:
             if (low >= self._corner).all() and (high <= self._corner + size).all():
                 return
             low, high = np.minimum(low, self._corner), np.maximum(high, self._corner + size)
-        corner, shape = low - _GROW, high - low + 2 * _GROW
+        grow = 32  # cells of margin added at a time, so that growing is rare
+        corner, shape = low - grow, high - low + 2 * grow
         shift = self._corner - corner
         for name in ("_hits", "_passes"):
             old = getattr(self, name)

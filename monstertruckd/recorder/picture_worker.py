@@ -46,8 +46,6 @@ _UNKNOWN, _FREE, _WALL = (np.array(rgb, dtype=np.float64) for rgb in ((216, 221,
 _INK, _FAINT, _RULE, _PAPER = "#222b36", "#6b7785", "#c3cad3", "#ffffff"
 _OVERSAMPLING = 2
 _MARGIN, _HEAD, _FOOT = 28, 84, 64
-_AROUND = 0.4
-"""Metres shown around everything that was seen or driven."""
 
 
 class MapRenderer:
@@ -166,7 +164,8 @@ def _shown(raster: OccupancyRaster, paths: list[Array]) -> Area:
         cells = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]])
         corners.append(np.array([raster.area.x0, raster.area.y0]) + cells * raster.cell)
     points = np.vstack(corners) if corners else np.array([[-1.0, -1.0], [1.0, 1.0]])
-    (x0, y0), (x1, y1) = points.min(axis=0) - _AROUND, points.max(axis=0) + _AROUND
+    around = 0.4  # metres shown around everything that was seen or driven
+    (x0, y0), (x1, y1) = points.min(axis=0) - around, points.max(axis=0) + around
     return Area(float(x0), float(y0), float(x1), float(y1))
 
 

@@ -35,8 +35,6 @@ TURN: Final = 5.0
 """Seconds without a chunk after which another source may download."""
 NAME: Final = re.compile(r"[A-Za-z0-9_.-]{1,120}\.mcap(\.damaged(-\d{1,3})?)?")
 DAMAGED_KIND: Final = "damaged"
-MOST: Final = 500
-"""Recordings listed; the newest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +113,8 @@ class Recordings:
     async def _list(self, _: dict[str, Any]) -> dict[str, Any]:
         rows = await self._offload(lambda: [replace(row, open=_is_open(path, row)) for path, row in self._files()])
         rows.sort(key=lambda row: row.modified, reverse=True)
-        return {"recordings": [asdict(row) for row in rows[:MOST]], "left_out": max(len(rows) - MOST, 0)}
+        most = 500  # recordings listed; the newest
+        return {"recordings": [asdict(row) for row in rows[:most]], "left_out": max(len(rows) - most, 0)}
 
     async def _read(self, payload: dict[str, Any]) -> dict[str, Any]:
         offset, source = payload.get("offset", 0), str(payload.get("source", ""))

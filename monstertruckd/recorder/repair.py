@@ -216,9 +216,6 @@ class _Registered:
         return self._channels[number, facts]
 
 
-NICENESS = 15
-
-
 def start_repair(folder: Path) -> "subprocess.Popen[bytes] | None":
     """Start the process if there is anything to repair.
 
@@ -250,7 +247,7 @@ def _may_wait(path: Path) -> bool:
 
 def main(folder: Path) -> None:
     """Repair ``folder``; standard output has the outcome for each log, as a JSON string on a line."""
-    os.nice(NICENESS)
+    os.nice(15)
     logging.basicConfig(level=logging.INFO, format="%(levelname)-7s %(name)s: %(message)s")
     for outcome in _repairs(folder):
         text = f"repaired {outcome}" if isinstance(outcome, Recovery) else f"not repaired: {outcome}"

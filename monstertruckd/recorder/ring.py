@@ -23,8 +23,6 @@ SHARE: Final = 32
 _HEAD: Final = Struct("<qqqII")
 """Log time, stamp, sequence, number of the topic, length of the payload."""
 
-JOURNAL_SHARE: Final = 0.25
-"""Part of the whole memory that the journal takes at most: a flood of it must not displace what was measured."""
 
 PICTURES: Final = "foxglove.CompressedImage"
 JOURNAL: Final = "event"
@@ -186,7 +184,7 @@ class _Part:
 class Ring:
     """Bounded memory of the newest messages.
 
-    When the bytes do not suffice, a journal of more than ``JOURNAL_SHARE`` of them loses its oldest messages first;
+    When the bytes do not suffice, a journal of more than a quarter of them loses its oldest messages first;
     then the oldest pictures go, then the oldest of the rest; all are counted. Of every retained topic the newest
     message from before the window is kept, so that what is left stands alone.
 
@@ -260,7 +258,9 @@ class Ring:
 
     def _fullest(self) -> _Part | None:
         """The part to remove from; never the newest message of its sort."""
-        flooded = self._journal.size > JOURNAL_SHARE * self._limit
+        # 0.25: part of the whole memory that the journal takes at most: a flood of it must not displace what was
+        # measured
+        flooded = self._journal.size > 0.25 * self._limit
         first = (self._journal,) if flooded else ()
         parts = (*first, self._sampled, self._fresh, self._rest, self._journal)
         return next((part for part in parts if len(part) > 1), None)

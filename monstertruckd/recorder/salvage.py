@@ -59,10 +59,6 @@ _INDEX_ENTRY: Final = 16
 """Bytes: log time and offset of a message."""
 _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17}
 """Of records whose content has one length."""
-_WINDOW: Final = 1 << 20
-"""Bytes searched at once."""
-_SECTOR: Final = 4096
-"""Bytes that a disk refuses together."""
 UNKNOWN: Final = "unknown/channel-{}"
 """Topic of messages whose channel is lost."""
 
@@ -97,14 +93,15 @@ class _Bytes:
 
     def at(self, begin: int, size: int) -> bytes:
         """Return ``size`` bytes from ``begin``, fewer at the end."""
+        sector = 4096  # bytes that a disk refuses together
         try:
             return os.pread(self._descriptor, size, begin)
         except OSError as error:
             if error.errno != errno.EIO:
                 raise
-            if size <= _SECTOR:
+            if size <= sector:
                 return bytes(min(size, self.size - begin))
-            middle = (begin + size // 2) // _SECTOR * _SECTOR
+            middle = (begin + size // 2) // sector * sector
             middle = middle if begin < middle < begin + size else begin + size // 2
             return self.at(begin, middle - begin) + self.at(middle, begin + size - middle)
 
@@ -114,11 +111,12 @@ class _Bytes:
 
     def next_candidate(self, at: int) -> int:
         """Return where a record may begin, from ``at`` on; the end if nowhere."""
+        window = 1 << 20  # bytes searched at once
         while at < self.size:
-            found = _CANDIDATE.search(self.at(at, _WINDOW + HEAD.size))
+            found = _CANDIDATE.search(self.at(at, window + HEAD.size))
             if found is not None:
                 return at + found.start()
-            at += _WINDOW
+            at += window
         return self.size
 
 

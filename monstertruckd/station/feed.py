@@ -33,8 +33,6 @@ TICK: Final = 0.05
 """Seconds between two checks of what is new."""
 PING: Final = 1.0
 """Seconds between two measurements of the round trip to the robot."""
-RETRY: Final = 1.0
-"""Seconds between two attempts to reach a robot, and in which one that is there answers."""
 KEPT_EVENTS: Final = 200
 """Events a browser gets when it begins to look at a robot."""
 
@@ -181,10 +179,11 @@ class RobotFeed:
 
     async def run(self) -> None:
         """Follow until cancelled."""
+        retry = 1.0  # seconds between two attempts to reach a robot, and in which one that is there answers
         while True:
             try:
                 name, endpoint = self.address.name, self.address.endpoint
-                async with TruckClient(name, endpoint, clock=self._clock, timeout=RETRY) as client:
+                async with TruckClient(name, endpoint, clock=self._clock, timeout=retry) as client:
                     self.client = client
                     try:
                         await self._follow(client)
@@ -192,11 +191,11 @@ class RobotFeed:
                         self.client = None  # before the session closes, which takes a while
             except TruckError as error:
                 self._set_link(None, str(error))
-                await self._clock.sleep(RETRY)
+                await self._clock.sleep(retry)
             except Exception as bug:  # the other robots are followed all the same
                 log.exception("robot %s cannot be followed", self.address.name)
                 self._set_link(None, f"{type(bug).__name__}: {bug}")
-                await self._clock.sleep(RETRY)
+                await self._clock.sleep(retry)
 
     async def _follow(self, client: TruckClient) -> None:
         jobs = [asyncio.create_task(job) for job in (self._ask(client), self._sample(client))]

@@ -17,8 +17,6 @@ from monstertruckd.station.viewer import Viewer
 
 PERIOD: Final = 0.5
 """Seconds between two checks of all robots."""
-OLD: Final = 2.0
-"""Seconds after which a pose that did not change in time is shown as old, and a battery as unknown."""
 
 
 class RobotSnapshot:
@@ -53,11 +51,12 @@ class RobotSnapshot:
         }
 
     def _is_old(self, name: str, message: Message | None, now: int) -> bool:
-        """Whether the newest message of a topic has been that for longer than ``OLD``."""
+        """Whether the newest message of a topic has been that for longer than 2 s."""
         stamp = None if message is None else message.stamp
         before, since = self._changes.get(name, (None, now))
         self._changes[name] = stamp, now if stamp != before else since
-        return (now - self._changes[name][1]) / SECOND > OLD
+        # 2.0: seconds after which a pose that did not change in time is shown as old, and a battery as unknown
+        return (now - self._changes[name][1]) / SECOND > 2.0
 
     def close(self) -> None:
         """End the subscriptions; the session may be gone already."""

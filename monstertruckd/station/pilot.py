@@ -63,12 +63,8 @@ MEMORY: Final = 200
 """Newest heartbeats among which the quickest is found."""
 MOST_ASKED: Final = 16
 """Commands of one browser whose outcome is waited for at once."""
-RETRY: Final = 1.0
-"""Seconds between two attempts to reach the robot, and in which it answers."""
 SPACING: Final = 0.05
 """Distance between two poses of a drawn path, m."""
-SMOOTHING: Final = 0.12
-"""Standard deviation of the weights with which a drawn line is smoothed, m: hands tremble."""
 SHORTEST: Final = 0.3
 """Least length of a drawn path, m."""
 LONGEST: Final = 200.0
@@ -128,10 +124,11 @@ class Pilot:
 
     async def run(self) -> None:
         """Keep the session until cancelled; a robot that is not there is waited for."""
+        retry = 1.0  # seconds between two attempts to reach the robot, and in which it answers
         try:
             while True:
                 with suppress(TruckError):  # the feed says what is wrong
-                    async with self._address.session(self._name, self._clock, RETRY) as client:
+                    async with self._address.session(self._name, self._clock, retry) as client:
                         self._client = client
                         self._viewer.send(frames.text("pilot", source=client.source))
                         while not self._ready:
@@ -139,7 +136,7 @@ class Pilot:
                                 await client.ready()
                                 self._ready = True
                         await asyncio.Event().wait()
-                await self._clock.sleep(RETRY)
+                await self._clock.sleep(retry)
         finally:
             self._client = None
             tasks = [*self._answers, *([] if self._driving is None else [self._driving])]
@@ -282,10 +279,11 @@ def drawn_path(points: Sequence[tuple[float, float]]) -> Path:
         raise InputError(f"path: {along[-1]:.4g} m are drawn, expected at most {LONGEST:g} m")
     places = np.linspace(0.0, along[-1], max(math.ceil(along[-1] / SPACING), 2) + 1)
     even = np.column_stack([np.interp(places, along, line[:, i]) for i in (0, 1)])
+    smoothing = 0.12  # standard deviation of the weights with which a drawn line is smoothed, m: hands tremble
     # Mirrored at its ends, which stay where they are.
-    more = min(math.ceil(3 * SMOOTHING / SPACING), len(even) - 1)
+    more = min(math.ceil(3 * smoothing / SPACING), len(even) - 1)
     mirrored = np.concatenate((2 * even[0] - even[more:0:-1], even, 2 * even[-1] - even[-2 : -2 - more : -1]))
-    weights = np.exp(-0.5 * (np.arange(-more, more + 1) * SPACING / SMOOTHING) ** 2)
+    weights = np.exp(-0.5 * (np.arange(-more, more + 1) * SPACING / smoothing) ** 2)
     smooth = np.column_stack([np.convolve(mirrored[:, i], weights / weights.sum(), "valid") for i in (0, 1)])
     turns = np.gradient(smooth, axis=0)
     poses = np.column_stack((smooth, np.arctan2(turns[:, 1], turns[:, 0])))

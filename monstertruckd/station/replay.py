@@ -17,10 +17,7 @@ from monstertruckd.station.viewer import Viewer, Viewers
 
 log = logging.getLogger(__name__)
 
-MOST_BYTES: Final = 400_000_000
-"""Payload of a recording that is kept in memory."""
 AGAIN_KINDS: Final = ("gate", "pose", "scan")
-FASTEST: Final = 20.0
 
 
 class Recorded(Protocol):
@@ -115,14 +112,15 @@ class ReplayFeed:
 
     def _fill(self, reader: RecordedLog, file: Path) -> tuple[int, int]:
         size = 0
+        most_bytes = 400_000_000  # payload of a recording that is kept in memory
         for row in reader:
             track = self._tracks.get(row.topic)
             if track is None:
                 continue
             size += len(row.payload)
-            if size > MOST_BYTES:
+            if size > most_bytes:
                 raise InputError(
-                    f"{file.name}: more than {MOST_BYTES / 1e6:.0f} MB to be shown; see `monstertruckd replay`"
+                    f"{file.name}: more than {most_bytes / 1e6:.0f} MB to be shown; see `monstertruckd replay`"
                 )
             track.times.append(max(row.log_time, track.times[-1] if track.times else row.log_time))
             track.messages.append(row)
@@ -150,7 +148,7 @@ class ReplayFeed:
     def control(self, at: float | None, playing: bool | None, rate: float | None) -> None:
         """Go to a time (s since the beginning), play or pause, or play at another rate."""
         if rate is not None:
-            self._rate = min(max(rate, 0.1), FASTEST)
+            self._rate = min(max(rate, 0.1), 20.0)
         if playing is not None:
             self._playing = playing
             if playing and self._at >= self._end and at is None:

@@ -29,11 +29,8 @@ log = logging.getLogger(__name__)
 COST: Final = {"n": 2**14, "r": 8, "p": 1}
 """Parameters of scrypt: 16 MB and some 50 ms for each attempt."""
 LENGTH: Final = 32
-SHORTEST: Final = 8
-"""Characters of a password."""
 PAUSE: Final = 1.0
 """Seconds that a wrong password costs, one attempt after the other."""
-REMEMBERED: Final = 256
 MOST_WAITING: Final = 16
 """Attempts of one address that wait for their turn; further ones are wrong at once."""
 HASH: Final = re.compile(rf"[0-9a-f]{{{2 * LENGTH}}}:[0-9a-f]{{{2 * LENGTH}}}")
@@ -135,7 +132,7 @@ class StationUsers:
                     await asyncio.sleep(PAUSE)
                     return None
             self._known[mark] = user
-            while len(self._known) > REMEMBERED:
+            while len(self._known) > 256:
                 self._known.popitem(last=False)
             return user
         return self._known[mark]
@@ -198,8 +195,9 @@ def add_user(file: Path, name: str, role: AccessRole, password: str) -> None:
     """
     if not SOURCE_NAME.fullmatch(name) or ":" in name or len(name) > 24:
         raise InputError(f"user {name!r}: expected up to 24 letters, digits and . _ - @")
-    if len(password) < SHORTEST:
-        raise InputError(f"password of {name}: expected at least {SHORTEST} characters")
+    shortest = 8  # characters of a password
+    if len(password) < shortest:
+        raise InputError(f"password of {name}: expected at least {shortest} characters")
     rows = _rows(file) if file.exists() else {}
     rows[name] = {"role": role.value, "password": hash_of(password, secrets.token_bytes(LENGTH))}
     make_folder(file.parent)

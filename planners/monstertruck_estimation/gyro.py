@@ -11,8 +11,6 @@ from monstertruck_schemas.base import Positive, Schema
 
 STILL: Final = 1e-4
 """Distance of the fastest shaft between two readings, m, up to which the robot stands."""
-LONG: Final = 20 * SECOND
-"""Turns are compared over so long as well, ns: what a bias that has crept away adds up to."""
 
 
 class GyroConfig(Schema):
@@ -153,10 +151,11 @@ class Gyro:
         # 0.05: curvature by which the wheels may be off all the time, rad/m
         rows.append((stamp, wheels, gyro, config.share * abs(wheels) + 0.05 * distance))
         off, allowed = self._sums[0] + gyro - wheels, self._sums[1] + rows[-1][3]
-        while stamp - rows[0][0] > LONG:
+        long = 20 * SECOND  # turns are compared over so long as well, ns: what a bias that has crept away adds up to
+        while stamp - rows[0][0] > long:
             _, by_wheels, by_gyro, may = rows.popleft()
             off, allowed = off - (by_gyro - by_wheels), allowed - may
         self._sums = (off, allowed)
-        if stamp - rows[0][0] > LONG // 4 and abs(off) > config.tolerance + allowed:
+        if stamp - rows[0][0] > long // 4 and abs(off) > config.tolerance + allowed:
             self.difference, self.trusted, self._left_out, self.bias = off, False, stamp, None
             self._forget()

@@ -11,12 +11,8 @@ from typing import Final, NamedTuple
 
 from monstertruck_estimation.transforms import wrap_angle
 
-PROOF: Final = 0.25
-"""Turn of the robot over which the headings are compared, rad: several times the error that iron nearby causes."""
 LONGEST: Final = 3.0
 """Distance within which it has to turn that much, m: a drift of the wheels over a long distance is no turn."""
-ALIKE: Final = 0.5
-"""Least share of the turn that the headings must show, with the same or the opposite sign, for a decision."""
 
 
 class _Row(NamedTuple):
@@ -75,19 +71,23 @@ class HeadingTurns:
         self._last = yaw
         rows = self._rows
         rows.append(_Row(self._turn, self._distance, self._heading, self._correction))
+        # turn of the robot over which the headings are compared, rad: several times the error that iron nearby causes
+        proof = 0.25
         while self._distance - rows[0].distance > LONGEST or (
-            len(rows) > 2 and abs(self._turn - rows[1].turn) >= PROOF
+            len(rows) > 2 and abs(self._turn - rows[1].turn) >= proof
         ):
             rows.popleft()
         first, before = rows[0], self.contrary
         turn, heading = self._turn - first.turn, self._heading - first.heading
-        if abs(turn) < PROOF:
+        if abs(turn) < proof:
             return False
         share = heading / turn
-        if share <= -ALIKE:
+        # least share of the turn that the headings must show, with the same or the opposite sign, for a decision
+        alike = 0.5
+        if share <= -alike:
             self.contrary = before or ContraryTurn(
                 turn, heading, self._distance - first.distance, self._correction - first.correction
             )
-        elif share >= ALIKE:
+        elif share >= alike:
             self.contrary = None
         return (self.contrary is None) is not (before is None)

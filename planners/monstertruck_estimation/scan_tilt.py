@@ -18,9 +18,6 @@ from monstertruck_runtime.ports import Publisher
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
 from monstertruck_schemas.state import Odometry
 
-STALE: Final = SECOND // 4
-"""Nanoseconds over which angles are extended beyond the newest reading."""
-KEPT: Final = 16
 UNKNOWN: Final = math.pi / 2
 """Tilt of a scan whose mount or body angles are unknown, so that it is not used."""
 
@@ -53,7 +50,7 @@ class AngleHistory:
     """Recent values of two angles, read at any instant between and shortly after them."""
 
     def __init__(self) -> None:
-        self._points: deque[tuple[int, Angles]] = deque(maxlen=KEPT)
+        self._points: deque[tuple[int, Angles]] = deque(maxlen=16)
 
     def extend(self, points: Iterable[tuple[int, Angles]]) -> None:
         """Take newer readings: stamp, ns, and angles."""
@@ -61,14 +58,15 @@ class AngleHistory:
 
     def at(self, time_ns: int) -> Angles | None:
         """On the straight line through the two readings around ``time_ns``, or the newest two; None = unknown."""
-        if not self._points or time_ns - self._points[-1][0] > STALE:
+        stale = SECOND // 4  # nanoseconds over which angles are extended beyond the newest reading
+        if not self._points or time_ns - self._points[-1][0] > stale:
             return None
         if len(self._points) == 1:
             return self._points[0][1]
         after = next((i for i, (stamp, _) in enumerate(self._points) if i and stamp >= time_ns), len(self._points) - 1)
         (begin, old), (end, new) = self._points[after - 1], self._points[after]
         share = (time_ns - begin) / max(end - begin, 1)
-        if not 0 <= end - begin <= STALE or share < 0:
+        if not 0 <= end - begin <= stale or share < 0:
             return new
         return old[0] + share * (new[0] - old[0]), old[1] + share * (new[1] - old[1])
 

@@ -15,8 +15,6 @@ from monstertruck_kinematics.se2 import Twist2
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import DriveFeedback, SteeringFeedback
 
-_ANGLE_STEP = 1e-4
-
 
 @dataclass(frozen=True, slots=True)
 class WheelIncrement:
@@ -134,10 +132,11 @@ def increment_covariance(
         result += np.outer(by_shaft, by_shaft) * (shaft**2 * abs(pace) * dt)
     if roll.distance <= 0:
         return result
+    angle_step = 1e-4
     for error in chassis.steering_errors:
-        step = _ANGLE_STEP * np.array(error)
+        step = angle_step * np.array(error)
         ahead = np.array(chassis.twist(roll.pace, *(np.array(roll.angles) + step).tolist()))
         behind = np.array(chassis.twist(roll.pace, *(np.array(roll.angles) - step).tolist()))
-        by_angle = (ahead - behind) * (dt / (2 * _ANGLE_STEP))
+        by_angle = (ahead - behind) * (dt / (2 * angle_step))
         result += np.outer(by_angle, by_angle) * (angle**2 / roll.distance)
     return result

@@ -72,14 +72,9 @@ CONTRADICTION: Final = 0.2
 """Shaft speeds may be off the motion they agree on best by this share of the fastest."""
 
 
-STRAIGHT: Final = 1e-6
-"""Axle angles this close count as equal, rad."""
-
 WHEEL_REACH: Final = math.radians(100.0)
 """Angle that wheels with servos of their own reach to both sides: more than a quarter turn, so that a wheel need not
 turn about when its motion passes through sideways, rad."""
-
-_HALVINGS: Final = 30
 
 
 DIRECT: Final = SteeringPolynomials(AxlePolynomials((1.0, 0.0), (1.0, 0.0)), AxlePolynomials((1.0, 0.0), (1.0, 0.0)))
@@ -221,9 +216,10 @@ class Chassis(ABC):
 
     def refusal(self, front: float, rear: float) -> str | None:
         """Why the body cannot take these axle angles; None if it can."""
-        if self.freedom == "front" and abs(rear) > STRAIGHT:
+        straight = 1e-6  # axle angles this close count as equal, rad
+        if self.freedom == "front" and abs(rear) > straight:
             return f"rear is {rear:.6g}: expected 0, this body has no second steered axle and cannot move sideways"
-        if self.freedom == "parallel" and abs(front - rear) > STRAIGHT:
+        if self.freedom == "parallel" and abs(front - rear) > straight:
             return f"front is {front:.6g}, rear is {rear:.6g}: expected equal angles, this body keeps its heading"
         return None
 
@@ -255,7 +251,7 @@ class Chassis(ABC):
         """Largest axle angle that the servos reach to both sides, in every way in which the body steers, rad."""
         ways = {"both": ((1.0, -1.0), (1.0, 1.0)), "front": ((1.0, 0.0),), "parallel": ((1.0, 1.0),)}[self.freedom]
         low, high = 0.0, MAX_AXLE_ANGLE
-        for _ in range(_HALVINGS):
+        for _ in range(30):
             middle = 0.5 * (low + high)
             asked = [(side * front, side * rear) for front, rear in ways for side in (middle, -middle)]
             low, high = (middle, high) if all(self.reached(angles) == angles for angles in asked) else (low, middle)

@@ -12,8 +12,6 @@ from monstertruck_kinematics.fitting import FitResult, least_squares, minimax
 from monstertruck_kinematics.se2 import integrate, to_body
 from monstertruck_kinematics.unsteered import SkidSteer
 
-MAX_SLIP_RATIO = 1.15
-
 
 @dataclass(frozen=True)
 class MeasuredCircle:
@@ -90,7 +88,7 @@ def skid_model(
     require_positive("half_track", half_track)
     # 3.0: bounds of a plausible fit: gain of one side over the other, and ICRs in half tracks
     far = 3.0 * half_track if bounded else 100.0 * half_track
-    slip = MAX_SLIP_RATIO if bounded else 10.0
+    slip = 1.15 if bounded else 10.0
     near = 0.1 * half_track
     table: dict[str, tuple[float, float, float]] = {
         "gain": (1.0, 0.3, 3.0),

@@ -34,8 +34,6 @@ from monstertruck_kinematics.wheels import SwedishWheel, Wheel
 
 _CASTER: Final = 0.05
 """Mass of a caster, kg."""
-_CASTER_SHARE: Final = 0.1
-"""Share of the weight on every caster."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,11 +89,12 @@ def platform_description(
     links = [Part("base", body, centre, box_inertia(body, (size.length, size.width, 0.1)), (deck,))]
     joints: list[PartJoint] = []
     weight = sprung * GRAVITY
-    share = (1.0 - _CASTER_SHARE * len(casters)) / len(wheels)
+    caster_share = 0.1  # share of the weight on every caster
+    share = (1.0 - caster_share * len(casters)) / len(wheels)
     roll = pitch = 0.0
     for name, x, y, radius, load in (
         *((frame_name(w), w.x, w.y, w.radius, share * weight) for w in wheels),
-        *((c.name, c.x, c.y, c.radius, _CASTER_SHARE * weight) for c in casters),
+        *((c.name, c.x, c.y, c.radius, caster_share * weight) for c in casters),
     ):
         spring = load / parts.droop if parts.spring is None else parts.spring
         roll, pitch = roll + spring * y * y, pitch + spring * x * x

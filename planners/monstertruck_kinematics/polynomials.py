@@ -24,8 +24,6 @@ F_PRINTED: Coefficients = (-0.0082, -0.0162, -0.00605, -0.0192, 0.6691, 0.0)
 F_CORRECTED: Coefficients = (-0.0082, -0.0162, -0.0605, -0.0192, 0.6691, 0.0)
 G_PRINTED: Coefficients = (0.0126, -0.0432, 0.0067, -0.0851, 0.9997, 0.0035)
 
-_NEWTON_STEPS = 30
-
 
 def mirrored(coefficients: Coefficients) -> Coefficients:
     """Coefficients of -p(-x): the even powers change sign."""
@@ -110,7 +108,7 @@ class AxlePolynomials:
         f, g = self.left_from_servo, self.right_from_left
         df, dg = self._slopes
         servo = clip(axle / f[-2], -self.servo_limit, self.servo_limit)
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(30):  # Newton steps
             left = polynomial(f, servo)
             left_tangent, right_tangent = tan(left), tan(polynomial(g, left))
             error = 0.5 * (left_tangent + right_tangent) - target

@@ -102,8 +102,6 @@ class TimedRamp:
         return t - self.begin >= self.shape.duration
 
 
-_SHORTEST: Final = 1e-3
-"""Duration from which on ramps are tried, s."""
 _COARSE: Final = np.linspace(0.0, 1.0, 97)
 _FINE: Final = np.linspace(0.0, 1.0, 65)
 """Shares of the span, of its logarithm and of one of its parts, that are tried."""
@@ -132,7 +130,8 @@ def shortest_ramp(v0: float, a0: float, v1: float, max_acceleration: float, max_
     limit = max(max_acceleration, abs(a0)) * (1.0 + 1e-9)
     change, jerk = v1 - v0, max_jerk * (1.0 + 1e-9)
     long = 2.0 * abs(change) / max_acceleration + 8.0 * (limit / max_jerk) + (6.0 * abs(change) / max_jerk) ** 0.5
-    times = _SHORTEST * np.exp(_COARSE * math.log(max(long, 1e-2) / _SHORTEST))
+    shortest = 1e-3  # duration from which on ramps are tried, s
+    times = shortest * np.exp(_COARSE * math.log(max(long, 1e-2) / shortest))
     found = _kept(times, change, a0, limit, jerk)
     first = int(np.argmax(found))
     if first == 0:

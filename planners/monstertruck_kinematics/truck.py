@@ -57,9 +57,6 @@ Range = tuple[float, float]
 
 FULL: Final[Range] = (-SERVO_LIMIT, SERVO_LIMIT)
 
-_ROUNDS: Final = 30
-_CONVERGED: Final = 1e-11
-
 
 @dataclass(frozen=True)
 class DriveTrain:
@@ -455,9 +452,9 @@ class LinkedAxles(Axles):
         ff, fr, rf, rr = 1.0 / slope_f, 0.0, 0.0, 1.0 / slope_r
         servo_f, servo_r = 0.0, 0.0
         got_f, got_r = self._tangents(servo_f, servo_r)
-        for _ in range(_ROUNDS):
+        for _ in range(30):
             off_f, off_r = target_f - got_f, target_r - got_r
-            if abs(off_f) + abs(off_r) < _CONVERGED:
+            if abs(off_f) + abs(off_r) < 1e-11:  # rad
                 break
             new_f = min(max(servo_f + ff * off_f + fr * off_r, -limit_f), limit_f)
             new_r = min(max(servo_r + rf * off_f + rr * off_r, -limit_r), limit_r)

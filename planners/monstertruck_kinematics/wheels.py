@@ -166,9 +166,6 @@ def sliding_matrix(wheels: Sequence[Wheel]) -> Array:
     return np.array([row for row in rows if row is not None]).reshape(-1, 3)
 
 
-RANK_TOLERANCE = 1e-9
-"""Singular value, relative to the largest, up to which rows count as dependent."""
-
 IcrKind = Literal["none", "point", "infinite", "line", "anywhere"]
 
 
@@ -205,7 +202,7 @@ class Mobility:
         return self.mobility, self.steerability
 
 
-def analyse(wheels: Sequence[Wheel], tolerance: float = RANK_TOLERANCE) -> Mobility:
+def analyse(wheels: Sequence[Wheel], tolerance: float = 1e-9) -> Mobility:
     """Mobility of the wheels at their current headings.
 
     Lengths are scaled by the robot's size about its middle, so neither the unit nor the frame's origin matters.
@@ -214,7 +211,8 @@ def analyse(wheels: Sequence[Wheel], tolerance: float = RANK_TOLERANCE) -> Mobil
 
     Args:
         wheels: any wheels; steered ones may contradict each other (then nothing moves: mobility 0).
-        tolerance: see ``RANK_TOLERANCE``; larger for headings that were rounded.
+        tolerance: singular value, relative to the largest, up to which rows count as dependent; larger for headings
+            that were rounded.
 
     Raises:
         KinematicsError: no wheels, or two of one name.

@@ -66,10 +66,7 @@ log = logging.getLogger(__name__)
 
 M = TypeVar("M", bound=Message)
 
-_HOP_DEPTH = 1024
 
-LOOK: Final = 0.5
-"""Seconds in which the robots that are there answer."""
 ORDER_TIMEOUT: Final = 6.0
 """Seconds to wait for the outcome of an order: the robot itself gives up after 5 s."""
 
@@ -215,9 +212,7 @@ class TruckClient(Operator):
             delivery: ``latest()`` or ``fifo(n)``.
         """
         mailbox: Mailbox[M] = Mailbox(delivery, self._unsubscribe)
-        hop: ThreadHop[bytes] = ThreadHop(
-            partial(_deliver, topic, mailbox), max(_HOP_DEPTH, delivery.depth), mailbox.lose
-        )
+        hop: ThreadHop[bytes] = ThreadHop(partial(_deliver, topic, mailbox), max(1024, delivery.depth), mailbox.lose)
 
         def receive(sample: zenoh.Sample) -> None:
             hop.put(sample.payload.to_bytes())
@@ -627,8 +622,9 @@ class TruckClient(Operator):
 
     async def _absent(self) -> NotFoundError | NoAnswerError:
         """That the robot is not there, and which ones are; or that it is, and does not answer."""
+        look = 0.5  # seconds in which the robots that are there answer
         # One that requires certificates shows itself only to who asks for it by name.
-        seen = await asyncio.gather(self._seen("*", LOOK), self._seen(self.robot, LOOK))
+        seen = await asyncio.gather(self._seen("*", look), self._seen(self.robot, look))
         names = sorted({name for some in seen for name in some})
         if self.robot in names:
             why = f"it is starting or ending, or takes nothing from {self.source!r}"

@@ -16,7 +16,6 @@ from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.stations import own_source, session_config, tls_for
 
 ENCODING: Final = "application/json;monstertruck.ControlRequest;v=1"
-LEASE: Final = 1.0
 
 
 def estop_key(robot: str, source: str) -> str:
@@ -26,7 +25,7 @@ def estop_key(robot: str, source: str) -> str:
 
 def estop_payload(source: str) -> bytes:
     """The order; its stamps and number are 0, for the robot trusts neither without its nonce."""
-    header = {"stamp": 0, "received": 0, "seq": 0, "source": source, "role": "station", "lease": LEASE, "nonce": ""}
+    header = {"stamp": 0, "received": 0, "seq": 0, "source": source, "role": "station", "lease": 1.0, "nonce": ""}
     return json.dumps(header | {"order": "estop"}).encode()
 
 

@@ -21,14 +21,13 @@ EVERYWHERE: Final = ("0.0.0.0", "::")  # noqa: S104
 """Addresses at which a program listens on all interfaces."""
 ANSWERS_WITHIN: Final = 0.2
 """Timeout of a connection to a program on this machine (s)."""
-_LAST_PORT: Final = 65_535
 
 
 def is_endpoint(text: str) -> bool:
     """Whether ``text`` has the form of an endpoint: a protocol that Zenoh knows, and an address."""
     if protocol_of(text) in _ADDRESSED:
         port = port_of(text)
-        return bool(host_of(text)) and port is not None and port <= _LAST_PORT
+        return bool(host_of(text)) and port is not None and port <= 65_535
     return protocol_of(text) in _OTHERS and bool(_address(text))
 
 

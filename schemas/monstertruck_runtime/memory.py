@@ -7,9 +7,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-HUGE: Final = 2 * 1024 * 1024
-"""Bytes of a huge page; where it is another size the kernel refuses, and nothing is lost."""
-
 _LIBRARY: Final = ctypes.CDLL(None)
 
 
@@ -22,11 +19,12 @@ def settle() -> None:
     """
     gc.collect()
     gc.freeze()
+    huge = 2 * 1024 * 1024  # bytes of a huge page; where it is another size the kernel refuses, and nothing is lost
     with suppress(OSError):  # /proc may be hidden
         for begin, end in _heaps():
-            for page in range(-(-begin // HUGE) * HUGE, end - HUGE + 1, HUGE):
+            for page in range(-(-begin // huge) * huge, end - huge + 1, huge):
                 # 25: see madvise(2), Linux 6.1 and later; the C library's headers came later
-                _LIBRARY.madvise(ctypes.c_void_p(page), ctypes.c_size_t(HUGE), 25)
+                _LIBRARY.madvise(ctypes.c_void_p(page), ctypes.c_size_t(huge), 25)
 
 
 def give_back() -> None:

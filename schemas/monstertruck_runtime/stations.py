@@ -19,8 +19,6 @@ from monstertruck_runtime.errors import NotFoundError, NotPermittedError
 
 TLS_VARIABLE: Final = "MONSTERTRUCKD_TLS"
 """Names the folder of the station's certificate."""
-LONGEST_SOURCE: Final = 64
-"""Characters of a source's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,14 +148,15 @@ def own_source(owner: str | None = None, program: str = "") -> str:
     """
     end = f"{os.getpid()}{'-' * bool(program)}{program}"
     host = _plain(socket.gethostname())
+    longest_source = 64  # characters of a source's name
     if owner is not None:
-        room = LONGEST_SOURCE - len(owner) - 1
-        return f"{owner}:{host[: max(room - len(end) - 1, 0)]}-{end[-max(room - 1, 0) :]}"[:LONGEST_SOURCE]
+        room = longest_source - len(owner) - 1
+        return f"{owner}:{host[: max(room - len(end) - 1, 0)]}-{end[-max(room - 1, 0) :]}"[:longest_source]
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user id without a name
         user = str(os.getuid())
-    return f"{_plain(user)}@{host}"[: LONGEST_SOURCE - len(end) - 1] + f":{end}"
+    return f"{_plain(user)}@{host}"[: longest_source - len(end) - 1] + f":{end}"
 
 
 def tls_for(endpoint: str) -> ClientTls | None:

@@ -61,10 +61,6 @@ class CalibrationHealth(Message):
     """Total distance driven, m."""
 
 
-LATE: Final = 0.02
-"""Lateness of the control tick that counts as late, s: a whole period."""
-
-
 class LoopHealth(Message):
     """Punctuality of the control tick over the last second and since the start."""
 
@@ -78,8 +74,8 @@ class LoopHealth(Message):
 
     @property
     def busy(self) -> str:
-        """That the daemon gets too little processor time, in words; empty while ticks are less than ``LATE`` late."""
-        if self.lateness_p99 <= LATE:
+        """That the daemon gets too little processor time, in words; empty while ticks are less than 20 ms late."""
+        if self.lateness_p99 <= 0.02:  # lateness of the control tick that counts as late, s: a whole period
             return ""
         return f"the computer is busy: control ticks come {self.lateness_p99 * 1e3:.0f} ms late; end other programs"
 

@@ -18,8 +18,6 @@ from monstertruck_runtime.errors import InputError
 
 BOOT: Final = 300_000_000
 """Nanoseconds from power-up to the first frame."""
-DRIFT: Final = radians(0.5) / 60
-"""Of the heading, rad/s, greatest."""
 FUSION: Final = 0.5
 """Time constant with which pitch and roll follow the accelerometer's vertical, s."""
 NOISE: Final = 4.0
@@ -49,7 +47,8 @@ class Bno085Emulator:
         self._source = source
         self._rng = np.random.default_rng(seed)
         self.signals = Signals(clock.now, dict.fromkeys(REPORTED, SignalKind.NUMBER), self._rng)
-        self._drift = float(self._rng.uniform(-DRIFT, DRIFT))
+        drift = radians(0.5) / 60  # of the heading, rad/s, greatest
+        self._drift = float(self._rng.uniform(-drift, drift))
         self._faults = {"frozen": False, "silent": False}
         self._bad_checksums = self._skip = 0
         self.power_cycle()

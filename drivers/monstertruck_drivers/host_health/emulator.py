@@ -11,8 +11,6 @@ from monstertruck_runtime.errors import InputError
 PERIOD: Final = 0.5
 """Seconds between two writes."""
 CORES: Final = 4
-MAX_KILOHERTZ: Final = 1_800_000
-MEMORY_KIB: Final = 4_000_000
 
 
 class HostEmulator:
@@ -91,8 +89,9 @@ class HostEmulator:
         rows += [f"cpu{core} {self._busy_ticks // CORES} 0 0 {idle // CORES} 0 0 0 0 0 0" for core in range(CORES)]
         self._files.put("proc/stat", "" if self._broken else "\n".join([*rows, "intr 1", "ctxt 2"]))
         self._files.put("proc/loadavg", f"{self._busy * CORES:.2f} 0.90 0.80 1/200 4711")
-        available = round(MEMORY_KIB * self._memory)
-        self._files.put("proc/meminfo", f"MemTotal: {MEMORY_KIB} kB\nMemFree: 1 kB\nMemAvailable: {available} kB")
+        memory_kib = 4_000_000
+        available = round(memory_kib * self._memory)
+        self._files.put("proc/meminfo", f"MemTotal: {memory_kib} kB\nMemFree: 1 kB\nMemAvailable: {available} kB")
         self._files.put("proc/self/statm", "20000 12000 3000 1 0 9000 0")
         for descriptor in range(7):
             self._files.put(f"proc/self/fd/{descriptor}", "")
@@ -105,11 +104,12 @@ class HostEmulator:
         self._files.put("sys/class/thermal/thermal_zone0/temp", str(round(self._celsius * 1000)))
         self._files.put("sys/class/thermal/thermal_zone1/temp", "-274000")
         self._files.put(FIRMWARE_THROTTLED, f"{self._firmware:x}")
+        max_kilohertz = 1_800_000
         for core in range(CORES):
             folder = f"sys/devices/system/cpu/cpu{core}"
-            self._files.put(f"{folder}/cpufreq/cpuinfo_max_freq", str(MAX_KILOHERTZ))
-            self._files.put(f"{folder}/cpufreq/scaling_max_freq", str(round(MAX_KILOHERTZ * self._cap)))
-            self._files.put(f"{folder}/cpufreq/scaling_cur_freq", str(round(MAX_KILOHERTZ * self._cap * 0.9)))
+            self._files.put(f"{folder}/cpufreq/cpuinfo_max_freq", str(max_kilohertz))
+            self._files.put(f"{folder}/cpufreq/scaling_max_freq", str(round(max_kilohertz * self._cap)))
+            self._files.put(f"{folder}/cpufreq/scaling_cur_freq", str(round(max_kilohertz * self._cap * 0.9)))
             self._files.put(f"{folder}/thermal_throttle/core_throttle_count", str(self._throttled))
 
 

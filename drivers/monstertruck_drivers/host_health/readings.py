@@ -16,7 +16,6 @@ from monstertruck_runtime.errors import DeviceError, ProtocolError
 from monstertruck_runtime.small_files import number_of, text_of
 
 FIRMWARE_THROTTLED: Final = "sys/devices/platform/soc/soc:firmware/get_throttled"
-THROTTLED_NOW: Final = 0xF
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +165,6 @@ def _shares(cpus: Path) -> Iterator[float]:
 
 def _firmware_throttled(file: Path) -> bool:
     try:
-        return bool(int(text_of(file) or "0", 16) & THROTTLED_NOW)
+        return bool(int(text_of(file) or "0", 16) & 0xF)  # bits that say what holds now
     except ValueError:
         return False

@@ -8,9 +8,6 @@ from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 
-LOOK = 0.5
-"""Seconds for which frames are collected."""
-
 
 async def probe(port: Port, clock: Clock, settings: ReceiverConfig | None = None) -> dict[str, object]:
     """Listen for half a second.
@@ -23,13 +20,14 @@ async def probe(port: Port, clock: Clock, settings: ReceiverConfig | None = None
         DeviceError: see the driver's ``run``.
     """
     config = settings or CrsfConfig()
+    look = 0.5  # seconds for which frames are collected
     async with await port.open() as link:
         stream = DeviceStream(link, clock, parser_of(config).feed)
         frames = await first_frames(stream, config)
-        until = clock.now() + round(LOOK * 1e9)
+        until = clock.now() + round(look * 1e9)
         while clock.now() < until:
             try:
-                frames += await stream.receive(LOOK)
+                frames += await stream.receive(look)
             except (DeviceTimeoutError, ProtocolError):
                 break
     channels = next((frame.channels for frame in reversed(frames) if frame.channels is not None), None)

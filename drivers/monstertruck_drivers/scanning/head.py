@@ -11,8 +11,6 @@ from monstertruck_drivers.emulation import Array, BeamSource, RangeSheet
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-SPIN_UP: Final = 0.4
-"""Time constant of the motor, s."""
 TURNING: Final = 0.5
 """Share of the set speed from which on the head measures."""
 LEAST_CODE: Final = 20
@@ -77,8 +75,9 @@ class TurningHead:
         """Angles at instants of its own clock, shape (n,), turns; the last one becomes the newest instant."""
         target = 0.0 if self._blocked else self.frequency
         passed = times / SECOND - self._at
-        fading = np.exp(-np.maximum(passed, 0.0) / SPIN_UP)
-        turned: Array = self._turned + target * passed + (self._speed - target) * SPIN_UP * (1.0 - fading)
+        spin_up = 0.4  # time constant of the motor, s
+        fading = np.exp(-np.maximum(passed, 0.0) / spin_up)
+        turned: Array = self._turned + target * passed + (self._speed - target) * spin_up * (1.0 - fading)
         self._at, self._turned = float(times[-1]) / SECOND, float(turned[-1]) % 1.0
         self._speed = target + (self._speed - target) * float(fading[-1])
         return turned

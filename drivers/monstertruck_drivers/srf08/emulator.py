@@ -23,12 +23,9 @@ from monstertruck_drivers.srf08.protocol import (
 from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-FIRMWARE: Final = 8
 ANSWER: Final = MILLISECOND
 """Nanoseconds that a command takes on USB and I2C."""
 SOUND: Final = 343.0
-JITTER: Final = 3.0
-"""Standard deviation of a flight time, us."""
 
 
 @dataclass(slots=True)
@@ -138,7 +135,7 @@ class Srf08Emulator:
     def _answer(self, command: bytes) -> bytes:
         if command[0] == ISS:
             if command[1] == 0x01:
-                return bytes((MODULE, FIRMWARE, 0x60 if self._i2c else 0x00))
+                return bytes((MODULE, 8, 0x60 if self._i2c else 0x00))  # firmware of the USB-ISS
             self._i2c = command[1] == 0x02 and 0x20 <= command[2] <= 0x80
             return bytes((ACK, 0)) if self._i2c else b"\x00\x05"
         if command[0] != I2C_AD1:
@@ -176,16 +173,17 @@ class Srf08Emulator:
             self.signals.order(f"ping_{module.name}", None, ping)
 
     def _read(self, module: Module) -> bytes:
+        jitter = 3.0  # standard deviation of a flight time, us
         if module.pending:
             module.pending = False
             distance = self._source.range(module.name)
             module.microseconds = 0
             if distance < inf:
-                flight = 2e6 * distance / SOUND + JITTER * float(self._rng.standard_normal())
+                flight = 2e6 * distance / SOUND + jitter * float(self._rng.standard_normal())
                 if flight < ranging_time(module.range) * 1e6:
                     module.microseconds = max(1, round(flight))
             if module.ghost is not None:
-                module.microseconds = module.ghost + round(JITTER * float(self._rng.standard_normal()))
+                module.microseconds = module.ghost + round(jitter * float(self._rng.standard_normal()))
         echo = module.microseconds if module.stuck is None else module.stuck
         echo = min(max(self.signals.report(f"echo_{module.name}", echo), 0), 0xFFFF)
         return bytes((10, module.light, echo >> 8 & 0xFF, echo & 0xFF)) + bytes(32)  # software of the sonars

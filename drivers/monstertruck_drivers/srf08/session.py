@@ -1,14 +1,9 @@
 """Requests and replies, with a USB-ISS and the sonars behind it; shared by driver and probe."""
 
-from typing import Final
-
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.srf08 import protocol
 from monstertruck_drivers.srf08.protocol import ACK, MODULE, READ_SIZE, Srf08Reading
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
-
-ATTEMPTS: Final = 3
-"""A host that died may have left half a command, which the USB-ISS drops after a pause."""
 
 
 class Srf08Session:
@@ -49,7 +44,8 @@ class Srf08Session:
             ProtocolError: it refuses the mode.
         """
         answer = b""
-        for attempt in range(ATTEMPTS):
+        attempts = 3  # a host that died may have left half a command, which the USB-ISS drops after a pause
+        for attempt in range(attempts):
             self._link.discard()
             try:
                 answer = await self.ask(protocol.VERSION, 3)
@@ -57,7 +53,7 @@ class Srf08Session:
             except DeviceTimeoutError:
                 if self._link.discard():
                     answer = b"?"
-                if attempt == ATTEMPTS - 1 and not answer:
+                if attempt == attempts - 1 and not answer:
                     raise
         if len(answer) != 3 or answer[0] != MODULE:
             raise WrongDeviceError(f"{self._link.name}: {answer.hex(' ')} is not the answer of a USB-ISS")

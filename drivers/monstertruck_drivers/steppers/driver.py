@@ -33,8 +33,6 @@ from monstertruck_schemas.sensor import DriveFeedback, DriveMode
 
 SAFE_DEADLINE: Final = 0.4
 """Seconds a session may take at its end to stop the motors and switch them off."""
-UPTIME_SLACK: Final = 200
-"""Ms by which the controller's uptime may lag behind the host's time between two answers."""
 NOISE_WINDOW: Final = 10 * SECOND
 
 MODES: Final = {
@@ -234,11 +232,12 @@ class StepperDriver:
             DeviceRestartedError: it did, while it was in use.
         """
         now = self._clock.now()
+        uptime_slack = 200  # ms by which the controller's uptime may lag behind the host's time between two answers
         if self._last is not None:
             before, then = self._last
             passed = (status.uptime_ms - before.uptime_ms) % (1 << 32)
             elapsed = (now - then) / 1e6
-            if not -UPTIME_SLACK <= passed - elapsed <= UPTIME_SLACK + elapsed:
+            if not -uptime_slack <= passed - elapsed <= uptime_slack + elapsed:
                 self._last = None
                 self._events(Reason.DEVICE_RESTARTED, Severity.WARNING, self.name, "the controller restarted")
                 if before.state is not MotorState.OFF:

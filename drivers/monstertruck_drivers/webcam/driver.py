@@ -14,7 +14,6 @@ from monstertruck_schemas.sensor import CompressedImage
 START: Final = b"\xff\xd8"
 END: Final = b"\xff\xd9"
 _HUFFMAN: Final = 0xC4
-_SCAN: Final = 0xDA
 _FRAME_HEADERS: Final = frozenset(range(0xC0, 0xD0)) - {_HUFFMAN, 0xC8, 0xCC}
 
 _TABLES: Final = bytes.fromhex(
@@ -57,7 +56,7 @@ def _follow(data: bytes) -> tuple[int, bool]:
     at, has_tables, has_frame = len(START), False, False
     while at + 4 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
-        if marker == _SCAN and has_frame:
+        if marker == 0xDA and has_frame:  # start of scan
             return at, has_tables
         has_tables |= marker == _HUFFMAN
         has_frame |= marker in _FRAME_HEADERS

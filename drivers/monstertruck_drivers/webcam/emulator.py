@@ -42,16 +42,12 @@ def _font() -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 SIZES: Final = ((1600, 1200), (1280, 720), (800, 600), (640, 480), (320, 240), (160, 120))
 """Sizes offered; like a real driver it grants the nearest one."""
 RATE_MAX: Final = 30.0
-LINE_LIMIT: Final = 256
 SIGNALS: Final = {
     "image": SignalKind.THING,
     "stamp": SignalKind.NUMBER,
     "open": SignalKind.SWITCH,
     "close": SignalKind.SWITCH,
 }
-CHUNK: Final = 4095
-"""Bytes written at a time: as many as the reader of a pty gets in one go."""
-CHUNK_PAUSE: Final = 0.0002
 
 REFUSALS: Final = {"EINVAL": errno.EINVAL, "EBUSY": errno.EBUSY, "ENOSPC": errno.ENOSPC, "off": 0}
 
@@ -145,7 +141,7 @@ class WebcamEmulator:
     async def _listen(self, end: DeviceEnd) -> None:
         buffer = b""
         while True:
-            *lines, buffer = (buffer + await end.read())[-LINE_LIMIT:].split(b"\n")
+            *lines, buffer = (buffer + await end.read())[-256:].split(b"\n")  # bytes of a line at most
             for line in lines:
                 self._obey(end, line)
 
@@ -194,9 +190,10 @@ class WebcamEmulator:
         stamp = self.signals.report("stamp", stamp)
         data = self._damaged(await self._offload(lambda: jpeg(draw(), number)))
         packet = CameraPacket(PacketKind.PICTURE, number, stamp + self._jump, data).encode()
-        for at in range(0, len(packet), CHUNK):
-            await self._clock.sleep(CHUNK_PAUSE)
-            end.write(packet[at : at + CHUNK])
+        chunk = 4095  # bytes written at a time: as many as the reader of a pty gets in one go
+        for at in range(0, len(packet), chunk):
+            await self._clock.sleep(0.0002)  # s
+            end.write(packet[at : at + chunk])
 
     def _damaged(self, data: bytes) -> bytes:
         if self._bare:

@@ -14,7 +14,6 @@ from monstertruck_drivers.webcam.source import Mode
 from monstertruck_runtime.errors import ProtocolError
 
 MAGIC: Final = b"\x89MTC"
-PAYLOAD_LIMIT: Final = 1 << 22
 _HEADER: Final = struct.Struct("<4sB3xIqI")
 _CRC: Final = struct.Struct("<I")
 _MODE: Final = struct.Struct("<IId")
@@ -108,7 +107,8 @@ class PacketParser:
             header = bytes(self._buffer[: _HEADER.size])
             _, kind, number, stamp, length = _HEADER.unpack(header)
             (crc,) = _CRC.unpack(self._buffer[_HEADER.size : HEADER_SIZE])
-            if crc == zlib.crc32(header) and length <= PAYLOAD_LIMIT and kind in list(PacketKind):
+            # 1 << 22: bytes of a payload at most
+            if crc == zlib.crc32(header) and length <= 1 << 22 and kind in list(PacketKind):
                 del self._buffer[:HEADER_SIZE]
                 self._header = PacketKind(kind), number, stamp, length
                 return True

@@ -21,7 +21,6 @@ MMAP: Final = 1
 """V4L2_MEMORY_MMAP."""
 DISCRETE: Final = 1
 """V4L2_FRMSIZE_TYPE_DISCRETE and V4L2_FRMIVAL_TYPE_DISCRETE."""
-ANY_FIELD: Final = 0
 MJPG: Final = int.from_bytes(b"MJPG", "little")
 
 CAP_CAPTURE: Final = 0x1
@@ -29,7 +28,6 @@ CAP_STREAMING: Final = 0x04000000
 CAP_DEVICE_CAPS: Final = 0x80000000
 """The node's own capabilities are given in addition to those of the whole device."""
 FLAG_ERROR: Final = 0x40
-TIMESTAMP_MASK: Final = 0xE000
 TIMESTAMP_MONOTONIC: Final = 0x2000
 
 CAPABILITY: Final = struct.Struct("@16s32s32s6I")
@@ -131,7 +129,7 @@ class Filled:
     def unpack(cls, data: Bytes) -> "Filled":
         """Read the kernel's structure."""
         index, _, used, flags, _, seconds, micros, *_, sequence, _, offset, length, _, _ = BUFFER.unpack(data)
-        monotonic = flags & TIMESTAMP_MASK == TIMESTAMP_MONOTONIC
+        monotonic = flags & 0xE000 == TIMESTAMP_MONOTONIC  # bits of the clock of its stamps
         stamp = seconds * SECOND + micros * 1000 if monotonic else None
         return cls(index, used, flags, stamp, sequence, offset & 0xFFFFFFFF, length)
 
@@ -143,7 +141,7 @@ def buffer(index: int) -> bytearray:
 
 def format_request(mode: Mode) -> bytearray:
     """Argument of S_FMT for motion JPEG."""
-    return bytearray(FORMAT.pack(CAPTURE, mode.width, mode.height, MJPG, ANY_FIELD, *([0] * 8)))
+    return bytearray(FORMAT.pack(CAPTURE, mode.width, mode.height, MJPG, 0, *([0] * 8)))  # any field order
 
 
 def format_granted(data: Bytes) -> tuple[int, int, int]:

@@ -4,21 +4,20 @@ from math import exp
 
 from monstertruck_sim.world.config import BatteryModelConfig
 
-CELLS = 6
 _CELL_VOLTS = (
     3.27, 3.61, 3.69, 3.71, 3.73, 3.75, 3.77, 3.79, 3.80, 3.82, 3.84,
     3.85, 3.87, 3.91, 3.95, 3.98, 4.02, 4.08, 4.11, 4.15, 4.20,
 )  # fmt: skip
 """At charges in steps of 5 %."""
-_STEPS = len(_CELL_VOLTS) - 1
 
 
 def rest_voltage(charge: float) -> float:
     """Open-circuit volts of the pack at a charge of 0..1 (the table in common circulation, 5 % steps)."""
-    place = min(max(charge, 0.0), 1.0) * _STEPS
-    below = min(int(place), _STEPS - 1)
+    steps = len(_CELL_VOLTS) - 1
+    place = min(max(charge, 0.0), 1.0) * steps
+    below = min(int(place), steps - 1)
     low, high = _CELL_VOLTS[below], _CELL_VOLTS[below + 1]
-    return CELLS * (low + (high - low) * (place - below))
+    return 6 * (low + (high - low) * (place - below))  # cells in series
 
 
 class BatteryModel:

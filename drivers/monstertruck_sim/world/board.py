@@ -18,8 +18,6 @@ ASIDE: float = 0.5
 """Greatest distance of the board's middle from the camera's axis, as a share of half the picture's width."""
 BELOW: float = 0.4
 """Greatest distance above or below the axis, as a share of half the picture's width."""
-UPRIGHT: float = 0.35
-"""Turn about the camera's axis, rad, at most."""
 
 
 class BoardHolder:
@@ -51,7 +49,8 @@ def held(board: HeldBoard, place: CameraPlace, rng: np.random.Generator, field_o
     away = rng.uniform(0.9, 1.7) * max(wide, high) / math.tan(field_of_view / 2)
     aside, below = rng.uniform(-ASIDE, ASIDE), rng.uniform(-BELOW, BELOW)
     aside, below = (part * away * math.tan(field_of_view / 2) for part in (aside, below))
-    spin, tilt = rng.uniform(-UPRIGHT, UPRIGHT), rng.uniform(-0.55, 0.55)
+    upright = 0.35  # turn about the camera's axis, rad, at most
+    spin, tilt = rng.uniform(-upright, upright), rng.uniform(-0.55, 0.55)
     lean = float(rng.choice((-1.0, 1.0))) * rng.uniform(0.3, 0.7)
     # Its axes in the camera's: right and down, turned about the axis, then tilted.
     right = np.array((math.cos(spin) * math.cos(tilt), math.sin(spin) * math.cos(tilt), math.sin(tilt)))

@@ -23,7 +23,6 @@ _WALL = 0.1
 
 LOOP_LENGTH, LOOP_WIDTH, LOOP_RADIUS = 4.6, 3.4, 1.0
 """Rounded rectangle of the lap: 14.28 m, 71 s at 0.2 m/s."""
-LOOP_CORRIDOR = 1.2
 
 
 def _widened(cells: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
@@ -80,7 +79,7 @@ def loop() -> BuiltIn:
     dx = np.maximum(abs(canvas.xs) - (LOOP_LENGTH / 2 - LOOP_RADIUS), 0)
     dy = np.maximum(abs(canvas.ys) - (LOOP_WIDTH / 2 - LOOP_RADIUS), 0)
     # Inside the straight core the distance to the rounded rectangle does not matter: the block stands there.
-    canvas.free = abs(np.hypot(dx, dy) - LOOP_RADIUS) < LOOP_CORRIDOR / 2
+    canvas.free = abs(np.hypot(dx, dy) - LOOP_RADIUS) < 1.2 / 2  # width of the corridor, m
     for niche in ((1.6, 2.2, 2.9, 2.45), (-1.3, 2.2, -0.4, 2.5), (-0.2, -2.6, 0.5, -2.2), (2.8, -0.5, 3.2, 0.2)):
         canvas.free |= canvas.rectangle(*niche)
     for corner in ((2.2, -2.25, 2.85, -1.6), (-2.85, -2.3, -2.2, -1.6), (-2.8, 1.6, -2.2, 2.2)):

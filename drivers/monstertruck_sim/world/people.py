@@ -17,7 +17,6 @@ SIDE = 0.25
 """What is further than this from the way somebody sweeps is passed, m."""
 _TURNS = (pi / 6, -pi / 6, pi / 3, -pi / 3, pi / 2, -pi / 2)
 _TRIES = 400
-_HISTORY = 40
 
 Free = Callable[[float, float, float], bool]
 """Whether a disc at x, y of a radius touches nothing of the map, m."""
@@ -67,7 +66,7 @@ class Person:
         self._waited = 0.0
         self._target = (self.x, self.y)
         self._choose()
-        self._trail: deque[tuple[int, float, float]] = deque(maxlen=_HISTORY)
+        self._trail: deque[tuple[int, float, float]] = deque(maxlen=40)
 
     @property
     def pace(self) -> float:

@@ -19,9 +19,6 @@ from monstertruck_sim.world.sonar import Solids
 from monstertruck_sim.world.terrain import LEVEL, Terrain, rocking
 from monstertruck_sim.world.truck_plant import TruckPlant
 
-_ROOM = 0.05
-"""Metres around the footprint: known to be free, they spare the contact test until the truck has crossed them."""
-
 
 class PlanOutline:
     """The robot's rectangle in the plane, among what is in its surroundings.
@@ -68,9 +65,11 @@ class PlanOutline:
     def _fixed(self, pose: Pose2) -> float:
         if self._known is not self.scene.obstacles:
             self._free, self._known = None, self.scene.obstacles
-        if self._free is not None and self._way(self._free, pose) < _ROOM:
+        # metres around the footprint: known to be free, they spare the contact test until the truck has crossed them
+        room = 0.05
+        if self._free is not None and self._way(self._free, pose) < room:
             return 0.0
-        self._free = pose if self._depth(pose, _ROOM) == 0.0 else None
+        self._free = pose if self._depth(pose, room) == 0.0 else None
         return 0.0 if self._free else self._depth(pose)
 
     def _way(self, a: Pose2, b: Pose2) -> float:

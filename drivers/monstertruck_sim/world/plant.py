@@ -16,7 +16,6 @@ from monstertruck_sim.world.actuators import RPM, Servo, Shaft
 from monstertruck_sim.world.battery import BatteryModel
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
 
-SERVO_FRAME_NS = 20_000_000
 GRAVITY = 9.81
 
 Xyz = tuple[float, float, float]
@@ -222,7 +221,7 @@ class Plant(ABC):
 
     def _turn_servos(self, dt: float) -> list[float]:
         """Angles of the servos after dt, rad."""
-        if self.pulses is not None and self._elapsed % SERVO_FRAME_NS == 0:
+        if self.pulses is not None and self._elapsed % 20_000_000 == 0:  # a servo frame, ns
             now = (self._start_ns or 0) + self._elapsed
             for servo, config in zip(self._servos, self.config.servos, strict=True):
                 servo.latch(self.pulses.pulse_us(config.channel, now) if self.servo_supply else None)

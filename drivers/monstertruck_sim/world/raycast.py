@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array
 
 Clearance = NDArray[np.uint8]
-_MOST = 255
 
 
 @njit(cache=True)
@@ -34,7 +33,7 @@ def clearance(occupied: NDArray[np.bool_]) -> Clearance:
     clear = np.empty((rows, columns), np.uint8)
     for row in range(rows):
         for column in range(columns):
-            least = 0 if occupied[row, column] else _MOST
+            least = 0 if occupied[row, column] else 255  # distances are counted up to this
             if row > 0:
                 for near in range(max(0, column - 1), min(columns, column + 2)):
                     least = min(least, clear[row - 1, near] + 1)

@@ -26,8 +26,6 @@ from monstertruck_sim.world.truck_plant import STEP_NS
 
 MOVING = 0.01
 """A body slower than this stands, m/s."""
-_RAYS = 64
-"""Rays of a sweep that meet the others at one instant: 6 ms of the lidar's revolution."""
 _WALK_NS = round(STEP_S * 1e9)
 
 
@@ -279,13 +277,14 @@ class Surroundings:
             now: list[Obstacle] = [*(body.outline for body in others), *(person.disc for person in self.people)]
             return self._cast(xs, ys, angles, reach, discs_and_segments((*self._obstacles, *now)))
         count = len(angles)
-        middles = times_ns[np.minimum(np.arange(0, count, _RAYS) + _RAYS // 2, count - 1)]
+        rays = 64  # rays of a sweep that meet the others at one instant: 6 ms of the lidar's revolution
+        middles = times_ns[np.minimum(np.arange(0, count, rays) + rays // 2, count - 1)]
         boxes = [body.outlines(middles) for body in others]
         elapsed = (middles - (self._start_ns or 0)).astype(float)
         walks = [(person.places(elapsed), person.radius) for person in self.people]
         ranges = np.empty(count)
-        for i, first in enumerate(range(0, count, _RAYS)):
-            part = slice(first, first + _RAYS)
+        for i, first in enumerate(range(0, count, rays)):
+            part = slice(first, first + rays)
             discs = [Disc(float(places[0, i]), float(places[1, i]), radius) for places, radius in walks]
             met = discs_and_segments((*self._obstacles, *(box[i] for box in boxes), *discs))
             ranges[part] = self._cast(xs[part], ys[part], angles[part], reach, met)

@@ -49,10 +49,8 @@ STEPS = 769
 SWEEP_NS = 100_000_000
 NO_RETURN, TOO_NEAR, FAILED = 0, 6, 19
 """Error codes of the scanner: nothing there; other error (never "free"); step cannot be measured."""
-_STEP_ANGLE = 2 * pi / 1024
-BEAM_ANGLES = (np.arange(STEPS) - 384) * _STEP_ANGLE
+BEAM_ANGLES = (np.arange(STEPS) - 384) * (2 * pi / 1024)
 _BEAM_DELAYS = (np.arange(STEPS) * (SWEEP_NS // 1024)).astype(np.int64)
-_LEVEL = 1e-4
 
 Beams = tuple[Array, Array, Array]
 """Directions: components x, y, z, each (n,)."""
@@ -102,7 +100,8 @@ class PlaneSweep:
         """As ``Sweep``."""
         x, y, yaw, pitch, roll, _ = poses
         xs, ys = self._places(x, y, yaw)
-        if beams is None and self._terrain is None and np.abs(poses[3:5]).max() < _LEVEL:
+        # 1e-4: tilt of a level robot at most, rad
+        if beams is None and self._terrain is None and np.abs(poses[3:5]).max() < 1e-4:
             return self._cast(xs, ys, yaw + BEAM_ANGLES, reach, times_ns)
         beams = turned(LEVEL_BEAMS if beams is None else beams, pitch, roll)
         if self._terrain is None:

@@ -5,14 +5,10 @@ whenever it reversed, and its circles wandered. Body parameters (turning centres
 """
 
 from math import copysign, cos, sin
-from typing import Final
 
 from monstertruck_kinematics.se2 import Twist2
 from monstertruck_sim.world.config import SkidModelConfig
 from monstertruck_sim.world.noise import SKID, generator
-
-TURNING_TIME: Final = 0.2
-"""Seconds that the turn at a reversal takes."""
 
 
 class SkidEffects:
@@ -40,10 +36,11 @@ class SkidEffects:
     def twist(self, twist: Twist2, yaw: float, dt: float) -> Twist2:
         """Velocity of the body, from what its wheels make of it; m/s, rad/s."""
         vx, vy, wz = twist
+        turning_time = 0.2  # seconds that the turn at a reversal takes
         if abs(vx) > 1e-3:  # slower robots stand, m/s
             direction = copysign(1.0, vx)
             if direction == -self._direction:
-                self._rate, self._left = self._turn() / TURNING_TIME, TURNING_TIME
+                self._rate, self._left = self._turn() / turning_time, turning_time
                 self._reversals += 1
             self._direction = direction
             x, y = self._config.drift_x, self._config.drift_y

@@ -25,7 +25,6 @@ from monstertruck_sim.world.sensors import turned
 
 SPEED_OF_SOUND: Final = 343.0
 """m/s, in air of 20 degrees Celsius."""
-_JUMP: Final = 0.12
 
 
 Solids = Callable[[float, float, float, float], Caster | None]
@@ -152,7 +151,7 @@ def _normals(x: Array, y: Array, ranges: Array) -> tuple[Array, NDArray[np.bool_
         # 0.2: neighbouring rays have an edge between them where their ranges differ by more, m, and their inverse
         # ranges by more of the greater one: along a straight wall these are near each other even where it is seen at a
         # grazing angle
-        gaps = (far - near > _JUMP) & (1.0 - near / far > 0.2)
+        gaps = (far - near > 0.12) & (1.0 - near / far > 0.2)  # m
     piece = np.concatenate([[0], np.cumsum(gaps)])
     scatters = np.zeros(count, dtype=np.bool_)
     # The nearer side of a jump within the cone is an edge.

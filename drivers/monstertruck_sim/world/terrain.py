@@ -13,9 +13,6 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_sim.world.config import RoughPatch, SinusoidTilt
 
-STEP = 0.05
-"""Horizontal distance between two looks along a beam, m."""
-
 
 @dataclass(frozen=True, slots=True)
 class Profile:
@@ -74,7 +71,8 @@ class Terrain:
             rises: metres upwards a metre of horizontal distance, (n,).
             reach: longest horizontal distance, m.
         """
-        ways = np.arange(0.0, reach + STEP, STEP)
+        step = 0.05  # horizontal distance between two looks along a beam, m
+        ways = np.arange(0.0, reach + step, step)
         x = xs[:, None] + np.cos(headings)[:, None] * ways
         y = ys[:, None] + np.sin(headings)[:, None] * ways
         above = zs[:, None] + rises[:, None] * ways - self.height(x, y)
@@ -82,7 +80,7 @@ class Terrain:
         beams = np.arange(len(xs))
         before, after = above[beams, first - 1], above[beams, first]
         with np.errstate(divide="ignore", invalid="ignore"):
-            met = ways[first] - STEP * after / (after - before)
+            met = ways[first] - step * after / (after - before)
         return np.where(above[beams, first] < 0.0, np.where(first > 0, met, 0.0), np.inf)
 
 

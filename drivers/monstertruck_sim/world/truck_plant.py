@@ -21,8 +21,6 @@ from monstertruck_sim.world.plant import GRAVITY, Plant, Xyz
 from monstertruck_sim.world.skid import SkidEffects
 
 STEP_NS = 5_000_000
-_FREED = 0.005
-_SLIP_PERIOD_NS = 200_000_000
 
 Contact = Callable[[float, float, float], float]
 """How deep the footprint at (x, y, yaw) reaches into things, m; 0 = free."""
@@ -67,7 +65,8 @@ class TruckPlant(Plant):
         self._tyres = _tyres(config, self._chassis)
         self._skid = SkidEffects(config.skid, seed) if config.body.kind == "skid_steer" else None
         self._contact, self._tilt = contact, tilt
-        self._noise = SlowNoise(seed, SLIP, 2 + count, _SLIP_PERIOD_NS) if seed is not None else None
+        # 200_000_000: period of the slip, ns
+        self._noise = SlowNoise(seed, SLIP, 2 + count, 200_000_000) if seed is not None else None
         self._wheel_speeds = [0.0] * count
         self._pulls = [0.0] * count
         self._felt = (0.0, 0.0)
@@ -163,7 +162,8 @@ class TruckPlant(Plant):
             self._twist = (0.0, 0.0, 0.0)
         else:
             self._pose, self._twist = pose, twist
-            if self._stuck_at and hypot(pose[0] - self._stuck_at[0], pose[1] - self._stuck_at[1]) > _FREED:
+            # 0.005: way from where it was stuck on which it is free, m
+            if self._stuck_at and hypot(pose[0] - self._stuck_at[0], pose[1] - self._stuck_at[1]) > 0.005:
                 self._stuck_at = None
         self._attitude = self._tilt(self._elapsed, *self._pose)
 

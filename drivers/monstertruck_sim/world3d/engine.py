@@ -6,7 +6,6 @@ heights by the project's own kernels: MuJoCo's rays cost 0.9 ms a scan against 4
 """
 
 from math import hypot, radians
-from typing import Final
 
 import mujoco
 import numpy as np
@@ -42,8 +41,6 @@ from monstertruck_sim.world3d.plant import RigidPlant, Steering
 
 _Shown = tuple[Obstacle, bool] | None
 """What a spare body stands for, and whether pictures show it: people are drawn as such; None = nothing."""
-_RAYS: Final = 64
-"""Beams that are cast at blocks from one origin; each is corrected for its own."""
 
 
 class LevelGround:
@@ -233,8 +230,9 @@ def to_blocks(plant: RigidPlant, places: Array, ways: Array, reach: float) -> Ar
     group = np.array([i == Group.BLOCKS for i in range(mujoco.mjNGROUP)], dtype=np.uint8)
     geoms, met = np.empty(count, dtype=np.int32), np.empty(count)
     ranges = np.full(count, np.inf)
-    for first in range(0, count, _RAYS):
-        part = slice(first, min(first + _RAYS, count))
+    rays = 64  # beams that are cast at blocks from one origin; each is corrected for its own
+    for first in range(0, count, rays):
+        part = slice(first, min(first + rays, count))
         size = part.stop - part.start
         middle = places[first + size // 2]
         mujoco.mj_multiRay(

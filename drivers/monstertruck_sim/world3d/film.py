@@ -20,7 +20,6 @@ SIZE: Final = (480, 320)
 """Pixels."""
 _BEHIND, _ASIDE, _ABOVE = 1.25, 0.7, 0.95
 """Place of the camera from the robot, m; it swings round behind a robot that turns."""
-_COLOURS: Final = 128
 _PLAIN: Final = Image.Dither.NONE
 
 
@@ -74,7 +73,7 @@ class Film:
         people = standing(self._world.scene.people_at(now), self._plant.ground)
         robots = self._world.scene.robots_beside(self._plant)
         picture = self._renderer.draw(self._plant.data, view, people=people, robots=robots)
-        self._pictures.add(Image.fromarray(picture).quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=_PLAIN))
+        self._pictures.add(Image.fromarray(picture).quantize(128, Image.Quantize.MAXCOVERAGE, dither=_PLAIN))  # colours
 
     def __enter__(self) -> Self:
         return self

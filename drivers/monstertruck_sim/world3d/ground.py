@@ -29,10 +29,6 @@ from monstertruck_sim.world3d.model import Block
 
 HEIGHT_STEP: Final = 0.05
 """Distance of the points of the height field, m."""
-_MARGIN: Final = 1.0
-"""The height field goes on so far beyond the map, m."""
-_EMBEDDED: Final = 0.05
-"""How deep blocks stand in the ground, m."""
 
 Bounds = tuple[float, float, float, float]
 """Least and greatest x, then y, m."""
@@ -55,7 +51,8 @@ def ground_heights(
     shaped = any(not isinstance(feature, UprightStep | Rubble) for feature in config.ground)
     if profile is None and not config.rough and not shaped and config.height_image is None:
         return None
-    x0, x1, y0, y1 = bounds[0] - _MARGIN, bounds[1] + _MARGIN, bounds[2] - _MARGIN, bounds[3] + _MARGIN
+    margin = 1.0  # the height field goes on so far beyond the map, m
+    x0, x1, y0, y1 = bounds[0] - margin, bounds[1] + margin, bounds[2] - margin, bounds[3] + margin
     columns, rows = (ceil((high - low) / HEIGHT_STEP) + 1 for low, high in ((x0, x1), (y0, y1)))
     x, y = np.meshgrid(x0 + np.arange(columns) * HEIGHT_STEP, y0 + np.arange(rows) * HEIGHT_STEP)
     z = Terrain(profile or LEVEL, config.rough).height(x, y)
@@ -126,8 +123,9 @@ def _standing(
 ) -> Block:
     foot = 0.0 if heights is None else float(heights.height(np.array(x), np.array(y)))
     length, width, height = size
-    middle = foot + (height - _EMBEDDED) / 2
-    return Block(x, y, middle, length, width, height + _EMBEDDED, yaw, pitch)
+    embedded = 0.05  # how deep blocks stand in the ground, m
+    middle = foot + (height - embedded) / 2
+    return Block(x, y, middle, length, width, height + embedded, yaw, pitch)
 
 
 def scenery(path: Path) -> tuple[list[ET.Element], list[ET.Element]]:

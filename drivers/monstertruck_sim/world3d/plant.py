@@ -29,7 +29,6 @@ from monstertruck_sim.world3d.model import (
     Warnings,
 )
 
-_FREED: Final = 0.005
 _UNSTABLE: Final = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -368,5 +367,6 @@ class RigidPlant(Plant):
             self._stuck_at = self._pose
         elif self._stuck_at is not None:
             x, y, _ = self._stuck_at
-            if hypot(self._pose[0] - x, self._pose[1] - y) > _FREED:
+            # 0.005: way from where it was stuck on which it is free, m
+            if hypot(self._pose[0] - x, self._pose[1] - y) > 0.005:
                 self._stuck_at = None

@@ -28,8 +28,6 @@ from monstertruckd.tools.calibrate.board_views import BoardView
 
 NAMES: Final = ("x", "y", "z", "yaw", "pitch", "roll")
 """Parameters of a mount."""
-EDGES: Final = 2
-"""Beams at both ends of the board that may have met its edge."""
 FLAT: Final = 0.001
 """Standard deviation of a board's middle off its plane, m."""
 WARPED: Final = 0.003
@@ -38,8 +36,6 @@ RANGE: Final = 0.004
 """Standard deviation of what the lidar measures too far on such a surface, m."""
 PRINT: Final = 0.003
 """Relative error of the board's size: a ruler, and paper."""
-UNKNOWN: Final = 0.3
-"""Standard deviation before the lidar is used."""
 LEAST_VIEWS: Final = 6
 REACH: Final = np.array((0.5, 0.5, 0.5, 0.8, 0.8, 0.8))
 """Greatest error of the configured mount, m and rad."""
@@ -95,8 +91,9 @@ def line_on_board(
     board, margin = reader.board, (0.12, 0.0)[known]
     inside = (on[:, 0] > -margin) & (on[:, 0] < board.width + margin)
     inside &= (on[:, 1] > -margin) & (on[:, 1] < board.height + margin)
+    edges = 2  # beams at both ends of the board that may have met its edge
     # (0.2, 0.04): m: how far beams may be off the board's plane, at first and once the mount is known
-    run = longest(finite & inside & (np.abs(on[:, 2]) < (0.2, 0.04)[known]), view.ranges)[EDGES:-EDGES]
+    run = longest(finite & inside & (np.abs(on[:, 2]) < (0.2, 0.04)[known]), view.ranges)[edges:-edges]
     if run.size < 10:  # beams on the board
         return None
     points = flat[run]
@@ -229,6 +226,7 @@ def fit_mount(
         InputError: too few views, a board of another size, or views that do not fit each other.
     """
     found = mount
+    unknown = 0.3  # standard deviation before the lidar is used
     for known in (False, True):
         lines = [o for v in views if (o := line_on_board(v, reader, lens, found, lidar, known=known)) is not None]
         if len(lines) < LEAST_VIEWS:
@@ -236,9 +234,9 @@ def fit_mount(
                 f"the lidar sees the board in {len(lines)} of {len(views)} views: expected {LEAST_VIEWS}; is its mount "
                 "right to 10 cm and 10 degrees in the configuration, and the camera's?"
             )
-        loose = fit(lines, found, lidar, UNKNOWN)
+        loose = fit(lines, found, lidar, unknown)
         lines = _agreeing(lines, loose, lidar)
-        loose = fit(lines, loose.parameters[:6], lidar, UNKNOWN)
+        loose = fit(lines, loose.parameters[:6], lidar, unknown)
         found = loose.parameters[:6]
     _check_size(loose, reader.board)
     return fit(lines, found, lidar, math.hypot(PRINT, focal_error)), lines

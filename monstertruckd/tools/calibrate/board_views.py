@@ -28,7 +28,6 @@ LEAST_SCANS: Final = 3
 """Scans of a view, at least."""
 ROWS: Final = ("upper", "middle", "lower")
 COLUMNS: Final = ("left", "middle", "right")
-VIEWS: Final = 24
 TILT: Final = math.radians(12.0)
 STEEP: Final = math.radians(30.0)
 SIDES: Final = ("left edge nearer", "right edge nearer", "upper edge nearer", "lower edge nearer")
@@ -160,7 +159,7 @@ class BoardGuide:
             if max(distances) < 1.3 * min(distances):  # distance of the farthest view over that of the nearest
                 found.append(f"the board nearer and farther than {min(distances):.2f} to {max(distances):.2f} m")
         found += self._tilts(self.views, 3, "")  # views needed that are tilted by more, to each of four sides
-        found += _more(VIEWS - len(self.views), "view of it", "views of it")
+        found += _more(24 - len(self.views), "view of it", "views of it")
         if self.beams is not None:
             # 3: views needed that the lidar sees as well
             found += self._tilts(self.seen_by_lidar, 3, ", across the lidar's beam")

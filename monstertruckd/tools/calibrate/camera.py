@@ -32,14 +32,10 @@ from monstertruckd.tools.calibrate.steps import Collect, Confirm, WatchStep
 from monstertruckd.tools.calibrate.wizard import WizardContext
 
 ROOM: Final = "a printed board on something flat (`stand print`), 0.4 to 1 m before the camera; light; nothing drives"
-WORST: Final = 1.0
-"""Pixels: root mean square by which corners may be off."""
 FIRST: Final = 3
 """Pictures from which the size is taken."""
 KEPT: Final = math.radians(0.7)
 """Turn of the lidar's joints that is tolerated meanwhile, rad: two steps of their servos."""
-STRAY: Final = 3.0
-"""Times the median by which the corners of a view may be off."""
 UNITS: Final = {"focal_x": "px", "focal_y": "px", "centre_x": "px", "centre_y": "px"}
 
 _BOARD: Final = Confirm(
@@ -153,12 +149,14 @@ def lens_of(views: Sequence[BoardView], reader: BoardReader, size: tuple[int, in
     found = fit_lens([view.sighting for view in views], reader, size)
     kept = list(views)
     off = np.array(found.by_view)
-    if (off > STRAY * np.median(off)).any():
-        kept = [view for view, one in zip(views, off.tolist(), strict=True) if one <= STRAY * np.median(off)]
+    stray = 3.0  # times the median by which the corners of a view may be off
+    if (off > stray * np.median(off)).any():
+        kept = [view for view, one in zip(views, off.tolist(), strict=True) if one <= stray * np.median(off)]
         found = fit_lens([view.sighting for view in kept], reader, size)
-    if found.rms > WORST:
+    worst = 1.0  # pixels: root mean square by which corners may be off
+    if found.rms > worst:
         raise InputError(
-            f"corners are off by {found.rms:.1f} pixels (expected {WORST:g} at most): the board is not flat, it "
+            f"corners are off by {found.rms:.1f} pixels (expected {worst:g} at most): the board is not flat, it "
             "moved, or the lens is no pinhole with some distortion"
         )
     return found, kept

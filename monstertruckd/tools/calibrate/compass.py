@@ -26,14 +26,10 @@ from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = "2 m x 2 m, level, outdoors or well away from iron: no car, no reinforced wall, no drain within 3 m"
 
-ANGLE: Final = 0.35
-"""Angle of both axles, in opposite directions, rad: a circle of 0.44 m."""
 TILT: Final = math.radians(0.5)
 """Greatest error of the unit's own tilt, rad (its data sheet): through it the vertical field looks like hard iron."""
 LINEARITY: Final = 0.001
 """Share by which a magnetoresistive sensor's output bends over the earth's field, and with it the ellipse."""
-FEWEST: Final = 24
-"""Readings: one in 30 degrees of both circles."""
 GAP: Final = math.radians(30)
 """Greatest gap between directions of the field that still is a circle."""
 
@@ -76,8 +72,9 @@ class FieldCircle:
             raise InputError(
                 "the compass sends no magnetic field: its field mask needs 64 (devices.compass.driver.fields)"
             )
-        if len(rows) < FEWEST:
-            raise InputError(f"{len(rows)} readings of the compass while the robot moved: expected {FEWEST} or more")
+        fewest = 24  # readings: one in 30 degrees of both circles
+        if len(rows) < fewest:
+            raise InputError(f"{len(rows)} readings of the compass while the robot moved: expected {fewest} or more")
         return cls(*np.array(rows).T)
 
 
@@ -99,15 +96,16 @@ class CompassWizard:
             "Motor and computer on, everything mounted as it will drive; phones and keys away from the compass."
         )
         await context.confirm(CLEAR)
-        length = 2 * math.pi / context.chassis.bicycle.curvature(ANGLE, -ANGLE)
+        angle = 0.35  # angle of both axles, in opposite directions, rad: a circle of 0.44 m
+        length = 2 * math.pi / context.chassis.bicycle.curvature(angle, -angle)
         full = 2 * math.pi * 1.05  # turns to be driven
         tracks = [
             await context.move(
                 MoveStep(
                     name,
                     speed,
-                    ANGLE,
-                    -ANGLE,
+                    angle,
+                    -angle,
                     metres=1.8 * length,
                     done=lambda track: abs(track.turned()) > full,
                     also=(topics.COMPASS,),

@@ -26,10 +26,6 @@ GRAVITY: Final = 9.80665
 TILT: Final = math.radians(0.2)
 """Standard deviation of the compass's own tilt, rad (its data sheet: 0.5 degrees at most), and with it of where gravity
 points."""
-ANGLE: Final = 0.35
-"""Angle of both axles, in opposite directions, rad."""
-LEAST: Final = 2
-"""Turns that determine the scale, at least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,15 +89,16 @@ class ImuWizard:
         resting = await context.collect(Collect("the unit at rest", topics.IMU, 500, 60.0))  # readings at rest
         tilt = await context.collect(Collect("the robot's tilt", topics.COMPASS, 20))
         turns = []
+        angle = 0.35  # angle of both axles, in opposite directions, rad
         if self.turns:
-            length = math.tau / context.chassis.bicycle.curvature(ANGLE, -ANGLE)
+            length = math.tau / context.chassis.bicycle.curvature(angle, -angle)
             for number in range(2 * self.rounds):
                 side = 1 if number % 2 == 0 else -1
                 move = MoveStep(
                     f"a full circle to the {'left' if side > 0 else 'right'}",
                     0.12,
-                    side * ANGLE,
-                    -side * ANGLE,
+                    side * angle,
+                    -side * angle,
                     1.8 * length,
                     done=lambda record: abs(record.turned()) > math.tau,
                     also=(topics.IMU,),
@@ -176,7 +173,8 @@ def rate_scale(turns: Sequence[Turn], bias: Interval) -> Interval:
     Raises:
         InputError: too few turns, or turns to one side only would let a bias look like a scale.
     """
-    if len(turns) < LEAST or len({turn.turned > 0 for turn in turns}) < LEAST:
+    least = 2  # turns that determine the scale, at least
+    if len(turns) < least or len({turn.turned > 0 for turn in turns}) < least:
         raise InputError(f"{len(turns)} turns: expected at least one to each side")
     rows = np.array([(t.integral, t.seconds, t.turned, t.sigma) for t in turns])
     integral, seconds, turned, sigma = rows.T

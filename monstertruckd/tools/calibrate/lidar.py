@@ -43,9 +43,6 @@ ROOM: Final = (
     "3 m x 3 m, with walls in sight to several sides; for heights a tape, a level floor, and a wall straight ahead and "
     "straight to the left"
 )
-SPEED: Final = 0.12
-ANGLE: Final = 0.35
-"""Angle of both axles, in opposite directions, rad."""
 QUARTER: Final = math.pi / 2
 LEAST_OVERLAP: Final = 0.5
 """Least overlap of two scans that are registered."""
@@ -159,19 +156,21 @@ class LidarWizard:
         return context.fit("mount", lambda: result_of(legs, mount, crab, offset, level))
 
     def _moves(self, chassis: Chassis) -> list[MoveStep]:
-        arc = QUARTER / chassis.bicycle.curvature(ANGLE, -ANGLE)
+        angle = 0.35  # angle of both axles, in opposite directions, rad
+        arc = QUARTER / chassis.bicycle.curvature(angle, -angle)
         moves = []
+        speed = 0.12
         for side, name in ((1, "left"), (-1, "right")):
             moves += [
-                MoveStep(f"straight {word}", sign * SPEED, metres=1.0, also=(topics.SCAN,))  # m
+                MoveStep(f"straight {word}", sign * speed, metres=1.0, also=(topics.SCAN,))  # m
                 for sign, word in ((1, "ahead"), (-1, "back"))
             ]
             moves += [
                 MoveStep(
                     f"quarter {k} of a circle to the {name}",
-                    SPEED,
-                    side * ANGLE,
-                    -side * ANGLE,
+                    speed,
+                    side * angle,
+                    -side * angle,
                     arc,
                     also=(topics.SCAN,),
                 )

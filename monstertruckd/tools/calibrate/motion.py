@@ -27,15 +27,12 @@ ARMING: Final = 3.0
 """Seconds in which the truck must be armed."""
 STEERING: Final = 1.0
 """Seconds for turning the wheels while the truck stands."""
-STUCK: Final = 3.0
-"""Seconds without progress after which a move is cancelled."""
 STILL: Final = 0.1
 """Turn of the motor, rad, that counts as rest: an encoder may alternate between two counts."""
 AT_REST: Final = 0.5
 """Seconds of an unchanged drive position that count as rest."""
 SETTLE: Final = 5.0
 """Seconds in which it must come to rest."""
-DEPTH: Final = 4096
 LATE: Final = (
     "requests came too late: end what else keeps this computer or the link to the robot busy, or run the command on "
     "the robot's own computer, and repeat it; nothing was saved"
@@ -46,10 +43,6 @@ SILENT: Final = (
     "and repeat the command; nothing was saved"
 )
 """What to do about measurements or ticks that came too late."""
-REPEATS: Final = 2
-"""Times that a move starts again after a stop that passed."""
-UNMOVED: Final = 0.01
-"""Distance, m, up to which a truck still stands where its move began."""
 ADVICE: Final = {
     Reason.LEASE_EXPIRED: LATE,
     Reason.SCAN_STALE: SILENT,
@@ -81,34 +74,36 @@ class Mover:
         """Drive ``move`` and return what was measured; ``report`` is called with the metres driven.
 
         However it ends, the truck is stopped and disarmed. After a stop that passed, such as a late request, it drives
-        back to where the move began and once more, ``REPEATS`` times at most, and reports by ``say``.
+        back to where the move began and once more, twice at most, and reports by ``say``.
 
         Raises:
             RequestRefusedError: the gate refused, stopped the truck, or holds it; with its reason.
             NoAnswerError: the truck does not move though nothing holds it, or sends no feedback.
         """
+        unmoved = 0.01  # distance, m, up to which a truck still stands where its move began
+        depth = 4096
         with (
             ExitStack() as besides,
-            self._truck.subscribe(topics.DRIVE, fifo(DEPTH)) as drive,
-            self._truck.subscribe(topics.STEERING, fifo(DEPTH)) as steering,
-            self._truck.subscribe(topics.COMPASS, fifo(DEPTH)) as attitude,
-            self._truck.subscribe(topics.GATE, fifo(DEPTH)) as gate,
-            self._truck.subscribe(topics.CMD_STEERING, fifo(DEPTH)) as steering_commands,
-            self._truck.subscribe(topics.CMD_DRIVE, fifo(DEPTH)) as drive_commands,
+            self._truck.subscribe(topics.DRIVE, fifo(depth)) as drive,
+            self._truck.subscribe(topics.STEERING, fifo(depth)) as steering,
+            self._truck.subscribe(topics.COMPASS, fifo(depth)) as attitude,
+            self._truck.subscribe(topics.GATE, fifo(depth)) as gate,
+            self._truck.subscribe(topics.CMD_STEERING, fifo(depth)) as steering_commands,
+            self._truck.subscribe(topics.CMD_DRIVE, fifo(depth)) as drive_commands,
         ):
             feeds = drive, steering, attitude, gate, steering_commands, drive_commands
-            also = {t.name: besides.enter_context(self._truck.subscribe(t, fifo(DEPTH))) for t in move.also}
-            for left in reversed(range(REPEATS + 1)):
+            also = {t.name: besides.enter_context(self._truck.subscribe(t, fifo(depth))) for t in move.also}
+            for left in (2, 1, 0):  # times that a move starts again after a stop that passed
                 run = _Run(self._truck, self._clock, feeds, also)
                 try:
                     await self._once(run, move, report)
                     break
                 except RequestRefusedError as error:
                     covered = await run.coasted(self._drivetrain) if left and error.refusal in ADVICE else None
-                    if covered is None or (move.marked and covered > UNMOVED):
+                    if covered is None or (move.marked and covered > unmoved):
                         raise
                     say(f"{move.name}: {error.refusal.text}; back to where it began, and once more")
-                if covered > UNMOVED:
+                if covered > unmoved:
                     await self._once(_Run(self._truck, self._clock, feeds, also), move.back(covered), report)
             return run.track
 
@@ -127,6 +122,7 @@ class Mover:
         run.track.left = run.robot_time
         distance, since = 0.0, self._clock.now()
         began = since
+        stuck = 3.0  # seconds without progress after which a move is cancelled
         while True:
             side = move.side((self._clock.now() - began) / SECOND)
             await run.hold(move.speed, side * move.front, side * move.rear, PERIOD)
@@ -136,8 +132,8 @@ class Mover:
                 return
             if new - distance > 0.01:  # distance, m, that counts as progress
                 distance, since = new, self._clock.now()
-            elif self._clock.now() - since > STUCK * SECOND:
-                text = f"{move.name}: no progress for {STUCK:g} s ({run.state.why if run.state else 'silent'})"
+            elif self._clock.now() - since > stuck * SECOND:
+                text = f"{move.name}: no progress for {stuck:g} s ({run.state.why if run.state else 'silent'})"
                 held = run.state is not None and run.state.reasons
                 raise RequestRefusedError(held[0], text) if held else NoAnswerError(text)
 

@@ -27,7 +27,6 @@ from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, N
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = "3.5 m x 3.5 m on either side: squares of 2.4 m to the left and to the right of the robot, level"
-SPEED: Final = 0.15
 CORNER: Final = 0.08
 """Speed in the corners, m/s: fast ones are wider, as tyres slip outward."""
 ANGLE: Final = 0.35
@@ -104,7 +103,7 @@ class OdometryWizard:
         legs, taped, turned = [], 0.0, 0.0
         towards = "left" if sense > 0 else "right"
         for number in range(1, 5):
-            side = MoveStep(f"square to the {towards}, side {number} of 4", SPEED, metres=self.side, marked=True)
+            side = MoveStep(f"square to the {towards}, side {number} of 4", 0.15, metres=self.side, marked=True)  # m/s
             record = await context.move(side)
             turned += record.turned()
             legs.append(SteeringRun.of(record, maps))

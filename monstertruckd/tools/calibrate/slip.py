@@ -32,8 +32,6 @@ OBSERVERS: Final[dict[Observer, Topic[Any]]] = {"stand": topics.STAND_POSE, "pos
 ROOM: Final = "ten lengths of the robot around it"
 RADII: Final = (4.0, 2.0, 0.0)
 """Radii of the arcs, in tracks; 0 = straight."""
-LEAST: Final = 5
-"""Poses at each end, at least."""
 SLIDING: Final = 0.004
 """Share of the distance by which a body that skids differs from its model, along and across; and of its turn."""
 FLOOR: Final = 0.0005
@@ -62,8 +60,9 @@ class SkidArc:
             InputError: too few poses at rest, or a shaft without feedback.
         """
         before, after = record.at_rest(OBSERVERS[observer])
-        if min(len(before), len(after)) < LEAST:
-            raise InputError(f"only {len(before)} and {len(after)} poses at rest: expected {LEAST} at each end")
+        least = 5  # poses at each end, at least
+        if min(len(before), len(after)) < least:
+            raise InputError(f"only {len(before)} and {len(after)} poses at rest: expected {least} at each end")
         (x0, y0, yaw0), (x1, y1, yaw1) = (_mean_pose([m.pose for m in poses]) for poses in (before, after))
         moving = [m.pose.yaw for m in record.of(OBSERVERS[observer])]
         turned = float(np.unwrap(moving)[-1] - np.unwrap(moving)[0])

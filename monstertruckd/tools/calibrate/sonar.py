@@ -33,8 +33,6 @@ ROOM: Final = (
     "a flat wall 5 m long and as high as the sonars see, 1.7 m to the robot's left; nothing else within 2 m before, "
     "behind and to the right of the robot"
 )
-ANGLE: Final = 0.35
-"""Angle of both axles of a truck, in opposite directions, rad."""
 NOISE: Final = (0.005, 0.01)
 """Standard deviation of a range: m, and share of it, added in quadrature."""
 DRIFT: Final = (0.003, 0.003, 0.01)
@@ -49,8 +47,6 @@ BEYOND: Final = 0.3
 """Past the cone's edge the wall is still heard, rad: grazing sound is reflected away."""
 LEAST: Final = 12
 """Echoes of a sonar that its place rests on, at least."""
-SPAN: Final = 1.0
-"""Turn to each side, rad, at least."""
 COMMON: Final = 5
 """Parameters before those of the arcs: distance and direction of the wall, half the cone, factors of the ranges and of
 the distance by odometry."""
@@ -169,8 +165,9 @@ def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape
         InputError: arcs to one side only, too few echoes, or sonars that hear what others should.
     """
     headings = np.concatenate([p[:, 2] for leg in legs for p in leg.poses.values()] or [np.zeros(1)])
-    if headings.max() < SPAN or headings.min() > -SPAN:
-        raise InputError(f"expected arcs of {SPAN:g} rad at least to both sides, with sonars that answer")
+    span = 1.0  # turn to each side, rad, at least
+    if headings.max() < span or headings.min() > -span:
+        raise InputError(f"expected arcs of {span:g} rad at least to both sides, with sonars that answer")
     places = {n: SonarPose(*s.mount.planar) for n, s in settings.sonars.items()}
     _check_places(legs, places, wall, settings.field_of_view / 2)
     model = SonarModel(legs, settings, wall, tape_error)
@@ -210,8 +207,9 @@ def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape
 
 def arc(chassis: Chassis, limit: float) -> tuple[float, float, float]:
     """Axle angles of an arc to the left (rad), and its radius (m): by both axles of a truck, else by the front one."""
+    angle = 0.35  # angle of both axles of a truck, in opposite directions, rad
     if isinstance(chassis, TruckChassis):
-        angles = ANGLE, -ANGLE
+        angles = angle, -angle
     else:
         # 0.96: share of the greatest angle that the gate allows
         # 0.4: least radius of the arcs, m

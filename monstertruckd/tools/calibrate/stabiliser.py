@@ -43,8 +43,6 @@ FOLLOWS: Final = math.radians(2.0)
 """Difference between a joint and the tilt that it takes out, rad, up to which it follows."""
 SECTOR: Final = math.radians(20.0)
 """Angle to both sides of the direction in which a tilted lidar meets the floor."""
-MOST: Final = 0.6
-"""Share of the beams of the sector that must be on the floor, for the lidar to look there."""
 JOINTS: Final = ("pitch", "roll")
 
 _LEVEL: Final = Confirm("level", "Stand the robot on the level floor, wheels straight, and let go. Done?")
@@ -247,11 +245,12 @@ def _turns(stand: RestMeasurement, flat: RestMeasurement, height: float, axis: i
             f"with the {low} low a lidar that leans would see the floor hardly nearer than what stands there: higher "
             "blocks, or more room"
         )
-    if turned > MOST:
+    most = 0.6  # share of the beams of the sector that must be on the floor, for the lidar to look there
+    if turned > most:
         return -1
-    if leaning > MOST:
+    if leaning > most:
         raise InputError(f"with the {low} low the lidar leans with the body: the horn of the {name} joint is loose")
-    if max(seen(joints) or 0.0 for joints in swapped) > MOST:
+    if max(seen(joints) or 0.0 for joints in swapped) > most:
         raise InputError(f"with the {low} low the lidar leans aside: pitch and roll servo are swapped (their ids)")
     if max(turned, leaning) < 0.2:  # share that may be on the floor, for the lidar not to look there
         return 1

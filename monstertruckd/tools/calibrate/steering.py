@@ -29,11 +29,8 @@ ROOM: Final = "2.5 m x 2.5 m, level, the robot in the middle; with --rough 1.5 m
 ROUGH: Final = (0.06, 0.1, 0.4)
 """Speed (m/s), axle angle (rad) and distance (m) of the first arcs: too little turn for the gate to call the steering
 dead, should it go the wrong way."""
-ARC: Final = (0.12, 0.18, 1.0)
 FULL: Final = 0.12
 """Speed of full circles."""
-STRAIGHT: Final = (0.12, 2.0)
-APPROACH: Final = 0.2
 
 DEAD_BAND: Final = 2.0
 """Pulse, us, by which a servo may stop short of its goal."""
@@ -41,12 +38,8 @@ BAND: Final = NORMAL * DEAD_BAND / math.sqrt(3)
 """The dead band as half a 95 % interval, us."""
 SPAN: Final = 50.0
 """Degrees of the servo between full circles to the left and to the right."""
-UNSCALED: Final = 0.5
-"""Share of a turn that may be wrong before compass and drive are calibrated."""
 SHORT: Final = math.radians(2.0)
 """Servo angle, rad, that has to be missing before a stop is assumed; circles keep as far from the ends."""
-MARGIN: Final = 1.0
-"""Degrees of servo angle kept from a stop: a servo that pushes against one burns."""
 
 _TURNED: Final = Confirm(
     "turned", "Steered to the left and driving ahead: did the robot turn to the LEFT, seen from above?", fact=True
@@ -107,7 +100,7 @@ class SteeringWizard:
                 await self._check_compass(context)
                 again += "; swapped cables look the same: do the FRONT wheels turn when the front ones are steered?"
             return context.fit("centres", lambda: _rough(arcs, model, start, again if wrong else None))
-        legs = [leg for axle in await self._arcs(context, maps, ARC) for leg in axle]
+        legs = [leg for axle in await self._arcs(context, maps, (0.12, 0.18, 1.0)) for leg in axle]
         first = Maps.from_parameters(model.fit([*arcs[0], *arcs[1], *legs], start).parameters)
         travel = await self._travel(context, maps, model, first)
         legs += await self._straights(context, maps)
@@ -171,10 +164,11 @@ class SteeringWizard:
 
     async def _straights(self, context: WizardContext, maps: Maps) -> list[SteeringRun]:
         """Straight ahead and back, the wheels set from one side and from the other."""
-        speed, metres = STRAIGHT
+        speed, metres = (0.12, 2.0)  # m/s, m
         legs = []
+        approach = 0.2
         for run in range(self._lines):
-            side = APPROACH if run % 2 == 0 else -APPROACH
+            side = approach if run % 2 == 0 else -approach
             if self.strings:
                 await context.confirm(_STRING)
             ahead = MoveStep("straight ahead", speed, metres=metres, approach=side, marked=bool(self.strings))
@@ -315,14 +309,15 @@ class AxleTravel:
             else "axle angle that the wheels follow to; the limits of gate and servo allow no more",
         )
         limit = None if before is None else before.estimate(f"{name}_{end}")
+        margin = 1.0  # degrees of servo angle kept from a stop: a servo that pushes against one burns
         if self.stopped:
-            degrees = math.degrees(self.servo) - self.sign * MARGIN
+            degrees = math.degrees(self.servo) - self.sign * margin
             limit = Estimate(
                 name=f"{name}_{end}",
                 value=centre + scale * degrees,
                 unit="us",
                 samples=2,
-                meaning=f"limit of the pulse, {MARGIN:g} deg of the servo before its stop",
+                meaning=f"limit of the pulse, {margin:g} deg of the servo before its stop",
                 key=f"{STEERING}.{name}.{end}",
             )
         return [travel] if limit is None else [travel, limit]
@@ -369,10 +364,11 @@ def _rough(
     fit = model.fit(legs, start)
     halves = half_widths(fit)
     estimates = []
+    unscaled = 0.5  # share of a turn that may be wrong before compass and drive are calibrated
     for axle, name in enumerate(AXLES):
         centre, scale = (float(value) for value in fit.parameters[2 * axle : 2 * axle + 2])
-        half = float(halves[2 * axle]) + UNSCALED * abs(centre - start.centres[axle])
-        meaning = f"rough: 95 % of the legs' noise, and {UNSCALED:.0%} of the correction for compass and drive"
+        half = float(halves[2 * axle]) + unscaled * abs(centre - start.centres[axle])
+        meaning = f"rough: 95 % of the legs' noise, and {unscaled:.0%} of the correction for compass and drive"
         estimates += [_direction(name, scale, len(legs)), _centre(name, centre, half, len(legs), meaning)]
     return Result(
         wizard="steering",

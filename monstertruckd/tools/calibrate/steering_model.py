@@ -40,9 +40,6 @@ EYE: Final = math.radians(3.0)
 """Servo angle, rad, within which straight wheels look straight: without a string the only word on a common error."""
 
 
-_HALVINGS: Final = 40
-
-
 @dataclass(frozen=True, slots=True)
 class Maps:
     """Pulse maps of both servos: pulse = centre + scale * servo angle in degrees; scales carry the direction's sign."""
@@ -214,7 +211,7 @@ class SteeringModel:
             return bicycle.body_twist(rolled / bicycle.drive_speed(1.0, *angles), *angles)[2]
 
         low, high = -SERVO_LIMIT, SERVO_LIMIT
-        for _ in range(_HALVINGS):
+        for _ in range(40):
             middle = 0.5 * (low + high)
             more = sense * (leg.turn - turned(middle)) * math.copysign(1.0, rolled) > 0.0
             low, high = (middle, high) if more else (low, middle)

@@ -35,9 +35,6 @@ ANGLE: Final = 0.12
 """Small, so that the curvature is about linear in it."""
 ROUNDED: Final = 1.5e-4
 """Square of the lag, s^2, that a curvature looks like which is 2 % from linear in the angles."""
-METRES: Final = 1.8
-LEAST: Final = 60
-"""Turns that dead time and lag have to rest on."""
 BASE: Final = 0.3
 """Seconds between two headings that are compared, about as long as the steering keeps to one side."""
 HALF_FRAME: Final = 0.010
@@ -48,7 +45,7 @@ runs, and another time after each start: nothing between 0 and a period can be e
 def weaves(rounds: int) -> list[MoveStep]:
     """Forward and back, in turn."""
     return [
-        MoveStep(f"weaving {direction}", sign * SPEED, ANGLE, -ANGLE, METRES, weave=WEAVE)
+        MoveStep(f"weaving {direction}", sign * SPEED, ANGLE, -ANGLE, 1.8, weave=WEAVE)  # m
         for _ in range(rounds)
         for sign, direction in ((1, "ahead"), (-1, "back"))
     ]
@@ -135,8 +132,9 @@ def response(records: Iterable[MoveRecord], chassis: TruckChassis, iron: IronCon
     """
     seen = [weave for record in records if (weave := Weave.of(record, chassis, iron)) is not None]
     samples = sum(weave.turns.size for weave in seen)
-    if samples < LEAST:
-        raise InputError(f"only {samples} turns determine dead time and lag: expected {LEAST}")
+    least = 60  # turns that dead time and lag have to rest on
+    if samples < least:
+        raise InputError(f"only {samples} turns determine dead time and lag: expected {least}")
 
     def residuals(delay: float, squared: float) -> Array:
         return np.concatenate([weave.residuals(delay, squared) for weave in seen])

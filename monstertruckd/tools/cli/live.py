@@ -2,7 +2,7 @@
 
 import math
 import sys
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,10 +16,6 @@ if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
     from monstertruck_schemas.topics import Topic
-
-
-SHORT: Final = 16
-"""Values of a list that a terminal shows; text it cuts at four times as many characters."""
 
 
 def status(
@@ -96,14 +92,15 @@ async def _explain_silence(client: "TruckClient", clock: "Clock", topic: "Topic[
 
 def shortened(value: Any) -> Any:
     """``value`` with long lists and texts cut, each saying how long it was."""
+    short = 16  # values of a list that a terminal shows; text it cuts at four times as many characters
     match value:
         case dict():
             return {name: shortened(inner) for name, inner in value.items()}
-        case list() if len(value) > SHORT:
-            return [*map(shortened, value[: SHORT // 2]), f"... {len(value)} values"]
+        case list() if len(value) > short:
+            return [*map(shortened, value[: short // 2]), f"... {len(value)} values"]
         case list():
             return [shortened(inner) for inner in value]
-        case str() if len(value) > 4 * SHORT:
-            return f"{value[: 4 * SHORT]}... {len(value)} characters"
+        case str() if len(value) > 4 * short:
+            return f"{value[: 4 * short]}... {len(value)} characters"
         case _:
             return value

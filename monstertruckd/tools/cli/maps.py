@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from monstertruckd.tools.logs.scan_log import LogGeometry, ScanLog
 
 
-MOST_LOST: Final = 0.1
-"""Share of the path that may be lost in a map built with success."""
 LABELS = {
     "log": "kind of log",
     "sources": "read from",
@@ -190,8 +188,9 @@ def build(
         _draw(png, _load(output))
     _print(facts, json_output)
     finish_log(log, scans.fault)
-    if quality.lost_share > MOST_LOST:
-        text = f"{quality.lost_share:.0%} of the path of {quality.length:.1f} m is lost (limit: {MOST_LOST:.0%})"
+    most_lost = 0.1  # share of the path that may be lost in a map built with success
+    if quality.lost_share > most_lost:
+        text = f"{quality.lost_share:.0%} of the path of {quality.length:.1f} m is lost (limit: {most_lost:.0%})"
         finish(Reason.POSE_LOST, f"{log}: {text}: check lidar geometry, stamps and odometry")
 
 

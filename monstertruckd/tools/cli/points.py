@@ -32,8 +32,6 @@ MapOption = Annotated[
 WITHOUT = "keeps no points of interest"
 FORMATS: Final = (".csv", ".geojson", ".yaml")
 COLUMNS: Final = ("name", "kind", "tag", "x_m", "y_m", "z_m", "yaw_rad", "sigma_m", "sigma_yaw_rad", "sightings")
-WAIT = 3.0
-"""Seconds to wait for the robot's list."""
 
 
 @app.command("list")
@@ -151,12 +149,13 @@ async def _newest(client: "TruckClient", clock: "Clock") -> "list[PointOfInteres
     from monstertruck_schemas.topics import POINTS
 
     await require_section(client, "points", WITHOUT)
+    wait = 3.0  # seconds to wait for the robot's list
     with client.subscribe(POINTS, latest()) as box:
         try:
-            async with clock.deadline(WAIT):
+            async with clock.deadline(wait):
                 return list((await box.next()).points)
         except TimeoutError:
-            text = f"no list of points of interest within {WAIT:g} s"
+            text = f"no list of points of interest within {wait:g} s"
             raise NoAnswerError(text + await not_ready(client)) from None
 
 

@@ -24,7 +24,6 @@ from monstertruckd.tools.security.certificates import DAY, common_name, read_cer
 SYNCHRONIZED: Final = Path("/run/systemd/timesync/synchronized")
 """Made by systemd-timesyncd once the clock is synchronized."""
 DAEMONS: Final = ("chronyd", "ntpd", "ntpsec")
-GIGABYTE: Final = 1e9
 NETWORKS: Final = Path("/etc/NetworkManager/system-connections")
 SUPPLICANT: Final = Path("/etc/wpa_supplicant/wpa_supplicant.conf")
 LISTEN: Final = "0A"
@@ -61,13 +60,14 @@ def condition(context: HostContext) -> Iterator[Finding]:
     except DeviceError as error:
         yield warn("host", error.reason, str(error))
         return
-    free = f"{host.disk.free / GIGABYTE:.1f} GB free for {folder}"
+    gigabyte = 1e9
+    free = f"{host.disk.free / gigabyte:.1f} GB free for {folder}"
     if host.disk.free < limits.disk:
         yield fail("disk", Reason.DISK_LOW, free, f"du -xh {folder} | sort -h | tail")
     else:
         yield fine("disk", free)
     share = host.memory_available / host.memory_total
-    memory = f"{share:.0%} of {host.memory_total / GIGABYTE:.1f} GB available"
+    memory = f"{share:.0%} of {host.memory_total / gigabyte:.1f} GB available"
     if share < limits.memory:
         yield warn("memory", Reason.MEMORY_LOW, memory, "ps -eo rss,comm --sort=-rss | head")
     else:

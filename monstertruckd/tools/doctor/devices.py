@@ -19,8 +19,6 @@ from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine,
 MODULES = {"0403": "ftdi_sio", "10c4": "cp210x", "067b": "pl2303"}
 """Kernel modules by vendor; all others are USB-CDC."""
 SUPPLY: Final = "what hangs there draws too much, or its cable is damaged: use a hub with a supply of its own"
-TIMEOUT: Final = 15.0
-"""Seconds for one device's whole answer; a scanner that measures has to be stopped first."""
 
 
 def wiring(context: HostContext) -> Iterator[Finding]:
@@ -128,11 +126,12 @@ async def handshakes(context: HostContext) -> AsyncIterator[Finding]:
 async def _handshake(context: HostContext, role: str, device: Device[Schema], node: Path) -> Finding:
     check, kind = f"{role} handshake", device.kind
     again = context.command("probe", role, "--port", str(node))
+    timeout = 15.0  # seconds for one device's whole answer; a scanner that measures has to be stopped first
     try:
-        async with context.computer.machine.clock.deadline(TIMEOUT):
+        async with context.computer.machine.clock.deadline(timeout):
             answer = await _probe(context, role, device, kind, node)
     except TimeoutError:
-        return fail(check, Reason.DEVICE_TIMEOUT, f"no complete answer within {TIMEOUT:g} s", again)
+        return fail(check, Reason.DEVICE_TIMEOUT, f"no complete answer within {timeout:g} s", again)
     except PortBusyError as error:
         return fail(check, error.reason, str(error), f"sudo fuser -v {node}")
     except WrongDeviceError as error:

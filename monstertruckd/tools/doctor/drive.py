@@ -25,10 +25,7 @@ from monstertruckd.tools.calibrate.lidar import LEAST_OVERLAP, resting_scan
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 from monstertruckd.tools.doctor.context import Finding, fail, fine, warn
 
-METRES: Final = 0.2
 SPEED: Final = 0.06
-ANGLE: Final = 0.045
-"""Angle of both axles, in opposite directions, rad: so small that the gate tolerates a turn to the wrong side."""
 CLEAR: Final = 0.3
 """Share of the turn that a sensor must have seen."""
 SIGN_ONLY: Final = "calibrate drive --sign-only"
@@ -67,9 +64,11 @@ async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]
     also = tuple(topic for role, topic in (("lidar", topics.SCAN), ("imu", topics.IMU)) if role in present)
     lidar = None if config.devices.lidar is None else np.array(config.devices.lidar.mount.planar)
     moves: list[Movement] = []
-    for side, steered in (("left", ANGLE), ("right", -ANGLE)):
+    # angle of both axles, in opposite directions, rad: so small that the gate tolerates a turn to the wrong side
+    angle = 0.045
+    for side, steered in (("left", angle), ("right", -angle)):
         for direction, speed in (("ahead", SPEED), ("back", -SPEED)):
-            step = MoveStep(f"20 cm {direction}, wheels {side}", speed, steered, -steered, METRES, also=also)
+            step = MoveStep(f"20 cm {direction}, wheels {side}", speed, steered, -steered, 0.2, also=also)  # m
             try:
                 moves.append(movement(await drives(step), chassis, lidar))
             except TruckError as error:

@@ -43,12 +43,8 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_ove
 
 LEG: Final = 20
 """Trials of one truck."""
-FOLLOWS: Final = 4
-"""Of so many trucks one is driven by its tracker, along its path or to goals of its planner, where it has one."""
 MOVES: Final = 0.03
 """True speed of a robot that drives, m/s; slower than it backs into ground that it knows little of."""
-RUN_UP_TIME: Final = 6.0
-"""Seconds after which it reverses without."""
 BY_HAND: Final[dict[str, Any]] = {
     "explorer": None,
     "planner": None,
@@ -212,11 +208,13 @@ class _Leg:
         self._rng = np.random.default_rng([leg.seed, leg.number, 1])
         base = wired(SimulatedTruckConfig.model_validate(leg.config))
         driven = base.tracker is not None and (base.path is not None or base.planner is not None)
-        self._follows = driven and leg.number % FOLLOWS == FOLLOWS - 1
+        # of so many trucks one is driven by its tracker, along its path or to goals of its planner, where it has one
+        follows = 4
+        self._follows = driven and leg.number % follows == follows - 1
         self._workers: tuple[str, ...] = ()
         if not self._follows:
             base = with_overlay(base, BY_HAND)
-        elif leg.number // FOLLOWS % 2:
+        elif leg.number // follows % 2:
             base, self._workers = with_overlay(base, TRACKER_IN_WORKER), (TRACKING,)
         records = None if leg.number % 5 else folder  # one of so many trucks records, and its disk may become full
         self._config = truck_of_leg(base, int(self._rng.integers(2**31)), records)
@@ -321,12 +319,13 @@ async def _turn(truck: DrillTruck, trial: Trial) -> None:
     assert judge is not None
     if not truck.by_hand or not isinstance(station, Wanderer):
         return
+    run_up_time = 6.0  # seconds after which it reverses without
     if trial.backwards:
-        station.run_up(RUN_UP_TIME)
+        station.run_up(run_up_time)
         begin = judge.place
         # 0.7: distance that the operator drives straight ahead before it reverses, m: a robot that has just been armed
         # knows nothing of the ground behind it
-        await truck.until(lambda: math.dist(judge.place, begin) > 0.7 or _blocked(truck), RUN_UP_TIME, Order.ARM)
+        await truck.until(lambda: math.dist(judge.place, begin) > 0.7 or _blocked(truck), run_up_time, Order.ARM)
     station.choose(backwards=trial.backwards)
     # 2.0: seconds in which the operator tries to drive in the direction of the trial
     await truck.until(lambda: abs(truck.speed) > MOVES and (truck.speed < 0) is trial.backwards, 2.0, Order.ARM)

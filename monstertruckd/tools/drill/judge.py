@@ -10,9 +10,6 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_sim.world.world import World
 from monstertruckd.tools.drill.observer import AT_REST, Violation
 
-PERIOD: Final = SECOND // 50
-MAY_TRAVEL: Final = 0.3
-"""Distance that a robot may travel while nothing permits motion, m."""
 MAY_MOVE: Final = 1.0
 """Seconds for which a robot may still move once nothing permits motion."""
 
@@ -21,7 +18,7 @@ class WorldJudge:
     """Watches one robot.
 
     Motion is permitted from the operator's order to arm until one to disarm or stop. Three things are unsafe: contact
-    with anything, motion that is not permitted beyond ``MAY_TRAVEL`` or ``MAY_MOVE``, and what a fault leaves behind.
+    with anything, motion that is not permitted beyond 0.3 m or ``MAY_MOVE``, and what a fault leaves behind.
     Contacts that begin while the operator confirms unseen ground are counted apart.
 
     Args:
@@ -53,7 +50,7 @@ class WorldJudge:
         due = self._clock.now()
         while True:
             self.look()
-            due += PERIOD
+            due += SECOND // 50
             await self._clock.sleep_until(due)
 
     # What the operator does
@@ -123,7 +120,7 @@ class WorldJudge:
             self._stood = None
         self._travelled += moved
         since = (now - self._forbidden) / SECOND
-        if self._travelled > MAY_TRAVEL:
+        if self._travelled > 0.3:  # distance that a robot may travel while nothing permits motion, m
             self._blame("motion", f"travelled {self._travelled:.2f} m after motion was forbidden {since:.2f} s ago")
         if moves and since > MAY_MOVE:
             self._blame("motion", f"{truth.v:.3f} m/s though motion was forbidden {since:.2f} s ago")

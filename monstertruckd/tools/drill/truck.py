@@ -111,12 +111,8 @@ STEERING: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Ways of a wanderer to steer, by a body's freedom: front axle alone, both against each other, both alike, each by
 itself."""
-TURN: Final = (0.0, 0.0, 0.5)
-SIDEWAYS: Final = (0.0, 0.1, 0.0)
 LOOKS_AHEAD: Final = 2 * MAY_MOVE
 """Look-ahead of the operator of a robot without range sensors (s): twice ``MAY_MOVE``."""
-LOOKS: Final = 8
-"""Number of poses checked over ``LOOKS_AHEAD``."""
 
 
 def _can(chassis: Chassis, twist: Twist2) -> bool:
@@ -129,7 +125,8 @@ def _can(chassis: Chassis, twist: Twist2) -> bool:
 def stays_clear(world: World, twist: Twist2) -> bool:
     """Whether a robot touches nothing for ``LOOKS_AHEAD``, moving as it does or with ``twist``."""
     pose, motions = world.plant.pose, (twist, world.plant.twist)
-    times = [LOOKS_AHEAD * (look + 1) / LOOKS for look in range(LOOKS)]
+    looks = 8  # number of poses checked over ``LOOKS_AHEAD``
+    times = [LOOKS_AHEAD * (look + 1) / looks for look in range(looks)]
     return all(world.is_free(integrate(pose, *motion, time)) for motion in motions for time in times)
 
 
@@ -167,7 +164,7 @@ class Wanderer(DrivingStation):
         chassis = config.sim.world.truck.chassis()
         self._bicycle = chassis.bicycle
         self._steering = STEERING[chassis.freedom]
-        self._twists = tuple(twist for twist in (TURN, SIDEWAYS) if _can(chassis, twist))
+        self._twists = tuple(twist for twist in ((0.0, 0.0, 0.5), (0.0, 0.1, 0.0)) if _can(chassis, twist))
         self._until = 0
         self.backwards: bool | None = None
         """Only backwards or forwards from now on; None = either."""

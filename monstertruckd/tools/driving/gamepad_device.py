@@ -22,9 +22,6 @@ LOOK: Final = 1.0
 """Seconds between two looks for a gamepad."""
 STOPPING: Final = frozenset({"stop", "estop"})
 """Actions that count however late they are read."""
-EV_FF: Final = 0x15
-FF_RUMBLE: Final = 0x50
-EVIOCSFF: Final = 0x4030_4580
 EFFECT: Final = struct.Struct("HhHHHHHxxHH28x")
 """Type, number, direction, trigger (2), replay (length and delay, ms), strong and weak motor."""
 
@@ -69,11 +66,11 @@ class PadLink:
         if self._file is None:
             return
         size = round(0xFFFF * strength)
-        effect = bytearray(EFFECT.pack(FF_RUMBLE, self._effect, 0, 0, 0, round(seconds * 1000), 0, size, size))
+        effect = bytearray(EFFECT.pack(0x50, self._effect, 0, 0, 0, round(seconds * 1000), 0, size, size))  # FF_RUMBLE
         with suppress(OSError):
-            fcntl.ioctl(self._file, EVIOCSFF, effect)
+            fcntl.ioctl(self._file, 0x4030_4580, effect)  # EVIOCSFF
             self._effect = EFFECT.unpack(effect)[1]
-            os.write(self._file, EVENT.pack(0, 0, EV_FF, self._effect, 1))
+            os.write(self._file, EVENT.pack(0, 0, 0x15, self._effect, 1))  # EV_FF
 
     def flush(self) -> None:
         """Throw away what was not read in time, but for orders to stop, and let go."""

@@ -36,8 +36,6 @@ from monstertruckd.tools.status.watch import PERIOD, Follower
 
 RATE: Final = 20.0
 """Drive requests per second."""
-LEASE: Final = 0.25
-"""Seconds a request stands."""
 REST: Final = 6
 """Neutral requests after the gamepad was let go, so that the truck stops by its ramp."""
 QUIET: Final = frozenset({Reason.CLIPPED, Reason.SERVO_LIMIT})
@@ -235,11 +233,12 @@ class DriveSession:
         if request is None:
             return
         client.role = role
+        lease = 0.25  # seconds a request stands
         try:
             if request.twist is None:
-                await client.drive(request.speed, request.front, request.rear, lease=LEASE, unseen=request.unseen)
+                await client.drive(request.speed, request.front, request.rear, lease=lease, unseen=request.unseen)
             else:
-                await client.drive_twist(*request.twist, lease=LEASE, unseen=request.unseen)
+                await client.drive_twist(*request.twist, lease=lease, unseen=request.unseen)
         except TruckError as error:  # shown: the robot may come back
             self._stream.trouble = str(error)
         else:

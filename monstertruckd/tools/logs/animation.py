@@ -23,10 +23,6 @@ from monstertruckd.tools.logs.geometry import recorded_geometry
 from monstertruckd.tools.logs.messages import Progress
 from monstertruckd.tools.logs.report.scan_map import PlacedScans
 
-FRAMES_PER_SECOND: Final = 12.5
-"""A GIF counts hundredths of a second."""
-REST: Final = 1.5
-"""Seconds for which the last picture stays."""
 EDGE: Final = 0.25
 """Empty edge around what was seen, m."""
 MOST_FRAMES: Final = 1500
@@ -128,20 +124,22 @@ def animate(
     if output.suffix.lower() != ".gif":
         raise InputError(f"{output}: expected a name that ends with .gif")
     spare_log(output)
-    scenes = _scenes(reader, round(speed / FRAMES_PER_SECOND * SECOND), report)
+    frames_per_second = 12.5  # a GIF counts hundredths of a second
+    scenes = _scenes(reader, round(speed / frames_per_second * SECOND), report)
     if not scenes:
         raise InputError(f"{reader.path}: no pose in it: nothing to draw")
     if len(scenes) > MOST_FRAMES:
         needed = speed * len(scenes) / MOST_FRAMES
         raise InputError(f"{len(scenes)} pictures, at most {MOST_FRAMES}: expected --speed {math.ceil(needed)} or more")
     canvas = _AnimationCanvas(scenes, width, recorded_geometry(reader.path, reader.config()))
+    rest = 1.5  # seconds for which the last picture stays
     try:
-        with MovingPicture(output, 1 / FRAMES_PER_SECOND, REST) as pictures:
+        with MovingPicture(output, 1 / frames_per_second, rest) as pictures:
             for scene in scenes:
                 pictures.add(canvas.frame(scene))
     except OSError as error:
         raise CommandFailedError(f"{output}: {error.strerror or error}") from error
-    seconds = (len(scenes) - 1) / FRAMES_PER_SECOND + REST
+    seconds = (len(scenes) - 1) / frames_per_second + rest
     return {"frames": len(scenes), "seconds": round(seconds, 2), "bytes": output.stat().st_size}
 
 

@@ -16,8 +16,6 @@ KEPT: Final = 16_000_000
 """Bytes of values in memory, about."""
 PLAIN: Final = 64
 """Bytes of a value that is no array and no text."""
-ROWS: Final = 256
-"""Texts that are an array at a time: each is as wide as the longest one."""
 
 
 class Spool:
@@ -125,9 +123,10 @@ class Column:
             _write(archive, name, np.dtype(f"<U{width}"), (self._count,), parts)
 
     def _texts(self) -> Iterator[list[str]]:
+        rows = 256  # texts that are an array at a time: each is as wide as the longest one
         for values in self._chunks():
-            for first in range(0, len(values), ROWS):
-                yield [v if isinstance(v, str) else self._text(v) for v in values[first : first + ROWS]]
+            for first in range(0, len(values), rows):
+                yield [v if isinstance(v, str) else self._text(v) for v in values[first : first + rows]]
 
     def _write_arrays(self, archive: zipfile.ZipFile, name: str) -> None:
         dtype, lengths = np.result_type(*self._dtypes), np.array(self._lengths)

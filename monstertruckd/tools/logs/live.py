@@ -25,8 +25,6 @@ from monstertruckd.tools.logs.rerun_view import APPLICATION, Scene, blueprint
 
 PERIOD: Final = 0.1
 """Seconds between two checks of what came."""
-RETRY: Final = 1.0
-"""Seconds between two attempts to reach the robot, and in which it answers."""
 WAITING: Final = 200
 """Messages of a topic that may wait for a look."""
 DRAWN: Final[tuple[Topic[Any], ...]] = (
@@ -42,9 +40,10 @@ async def follow(robot: str, endpoint: str, clock: Clock, stream: rr.RecordingSt
     topics = {topic.name: topic for topic in drawn}
     scene = Scene(stream, clock.real_offset())
     laid_out: set[str] = set()
+    retry = 1.0  # seconds between two attempts to reach the robot, and in which it answers
     while True:
         with suppress(TruckError):
-            async with TruckClient(robot, endpoint, clock=clock, timeout=RETRY) as client:
+            async with TruckClient(robot, endpoint, clock=clock, timeout=retry) as client:
                 with ExitStack() as stack:
                     boxes = [
                         (topic, stack.enter_context(client.subscribe(topic, fifo(WAITING))))
@@ -57,7 +56,7 @@ async def follow(robot: str, endpoint: str, clock: Clock, stream: rr.RecordingSt
                             laid_out = set(scene.entities)
                             stream.send_blueprint(blueprint(laid_out))
                         await clock.sleep(PERIOD)
-        await clock.sleep(RETRY)
+        await clock.sleep(retry)
 
 
 def take(scene: Scene, boxes: list[tuple[Topic[Any], Mailbox[Any]]]) -> None:

@@ -46,8 +46,6 @@ _CAMERA: Final = "camera"
 _FIRST: Final = ("Speed", "Steering commanded", "Cross-track error", "Battery", "Lateness of the control tick")
 """Figures that are in view when the recording opens."""
 _SCAN, _PATH, _WAY, _TRUCK = (39, 104, 211), (120, 130, 145), (217, 83, 44), (28, 154, 104)
-_HEIGHT: Final = 0.15
-"""Height of the truck's box, m; not configured."""
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 _JOURNAL: Final = {
     LogLevel.DEBUG: "DEBUG",
@@ -146,9 +144,10 @@ class Scene:
         length, width = geometry.get("length"), geometry.get("width")
         if length is None or width is None:
             return
-        box = rr.Boxes3D(sizes=[(length, width, _HEIGHT)], centers=[(0.0, 0.0, _HEIGHT / 2)], colors=_TRUCK)
+        height = 0.15  # height of the truck's box, m; not configured
+        box = rr.Boxes3D(sizes=[(length, width, height)], centers=[(0.0, 0.0, height / 2)], colors=_TRUCK)
         self._stream.log("truck", rr.CoordinateFrame("base"), box, static=True)
-        ahead = rr.Arrows3D(vectors=[(length, 0.0, 0.0)], origins=[(0.0, 0.0, _HEIGHT)], colors=_TRUCK, radii=0.012)
+        ahead = rr.Arrows3D(vectors=[(length, 0.0, 0.0)], origins=[(0.0, 0.0, height)], colors=_TRUCK, radii=0.012)
         self._stream.log("truck/ahead", rr.CoordinateFrame("base"), ahead, static=True)
 
     def take(self, topic: str, log_time: int, message: Message) -> None:

@@ -31,8 +31,6 @@ from monstertruckd.tools.logs.export import removed_on_failure
 from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
 
 _STORE: Final = get_typestore(Stores.ROS2_JAZZY)
-_PLANE: Final = (0, 1, 5)
-"""Rows of (x, y, yaw) in ROS's covariances over (x, y, z, roll, pitch, yaw)."""
 _NEVER: Final = QosTime(9_223_372_036, 854_775_807)
 
 
@@ -119,7 +117,8 @@ def _pose(pose: Pose2D) -> Any:
 def _covariance(planar: Array) -> Array:
     """Shape (36,) from the (9,) of x, y, yaw; what the plane does not know is 0."""
     full = np.zeros((6, 6))
-    full[np.ix_(_PLANE, _PLANE)] = planar.reshape(3, 3)
+    plane = (0, 1, 5)  # rows of (x, y, yaw) in ROS's covariances over (x, y, z, roll, pitch, yaw)
+    full[np.ix_(plane, plane)] = planar.reshape(3, 3)
     return full.ravel()
 
 

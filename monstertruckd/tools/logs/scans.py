@@ -37,10 +37,6 @@ from monstertruckd.tools.logs.scan_log import (
 
 LONGEST_LOG: Final = 1e9
 """A longer npz log has other units than seconds, s."""
-URG_STEP: Final = math.tau / 1024
-URG_ERRORS: Final = 0.02
-"""Shorter readings of a URG are error codes, m."""
-URG_RANGE: Final = 5.6
 URG_AHEAD: Final = 341
 """Beam of a URG recording that looks straight ahead."""
 BAG: Final = b"#ROSBAG V"
@@ -204,14 +200,16 @@ def _check(path: Path, geometry: dict[str, Any]) -> None:
 
 def _urg(path: Path) -> Iterator[ScanInput]:
     recording = RecordedRanges.load(path)
+    urg_errors = 0.02  # shorter readings of a URG are error codes, m
+    urg_step = math.tau / 1024
     for time, row in zip(recording.times.tolist(), recording.ranges, strict=True):
         yield ScanInput(
             stamp=BEGIN + time,
-            ranges=np.where(row / 1000 >= URG_ERRORS, row / 1000, np.inf),
-            start_angle=-URG_AHEAD * URG_STEP,
-            angle_increment=URG_STEP,
-            range_min=URG_ERRORS,
-            range_max=URG_RANGE,
+            ranges=np.where(row / 1000 >= urg_errors, row / 1000, np.inf),
+            start_angle=-URG_AHEAD * urg_step,
+            angle_increment=urg_step,
+            range_min=urg_errors,
+            range_max=5.6,  # m
             time_increment=0.1 / 1024,
             mount=(0.145, 0.0, 0.0),
         )

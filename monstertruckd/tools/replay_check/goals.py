@@ -26,7 +26,6 @@ from monstertruckd.recorder.reader import LogMessage
 ASKED: Final = frozenset({topics.REQ_GOAL.name, topics.REQ_GOAL_CONTROL.name})
 CANCELLED_BY: Final = "cancelled by "
 
-LEASE: Final = 1.0
 PLANNED: Final = r"goal-\d+\.\d+"
 DEFORMED: Final = r"goal-\d+-(deformed|held-up)\.\d+"
 TOGETHER: Final = SECOND // 50
@@ -51,7 +50,7 @@ class RecordedCall:
             "frame": self.frame,
             "source": self.source,
             "role": Role.STATION,
-            "lease": LEASE,
+            "lease": 1.0,  # s
             "nonce": gate.nonce,
             "gate_stamp": gate.stamp,
         }

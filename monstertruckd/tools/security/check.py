@@ -26,8 +26,6 @@ from monstertruckd.tools.security.folder import Folder
 
 TIMEOUT: Final = 1.5
 """Seconds to wait for what may not come."""
-SHORT: Final = 6
-"""Seconds after which the certificate of the expiry case expires."""
 LONG: Final = 600
 
 
@@ -140,12 +138,13 @@ class _Attempt:
 
     async def _expiring(self, name: str) -> Case:
         who, expected = "a certificate that expires", "state until then, nothing afterwards"
-        tls = self._files(self._made(name, SHORT), self._folder.issuer(name).pem)
+        short = 6  # seconds after which the certificate of the expiry case expires
+        tls = self._files(self._made(name, short), self._folder.issuer(name).pem)
         try:
             async with self._client(tls) as client:
                 gate = client.subscribe(GATE, latest())
                 first = await gate.next_within(TIMEOUT)
-                await self._clock.sleep(SHORT)
+                await self._clock.sleep(short)
                 gate.drain()
                 later = await gate.next_within(TIMEOUT)
         except TruckError as error:

@@ -46,7 +46,6 @@ from monstertruckd.tools.security.certificates import (
 
 AUTHORITY_DAYS: Final = 3650
 ROBOT_DAYS: Final = 825
-STATION_DAYS: Final = 365
 PORT: Final = 7447
 PILOTS_PORT: Final = 7448
 ROUTER_FILE: Final = "router.pem"
@@ -189,7 +188,7 @@ class Folder:
             self._write(register)
         return new
 
-    def add(self, name: str, role: AccessRole | None, rank: Role | None, now: int, days: int = STATION_DAYS) -> bool:
+    def add(self, name: str, role: AccessRole | None, rank: Role | None, now: int, days: int = 365) -> bool:
         """Certify a station, or renew its certificate; True if the robot must be restarted to know it.
 
         Args:

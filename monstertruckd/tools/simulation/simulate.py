@@ -38,7 +38,6 @@ from monstertruckd.tools.simulation.program import program
 from monstertruckd.tools.simulation.tape import EmulatedTape
 
 Say = Callable[[str], None]
-TRUTH_PERIOD = SECOND // 20
 ANOTHER: Final = (
     "probably another `simulate` on this computer; Ctrl-C in its terminal ends it. "
     "A second robot beside it needs a configuration with a `robot` and `zenoh: listen` of its own"
@@ -63,7 +62,7 @@ class TruthLog:
             now = self._clock.now()
             state = self._world.truth(now)
             self._samples.extend((now / SECOND, state.x, state.y, state.yaw, state.v, float(state.stuck)))
-            due += TRUTH_PERIOD
+            due += SECOND // 20  # 20 Hz
             await self._clock.sleep_until(due)
 
     def array(self) -> Array:

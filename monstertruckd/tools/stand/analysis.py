@@ -19,8 +19,6 @@ from monstertruckd.recorder.reader import LogReader
 
 LEAST: Final = 40
 """Poses in common."""
-REACH: Final = 0.5
-"""Greatest latency, s."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,8 @@ def latency_of(seen: Array, estimate: Array) -> float | None:
     if np.ptp(yaw) < 0.5:  # least turn to determine the latency, rad
         return None
     times = seen[:, 0]
-    inside = (times > estimate[0, 0] + REACH) & (times < estimate[-1, 0] - REACH)
+    reach = 0.5  # greatest latency, s
+    inside = (times > estimate[0, 0] + reach) & (times < estimate[-1, 0] - reach)
     if inside.sum() < LEAST:
         return None
 
@@ -109,7 +108,7 @@ def latency_of(seen: Array, estimate: Array) -> float | None:
         basis = np.column_stack((np.ones(predicted.size), predicted, times[inside] - times[0]))
         return np.asarray(yaw[inside] - basis @ np.linalg.lstsq(basis, yaw[inside], rcond=None)[0])
 
-    fit = least_squares(residual, np.zeros(1), np.array((-REACH,)), np.array((REACH,)), huber=0.05)
+    fit = least_squares(residual, np.zeros(1), np.array((-reach,)), np.array((reach,)), huber=0.05)
     return float(fit.parameters[0])
 
 

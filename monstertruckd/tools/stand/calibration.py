@@ -28,8 +28,6 @@ Numbers = Annotated[tuple[float, ...], Field(strict=False)]
 
 LEAST_MARKS: Final = 5
 """Marks that a camera must see, at least."""
-MISPLACED: Final = (0.002, 5.0)
-"""A mark is not where it was said to be beyond so many m, and so many standard deviations of the ruler."""
 
 
 class CameraCalibration(Schema):
@@ -107,7 +105,9 @@ def check_places(
     Raises:
         InputError: so it is. The mark without which all others fit is named, else the three that fit worst.
     """
-    limit = MISPLACED[0] + MISPLACED[1] * ruler
+    # a mark is not where it was said to be beyond so many m, and so many standard deviations of the ruler
+    misplaced = (0.002, 5.0)
+    limit = misplaced[0] + misplaced[1] * ruler
 
     def off(camera: PlacedCamera) -> dict[int, float]:
         points = {tag: camera.on_plane(px[None])[0] for tag, px in seen.items()}

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,8 +10,6 @@ from monstertruck_estimation.vision.tags import Sighting
 from monstertruck_kinematics.elementary import Array
 from monstertruckd.tools.stand.camera import PlacedCamera
 from monstertruckd.tools.stand.config import BlobRobot, TaggedRobot
-
-LEAST_WEIGHT: Final = 1e-3
 
 
 class MarkerPose(NamedTuple):
@@ -69,7 +67,7 @@ def tag_pose(camera: PlacedCamera, sighting: Sighting, height: float) -> MarkerP
 def weight_of(camera: PlacedCamera, pixels: Array) -> float:
     """Of what lies at these pixels, (n, 2): 1, and less near the picture's border."""
     # 0.12: share of a picture's height: nearer to its border a sighting has less weight
-    return min(max(camera.border(pixels) / 0.12, 0.0), 1.0) + LEAST_WEIGHT
+    return min(max(camera.border(pixels) / 0.12, 0.0), 1.0) + 1e-3  # least weight
 
 
 def merged(poses: Sequence[MarkerPose]) -> MarkerPose:

@@ -27,8 +27,6 @@ EXPECTED: Final = 0.5
 """Seconds for which a robot is expected where its speed takes it."""
 BLIND: Final = 5.0
 """Seconds without any mark after which a camera looks elsewhere."""
-SILENT: Final = 1.0
-"""Seconds without a picture after which a camera counts as lost."""
 
 
 @dataclass(slots=True)
@@ -177,11 +175,12 @@ class StandTracker:
     def complaints(self, now: int) -> list[str]:
         """What is newly wrong with cameras, or right again, and robots that are not distinguished."""
         said = self._identities.complaints()
+        silent = 1.0  # seconds without a picture after which a camera counts as lost
         for name, state in self.cameras.items():
-            lost = now - state.heard > SILENT * SECOND
+            lost = now - state.heard > silent * SECOND
             if lost != state.lost:
                 said.append(
-                    f"camera {name} " + (f"sends no picture for {SILENT:g} s" if lost else "sends pictures again")
+                    f"camera {name} " + (f"sends no picture for {silent:g} s" if lost else "sends pictures again")
                 )
                 state.lost = lost
             if lost:

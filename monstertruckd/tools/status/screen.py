@@ -55,7 +55,6 @@ STATE_STYLE = {
     ServiceState.STOPPED: "dim",
 }
 EVENT_STYLE = {Severity.INFO: "green", Severity.WARNING: "yellow", Severity.ERROR: "bold red"}
-WIDE = 104
 HORIZON = 0.72
 """Where the truck stands in the scan view, from the top: the lidar looks ahead."""
 
@@ -181,7 +180,7 @@ _FIELDS: Final = {topic.model: name for name, topic in SHOWN.items()}
 
 
 def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:
-    """The whole screen; a terminal narrower than ``WIDE`` columns names the services alone that are not ready.
+    """The whole screen; a terminal narrower than 104 columns names the services alone that are not ready.
 
     Once the robot has been silent for ``SILENCE`` seconds, that stands above everything it said, in grey.
 
@@ -205,7 +204,7 @@ def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:
     layout.split_column(*rows)
     scan = Layout(paint(Panel(_Braille(state), title=_view_title(state), border_style="dim")))
     truck = Layout(paint(_truck(state)), size=40)
-    if width >= WIDE:
+    if width >= 104:
         layout["top"].split_row(truck, scan, Layout(paint(_services(state)), size=34))
         return layout
     column = Layout()

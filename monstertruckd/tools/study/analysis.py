@@ -13,12 +13,6 @@ from monstertruck_runtime.errors import InputError
 
 LEAST: Final = 40
 """Poses of a run, at least."""
-LEAST_TURN: Final = 1.0
-"""Radians that a circle must turn: less does not separate its centre from its radius."""
-LEAST_WAY: Final = 0.01
-"""Metres that a pass must cover: less has no direction."""
-SETTLED: Final = 1.0
-"""Seconds at the beginning of a run, or of a pass, that do not count: ramps, and the turn at a reversal."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +71,9 @@ def circle(times: Array, poses: Array) -> Circle:
     times, poses = _checked(times, poses)
     at, heading = times - times[0], np.unwrap(poses[2])
     turned = float(heading[-1] - heading[0])
-    if abs(turned) < LEAST_TURN:
-        raise InputError(f"the run turns by {turned:.2f} rad: expected at least {LEAST_TURN:g}, a circle")
+    least_turn = 1.0  # radians that a circle must turn: less does not separate its centre from its radius
+    if abs(turned) < least_turn:
+        raise InputError(f"the run turns by {turned:.2f} rad: expected at least {least_turn:g}, a circle")
     c, s, one, zero = np.cos(heading), np.sin(heading), np.ones_like(at), np.zeros_like(at)
     along_x = np.stack((one, zero, at, zero, c, -s), axis=1)
     along_y = np.stack((zero, one, zero, at, s, c), axis=1)
@@ -127,19 +122,22 @@ def line(times: Array, poses: Array, directions: Array) -> StraightPasses:
     times, poses = _checked(times, poses)
     heading = np.unwrap(poses[2])
     cuts = np.flatnonzero(np.diff(directions)) + 1
+    # seconds at the beginning of a run, or of a pass, that do not count: ramps, and the turn at a reversal
+    settled = 1.0
     passes = [
-        part[times[part] - times[part[0]] > SETTLED]
+        part[times[part] - times[part[0]] > settled]
         for part in np.split(np.arange(times.size), cuts)
         if directions[part[0]] != 0.0
     ]
     passes = [part for part in passes if part.size >= LEAST]
     if not passes:
-        raise InputError(f"no pass has {LEAST} poses after its first {SETTLED:g} s")
+        raise InputError(f"no pass has {LEAST} poses after its first {settled:g} s")
     ends = [_fitted(times[part], poses[:, part]) for part in passes]
     lengths = np.array([np.hypot(*(end - begin)) for begin, _, end in ends])
-    if lengths.min() < LEAST_WAY:
+    least_way = 0.01  # metres that a pass must cover: less has no direction
+    if lengths.min() < least_way:
         number, way = int(lengths.argmin()) + 1, 1000 * lengths.min()
-        raise InputError(f"pass {number} covers {way:.1f} mm: expected at least {1000 * LEAST_WAY:g}")
+        raise InputError(f"pass {number} covers {way:.1f} mm: expected at least {1000 * least_way:g}")
     begin, _, end = ends[0]
     ahead = (end - begin) / np.hypot(*(end - begin))
     across = [np.array([-ahead[1], ahead[0]]) @ (poses[:2, part] - begin[:, None]) for part in passes]

@@ -11,9 +11,6 @@ from monstertruckd.tools.study.analysis import Circle, centre_track, velocities
 from monstertruckd.tools.study.log import Run
 from monstertruckd.tools.study.report import Result
 
-SMOOTHED: Final = 20
-"""Poses over which the centre of rotation is averaged in the picture."""
-
 Draw = Callable[[Any, Run, Any], None]
 
 
@@ -33,10 +30,11 @@ def _velocity(axes: Any, run: Run, _found: Any) -> None:
 def _centre(axes: Any, run: Run, found: Circle) -> None:
     track = centre_track(run.poses, found)
     at = run.times - run.times[0]
+    smoothed = 20  # poses over which the centre of rotation is averaged in the picture
     for name, row, start, drift in zip("XY", track, found.centre, found.drift, strict=True):
-        window = np.ones(SMOOTHED) / SMOOTHED
+        window = np.ones(smoothed) / smoothed
         smooth = 1000 * (np.convolve(row, window, "valid") - start)
-        (drawn,) = axes.plot(run.times[SMOOTHED // 2 :][: smooth.size], smooth, linewidth=0.5, alpha=0.6)
+        (drawn,) = axes.plot(run.times[smoothed // 2 :][: smooth.size], smooth, linewidth=0.5, alpha=0.6)
         label = f"{name}, {run.name}: {1000 * drift:.3f} mm/s"
         axes.plot(run.times, 1000 * drift * at, color=drawn.get_color(), label=label)
     axes.set(xlabel="time, s", ylabel="centre of rotation less its begin, mm")

@@ -15,7 +15,6 @@ from monstertruckd.config.truck import TruckConfig
 
 PERIOD: Final = 0.05
 """Seconds between two requests."""
-LEASE: Final = 0.25
 PAUSE: Final = 0.6
 """Seconds of standstill at a reversal."""
 SETTLING: Final = 2.0
@@ -126,7 +125,7 @@ async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequen
                 due = clock.now()
                 end = due + round(stretch.seconds * SECOND)
                 while due < end:
-                    await robot.drive_shafts(*row, lease=LEASE)
+                    await robot.drive_shafts(*row, lease=0.25)
                     due += round(PERIOD * SECOND)
                     await clock.sleep_until(min(due, end))
                     state = gate.latest

@@ -13,14 +13,10 @@ OVERSHOOTS: Final = 0.6
 """Share of the first error by which the distance goes beyond the one wanted, from which on it overshoots."""
 CALM: Final = 0.5
 """Share up to which it is calm."""
-RAISE_P: Final = 1.5, 1.2
-"""Factors of K_p, at first and again later."""
 FIRST_D, RAISE_D = 0.5, 1.8
 """First K_d, of K_p, and the factor by which it grows."""
 MOST: Final = 16
 """Runs."""
-SMOOTHED: Final = 4
-"""Samples over which errors are averaged."""
 
 
 class WallGains(NamedTuple):
@@ -47,10 +43,11 @@ def judged(errors: Sequence[float]) -> RunVerdict:
     Raises:
         ValueError: fewer than ten samples.
     """
-    if len(errors) < 3 * SMOOTHED + 1:
-        raise ValueError(f"{len(errors)} samples: expected at least {3 * SMOOTHED + 1}")
+    smoothed = 4  # samples over which errors are averaged
+    if len(errors) < 3 * smoothed + 1:
+        raise ValueError(f"{len(errors)} samples: expected at least {3 * smoothed + 1}")
     all_of = np.asarray(errors)
-    smooth = np.convolve(all_of, np.ones(SMOOTHED) / SMOOTHED, "valid")
+    smooth = np.convolve(all_of, np.ones(smoothed) / smoothed, "valid")
     step = max(abs(float(smooth[0])), 0.03)  # first error that counts as one, m
     beyond = -np.sign(smooth[0]) * smooth
     steady = all_of[-len(all_of) // 3 :]
@@ -65,8 +62,9 @@ def recipe(k_p: float) -> Generator[WallGains, RunVerdict, WallGains | None]:
     """
     gains, runs = WallGains(k_p, 0.0), 1
     verdict = yield gains
-    while verdict.overshoot < OVERSHOOTS and runs < MOST and gains.k_p * RAISE_P[0] <= 60.0:  # k_p that is tried
-        gains, runs = WallGains(gains.k_p * RAISE_P[0], 0.0), runs + 1
+    raise_p = 1.5, 1.2  # factors of K_p, at first and again later
+    while verdict.overshoot < OVERSHOOTS and runs < MOST and gains.k_p * raise_p[0] <= 60.0:  # k_p that is tried
+        gains, runs = WallGains(gains.k_p * raise_p[0], 0.0), runs + 1
         verdict = yield gains
     best: tuple[float, WallGains] | None = None
     while runs < MOST:
@@ -75,7 +73,7 @@ def recipe(k_p: float) -> Generator[WallGains, RunVerdict, WallGains | None]:
                 best = verdict.steady, gains
             if verdict.steady <= 0.006:  # steady error that is small, m: what the coursework had
                 break
-            gains = WallGains(gains.k_p * RAISE_P[1], gains.k_d)
+            gains = WallGains(gains.k_p * raise_p[1], gains.k_d)
         else:
             gains = WallGains(gains.k_p, max(FIRST_D * gains.k_p, RAISE_D * gains.k_d))
         runs += 1

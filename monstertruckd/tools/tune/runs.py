@@ -20,17 +20,9 @@ from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import BEHAVIOUR
 from monstertruckd.tools.tune.recipe import RunVerdict, WallGains, judged, recipe
 
-STEP: Final = 0.05
-"""Change of the wanted distance from one run to the next, m."""
 FOLLOWING: Final = "follow"
-LIMIT: Final = 120.0
-"""Seconds in which a run must have been complete."""
 LOST: Final = 0.12
 """Distance error at which a run is broken off before the robot loses the wall, m; it counts as overshooting."""
-CALM_WITHIN: Final = 0.02
-"""Distance error below which a robot is ready for a run, m."""
-CALM_FOR: Final = 2.0
-"""Seconds for which the error must be below ``CALM_WITHIN``."""
 
 
 Samples = Sequence[tuple[float, float]]
@@ -70,7 +62,7 @@ async def tune(
     Args:
         client: of the robot.
         name: of a behaviour of kind ``wall_pd``.
-        distance: the nearer one, m; every second run wants ``STEP`` more.
+        distance: the nearer one, m; every second run wants 5 cm more.
         first: K_p of the first run.
         seconds: of following that make a run.
         pause: waits until the robot stands.
@@ -101,7 +93,8 @@ async def _tuned(
 ) -> WallGains | None:
     gains, number = next(trials), 0
     while True:
-        before, wanted = (distance + STEP * (n % 2) for n in (number, number + 1))
+        # 0.05: change of the wanted distance from one run to the next, m
+        before, wanted = (distance + 0.05 * (n % 2) for n in (number, number + 1))
         await _run(client, name, {"distance": before}, partial(_calm, before), held=number == 0)
         await pause()
         samples = await _run(client, name, {**gains._asdict(), "distance": wanted}, partial(_over, wanted, seconds))
@@ -122,8 +115,10 @@ async def _tuned(
 
 def _calm(wanted: float, samples: Samples) -> bool:
     """Whether the robot keeps its distance."""
-    newest = [measured for at, measured in samples if at >= samples[-1][0] - CALM_FOR]
-    return samples[-1][0] >= CALM_FOR and max(abs(measured - wanted) for measured in newest) < CALM_WITHIN
+    calm_for = 2.0  # seconds for which the error must be below 2 cm
+    newest = [measured for at, measured in samples if at >= samples[-1][0] - calm_for]
+    # 0.02: distance error below which a robot is ready for a run, m
+    return samples[-1][0] >= calm_for and max(abs(measured - wanted) for measured in newest) < 0.02
 
 
 def _over(wanted: float, seconds: float, samples: Samples) -> bool:
@@ -151,13 +146,14 @@ async def _run(
 
 async def _followed(states: Mailbox[BehaviourState], number: int, over: Callable[[Samples], bool]) -> Samples:
     begun, samples = 0.0, list[tuple[float, float]]()
+    limit = 120.0  # seconds in which a run must have been complete
     async for state in states:
         if state.number != number:
             continue
         if not state.running:
             raise RequestRefusedError(state.outcome, f"the run ended early: {state.text or state.outcome.text}")
-        if state.elapsed > LIMIT:
-            text = f"{state.phase} for {LIMIT:g} s: place the robot beside a straight wall"
+        if state.elapsed > limit:
+            text = f"{state.phase} for {limit:g} s: place the robot beside a straight wall"
             raise RequestRefusedError(Reason.TIMEOUT, text)
         if state.phase != FOLLOWING or "distance" not in state.values:
             samples = []
@@ -167,9 +163,6 @@ async def _followed(states: Mailbox[BehaviourState], number: int, over: Callable
         if over(samples):
             return samples
     raise NoAnswerError("the link to the robot was closed")
-
-
-COLUMNS: Final = 4
 
 
 def require_drawable(path: Path) -> None:
@@ -197,10 +190,11 @@ def draw(runs: Sequence[TuningRun], path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - of this command only
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    rows = math.ceil(len(runs) / COLUMNS)
-    figure = Figure(figsize=(3.2 * COLUMNS, 2.4 * rows), layout="constrained")
+    columns = 4
+    rows = math.ceil(len(runs) / columns)
+    figure = Figure(figsize=(3.2 * columns, 2.4 * rows), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, COLUMNS, squeeze=False, sharex=True, sharey=True).flat
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat
     for place, (number, run) in zip(axes, enumerate(runs, 1), strict=False):
         times, errors = zip(*run.samples, strict=True)
         place.plot(times, [1000 * error for error in errors])

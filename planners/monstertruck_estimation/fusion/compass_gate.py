@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final
 
 from monstertruck_estimation.fusion.config import HeadingTrust
 from monstertruck_estimation.transforms import wrap_angle
@@ -58,7 +57,7 @@ class CompassGate:
     jump: float = 0.0
     """By how much the headings jumped, and the robot did not turn, when the present disturbance began, rad; 0 = not."""
     level: float = 0.0
-    """Mean residual since, rad, over about ``LEVEL_WAY``."""
+    """Mean residual since, rad, over about 1 m and rad."""
     level_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Pose in odom at the last heading, m and rad."""
 
@@ -89,10 +88,6 @@ class HeadingInnovation:
     whether its residual is a jump shows by ``turn_known``."""
     turn_known: float = 0.0
     """Greatest residual, rad, that may be the robot's own turn, and not the compass's."""
-
-
-LEVEL_WAY: Final = 1.0
-"""Distance, m, and turn, rad, over which reckoning drifts less than a jump."""
 
 
 def gate_heading(
@@ -144,7 +139,8 @@ def _jumped(gate: CompassGate, innovation: HeadingInnovation) -> CompassGate:
     change = wrap_angle(innovation.residual - gate.level)
     if change * gate.jump < 0 and abs(change) > abs(gate.jump) / 2:
         return replace(gate, jump=0.0)
-    share = 1.0 - math.exp(-(math.hypot(x - x0, y - y0) + abs(wrap_angle(yaw - yaw0))) / LEVEL_WAY)
+    # 1.0: distance, m, and turn, rad, over which reckoning drifts less than a jump
+    share = 1.0 - math.exp(-(math.hypot(x - x0, y - y0) + abs(wrap_angle(yaw - yaw0))) / 1.0)
     return replace(gate, level=wrap_angle(gate.level + share * change), level_at=innovation.place)
 
 

@@ -127,8 +127,6 @@ class MeasurementHistory:
             self._done -= kept
 
 
-MARGIN: Final = (0.1, 0.1)
-"""Allowance for errors of two scans in the limits of their motion, m and rad."""
 MAX_RECOMPUTED: Final = 6
 """Most measurements that one estimate recomputes, about a millisecond."""
 NAMES: Final = ("drive", "steering", "compass", "imu", "tilt", "lidar")
@@ -258,7 +256,8 @@ class Fusion:
             return
         dt = (measured.stamp - measured.since) / SECOND
         x, y, yaw = np.abs(measured.delta).tolist()
-        if max(x, y) > self._config.max_speed * dt + MARGIN[0] or yaw > self._config.max_turn * dt + MARGIN[1]:
+        margin = (0.1, 0.1)  # allowance for errors of two scans in the limits of their motion, m and rad
+        if max(x, y) > self._config.max_speed * dt + margin[0] or yaw > self._config.max_turn * dt + margin[1]:
             self._left_out["lidar: faster than the robot can be"] += 1
             return
         self._apply_slip(self._slip.scans(measured))

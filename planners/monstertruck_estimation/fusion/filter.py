@@ -86,8 +86,6 @@ LATER: Final = slice(15, 18)
 """Pose of the scan being applied."""
 IDENTITY: Final = np.eye(SIZE)
 LARGER: Final = np.eye(SIZE + 3)
-QUANTUM: Final = (1e-5, 1e-5)
-"""Standard deviation of a wheel reading that did not move, m and rad: status costs no certainty."""
 MOVED_BY: Final = ("drive", "lidar")
 """Sensors that measure motion."""
 TURNED_BY: Final = ("imu", "lidar")
@@ -228,13 +226,15 @@ def _motion_residual(state: FilterState, clone: slice, delta: Array) -> tuple[Ar
 
 def _wheels(state: FilterState, measured: WheelMeasurement, config: FusionConfig) -> FilterState:
     slip, used = config.slip, state.used
+    # standard deviation of a wheel reading that did not move, m and rad: status costs no certainty
+    quantum = (1e-5, 1e-5)
     if state.wheels == measured.since:
         if measured.tilt is not None:
             used = {**used, "tilt": measured.stamp}
         level = np.array((*_level(state, measured.tilt), 1.0))
         delta, dt = measured.delta * level, (measured.stamp - measured.since) / SECOND
         residual, by_state = _motion_residual(state, WHEELS, delta)
-        noise = measured.covariance + np.diag((QUANTUM[0] ** 2, QUANTUM[0] ** 2, QUANTUM[1] ** 2))
+        noise = measured.covariance + np.diag((quantum[0] ** 2, quantum[0] ** 2, quantum[1] ** 2))
         if measured.slipping:
             noise = noise + np.diag(np.square((slip.speed * dt, slip.speed * dt, slip.turn * dt)))
         if measured.turn is not None:

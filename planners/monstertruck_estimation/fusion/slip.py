@@ -21,12 +21,6 @@ from monstertruck_runtime.clock import SECOND
 
 BLIND: Final = SECOND
 """Without scans for so long, wheels are compared with the compass, ns."""
-FLOOR: Final = (0.003, 0.005)
-"""Standard deviation of any comparison, m and rad."""
-JITTER: Final = 0.01
-"""Standard deviation of a compass heading against one a second before, rad."""
-EXPIRES: Final = 10 * SECOND
-"""Slip that nothing has confirmed for so long, ns, is over: the scans have ended, and the wheels are all there is."""
 SPAN: Final = SECOND
 """Wheels and compass are compared over this long, ns."""
 
@@ -77,10 +71,13 @@ class SlipDetector:
         self._trail.append((measured.stamp, compose(pose, measured.delta), spread + measured.covariance))
         while self._trail[0][0] < measured.stamp - 3 * SECOND:  # wheel motion is remembered for this long, ns
             self._trail.popleft()
-        if not self.slipping or measured.stamp - self._compared_at < EXPIRES:
+        # slip that nothing has confirmed for so long, ns, is over: the scans have ended, and the wheels are all there
+        # is
+        expires = 10 * SECOND
+        if not self.slipping or measured.stamp - self._compared_at < expires:
             return None
         self.slipping = False
-        text = f"nothing to compare the wheels with for {EXPIRES // SECOND} s: they count again"
+        text = f"nothing to compare the wheels with for {expires // SECOND} s: they count again"
         return SlipChange(slipping=False, since=measured.stamp, text=text)
 
     def scans(self, measured: ScanMeasurement) -> SlipChange | None:
@@ -143,10 +140,11 @@ class SlipDetector:
 
     def heading(self, stamp: int, yaw: float) -> SlipChange | None:
         """Take an undisturbed heading (counter-clockwise, rad); it is used where there are no scans."""
+        jitter = 0.01  # standard deviation of a compass heading against one a second before, rad
         if self._headings:
             last, before = self._headings[-1]
             # 3.0: no robot turns faster than this, rad/s
-            if abs(wrap_angle(yaw - before)) > JITTER * 4 + 3.0 * (stamp - last) / SECOND:
+            if abs(wrap_angle(yaw - before)) > jitter * 4 + 3.0 * (stamp - last) / SECOND:
                 # The field has changed, nothing turns so fast.
                 self._headings.clear()
         self._headings.append((stamp, yaw))
@@ -163,7 +161,7 @@ class SlipDetector:
         like = math.exp(
             -math.hypot(delta[0], delta[1]) / DEVIATION_SCALE[0] - abs(float(delta[2])) / DEVIATION_SCALE[1]
         )
-        elsewhere = JITTER**2 + self._deviation**2 * (1 - like)
+        elsewhere = jitter**2 + self._deviation**2 * (1 - like)
         distance = abs(off) / math.sqrt(float(noise[2, 2]) + 2 * elsewhere)
         self._compared_at = stamp
         text = f"wheels and compass differ by {off:+.3f} rad in {(stamp - since) / SECOND:.1f} s"
@@ -192,11 +190,12 @@ class SlipDetector:
         place, turn = max(grown[0, 0], grown[1, 1], 0.0), max(grown[2, 2], 0.0)
         speed, rate = (abs(delta) / ((stamp - since) / SECOND))[[0, 2]]
         timing = self._config.timing
+        floor = (0.003, 0.005)  # standard deviation of any comparison, m and rad
         return delta, np.diag(
             (
-                place + FLOOR[0] ** 2 + (timing * speed) ** 2,
-                place + FLOOR[0] ** 2 + (timing * speed) ** 2,
-                turn + FLOOR[1] ** 2 + (timing * rate) ** 2,
+                place + floor[0] ** 2 + (timing * speed) ** 2,
+                place + floor[0] ** 2 + (timing * speed) ** 2,
+                turn + floor[1] ** 2 + (timing * rate) ** 2,
             )
         )
 

@@ -18,8 +18,6 @@ FILE: Final = "ground.npz"
 """Name of the file in the folder of a saved map."""
 RESOLUTION: Final = 0.1
 """m."""
-MARGIN: Final = 20
-"""Cells added when the grid has to grow."""
 LARGEST: Final = 2000
 """Cells a side at most; what lies outside is left out."""
 KEY: Final = 1 << 24
@@ -123,8 +121,9 @@ class GroundGrid:
         size = np.array(self._counts.shape[::-1])
         if not size.all():
             self._corner, size = low.copy(), np.zeros(2, np.int64)
-        before = np.where(low < self._corner, self._corner - low + MARGIN, 0)
-        behind = np.where(high >= self._corner + size, high + 1 - self._corner - size + MARGIN, 0)
+        margin = 20  # cells added when the grid has to grow
+        before = np.where(low < self._corner, self._corner - low + margin, 0)
+        behind = np.where(high >= self._corner + size, high + 1 - self._corner - size + margin, 0)
         if not (before.any() or behind.any()):
             return True
         if (size + before + behind).max() > LARGEST:

@@ -5,8 +5,6 @@ in OpenCV ``SOLVEPNP_IPPE_SQUARE``). It has two solutions: a small square seen f
 side.
 """
 
-from typing import Final
-
 import cv2
 import numpy as np
 
@@ -14,13 +12,6 @@ from monstertruck_estimation.points.exchange import ReadAnswer, ReadTask, TagRea
 from monstertruck_estimation.vision.lens import Lens
 from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader, drawn
 from monstertruck_kinematics.elementary import Array
-
-CELLS: Final = 8
-"""Cells of a tag's black square, along a side."""
-SAMPLES: Final = 6
-"""Pixels of a cell that is looked at."""
-PIXEL: Final = 0.25
-"""Standard deviation of a corner, pixels."""
 
 
 class ReadingStep:
@@ -49,13 +40,15 @@ class ReadingStep:
 
 def decode_margin(grey: Picture, sighting: Sighting) -> float:
     """How clear the least clear cell is: 1 = black or white, 0 = grey, below 0 = the other one."""
-    side = CELLS * SAMPLES
+    cells = 8  # cells of a tag's black square, along a side
+    samples = 6  # pixels of a cell that is looked at
+    side = cells * samples
     square = np.array(((0, 0), (side, 0), (side, side), (0, side)), np.float32) - 0.5
     turned = cv2.getPerspectiveTransform(sighting.corners.astype(np.float32), square.astype(np.float32))
     flat = cv2.warpPerspective(grey, turned, (side, side), flags=cv2.INTER_LINEAR)
-    core = slice(SAMPLES // 3, SAMPLES - SAMPLES // 3)
-    means = np.asarray(flat, dtype=np.float64).reshape(CELLS, SAMPLES, CELLS, SAMPLES)[:, core, :, core].mean((1, 3))
-    white = drawn(sighting.tag, CELLS) > 127
+    core = slice(samples // 3, samples - samples // 3)
+    means = np.asarray(flat, dtype=np.float64).reshape(cells, samples, cells, samples)[:, core, :, core].mean((1, 3))
+    white = drawn(sighting.tag, cells) > 127
     bright, dark = float(means[white].mean()), float(means[~white].mean())
     if bright - dark < 25.0:  # least difference of white and black, of 255
         return -1.0
@@ -77,7 +70,8 @@ def placed(sighting: Sighting, size: float, lens: Lens, margin: float) -> TagRea
         return None
     normals = [np.asarray(cv2.Rodrigues(turn)[0])[:, 2] for turn in rotations[:count]]
     fits = [float(np.ravel(error)[0]) for error in errors[:count]]
-    doubt = 0.0 if count < 2 else min(1.0, (fits[0] + PIXEL) / (fits[1] + PIXEL))
+    pixel = 0.25  # standard deviation of a corner, pixels
+    doubt = 0.0 if count < 2 else min(1.0, (fits[0] + pixel) / (fits[1] + pixel))
     away = middle / np.linalg.norm(middle)
     return TagReading(
         sighting.tag,

@@ -40,13 +40,10 @@ START_TIMEOUT: Final = 60.0
 """Real seconds the worker may take to start."""
 OLDEST: Final = SECOND
 """Older pictures are not read, ns."""
-STANDING: Final = (0.02, 0.02)
-"""A robot that has moved and turned less, m and rad, is still at the place of the last picture."""
 PERIOD: Final = SECOND
 """Time between two messages, ns."""
 PAUSE: Final = 0.02
 """Seconds that others run then."""
-CRUMBS: Final = 4000
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +123,7 @@ class PointService:
         self._map = PointMap(config, mount)
         self._sequences = Sequences(max_age)
         self._history: deque[_Placed] = deque(maxlen=128)  # poses kept: 2.5 s at 50 Hz
-        self._trail: deque[tuple[int, Pose2]] = deque(maxlen=CRUMBS)
+        self._trail: deque[tuple[int, Pose2]] = deque(maxlen=4000)
         self._stamps: tuple[int, ...] = ()
         self._bases: Bases = {}
         self._dirty: dict[str, None] = {}
@@ -231,10 +228,12 @@ class PointService:
 
     def _worth(self, pose: Pose2) -> bool:
         """Whether the robot has moved since the last pictures, or has looked here once only."""
+        # a robot that has moved and turned less, m and rad, is still at the place of the last picture
+        standing = (0.02, 0.02)
         if self._looked is not None:
             before, looks = self._looked
             turned = abs(math.remainder(pose[2] - before[2], math.tau))
-            if math.dist(before[:2], pose[:2]) < STANDING[0] and turned < STANDING[1]:
+            if math.dist(before[:2], pose[:2]) < standing[0] and turned < standing[1]:
                 self._looked = before, looks + 1
                 return looks < 2  # pictures read at one place
         self._looked = pose, 1

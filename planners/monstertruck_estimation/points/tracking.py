@@ -22,10 +22,6 @@ from monstertruck_schemas.points import PointKind, PointOfInterest
 
 KEPT: Final = 24
 """Sightings of a point at most."""
-SIDE_ERROR: Final = 0.006
-"""Standard deviation across the line of sight, m."""
-DOUBTED: Final = 0.6
-"""Ratio of the fits of the best and the second pose of a square up to which the tag is unambiguous."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,19 +206,21 @@ def sighting(
     place = turned @ np.array(reading.middle) + np.array((mount.x, mount.y, mount.z))
     normals = [turned @ np.array(normal) for normal in (reading.normal, reading.other_normal)]
     level = [abs(float(normal[2])) for normal in normals]
-    second = reading.doubt > DOUBTED and level[1] < level[0] - 0.1
+    doubted = 0.6  # ratio of the fits of the best and the second pose of a square up to which the tag is unambiguous
+    second = reading.doubt > doubted and level[1] < level[0] - 0.1
     normal = normals[1 if second else 0]
-    sure = reading.doubt <= DOUBTED or abs(level[0] - level[1]) > 0.1
+    sure = reading.doubt <= doubted or abs(level[0] - level[1]) > 0.1
     away = math.hypot(*reading.middle)
     along = 0.4 / max(reading.pixels, 1.0) * away  # standard deviation of a tag's side in a picture, pixels
+    side_error = 0.006  # standard deviation across the line of sight, m
     # 0.004: standard deviation of the direction of the line of sight, rad: mount and lens
     # 0.015: error of the picture's stamp, s
-    across = SIDE_ERROR + away * (0.004 + abs(rate) * 0.015)
+    across = side_error + away * (0.004 + abs(rate) * 0.015)
     bearing = math.atan2(place[1] - mount.y, place[0] - mount.x)
     c, s = math.cos(bearing), math.sin(bearing)
     spin = np.array(((c, -s), (s, c)))
     spread = np.zeros((3, 3))
-    spread[:2, :2] = spin @ np.diag((along**2 + SIDE_ERROR**2, across**2)) @ spin.T
+    spread[:2, :2] = spin @ np.diag((along**2 + side_error**2, across**2)) @ spin.T
     # 0.06: standard deviation of the normal of an unambiguous tag, rad
     # 2.0: standard deviation of the normal of an ambiguous tag, rad
     spread[2, 2] = (0.06 if sure else 2.0) ** 2

@@ -6,7 +6,7 @@ OpenCV's ``CharucoDetector``).
 """
 
 import math
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,9 +15,6 @@ from numpy.typing import NDArray
 from monstertruck_estimation.vision.tags import Picture, dictionary
 from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.board import BoardConfig
-
-PROFILE: Final = 6
-"""Pixels to both sides of an edge, over which its width is measured."""
 
 
 class BoardSighting(NamedTuple):
@@ -70,9 +67,10 @@ def edge_blur(picture: Picture, corners: Array) -> float:
     A step blurred by a Gaussian has its greatest slope, contrast / (sqrt(2 pi) sigma), in its middle.
     """
     found = []
+    profile = 6  # pixels to both sides of an edge, over which its width is measured
     for x, y in np.rint(corners).astype(int):
-        patch = picture[max(y - PROFILE, 0) : y + PROFILE + 1, max(x - PROFILE, 0) : x + PROFILE + 1].astype(np.float64)
-        if min(patch.shape) <= PROFILE:
+        patch = picture[max(y - profile, 0) : y + profile + 1, max(x - profile, 0) : x + profile + 1].astype(np.float64)
+        if min(patch.shape) <= profile:
             continue
         contrast = float(np.subtract(*np.percentile(patch, (90, 10))))
         down, right = np.gradient(patch)

@@ -5,7 +5,7 @@ at the sonar's place. Behaviours that follow walls by sonars then drive a robot 
 """
 
 import math
-from typing import Annotated, Final, Self
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,6 @@ from monstertruck_schemas.base import FrameId, Schema
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan, SonarEcho, SonarRanges
-
-JOINED_SHARE: Final = 0.1
 
 
 def places() -> dict[str, Mount]:
@@ -71,7 +69,7 @@ def sonars_of(scan: LaserScan, mount: tuple[float, float, float], config: LidarS
     around = np.resize(np.arange(len(ranges)), len(ranges) + bool(len(ranges)))  # to the first beam again
     apart = np.hypot(*np.diff(points[around], axis=0).T)
     # 0.15: greatest distance of neighbouring points of one surface, m, and its share of their range, where that is more
-    joined = valid & valid[around[1:]] & (apart <= np.maximum(0.15, JOINED_SHARE * ranges[around[1:]]))
+    joined = valid & valid[around[1:]] & (apart <= np.maximum(0.15, 0.1 * ranges[around[1:]]))
     if not is_full_turn(len(ranges), scan.angle_increment):
         joined[-1:] = False
     known = valid | (scan.codes <= NO_ECHO)

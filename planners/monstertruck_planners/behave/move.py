@@ -26,8 +26,6 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Odometry
 from monstertruck_schemas.topics import GATE, ODOMETRY, Topic
 
-STEERED: Final = 0.03
-"""Difference of two directions up to which they are the same, 1/m and rad."""
 LAG: Final = 0.3
 """Seconds of driving by which every robot is behind."""
 
@@ -239,7 +237,8 @@ class Move:
             return False
         vx, vy, wz = self._twist
         off = max(abs(commanded.vx / pace - vx), abs(commanded.vy / pace - vy))
-        return off <= STEERED and abs(commanded.wz / pace - wz) <= STEERED * (1.0 + abs(wz))
+        steered = 0.03  # difference of two directions up to which they are the same, 1/m and rad
+        return off <= steered and abs(commanded.wz / pace - wz) <= steered * (1.0 + abs(wz))
 
     # The profile
 

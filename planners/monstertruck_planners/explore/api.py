@@ -32,7 +32,6 @@ from monstertruck_planners.route.heuristic import (
 
 AROUND: Final = 3.0
 """Distance of a viewpoint from its frontier at most, m."""
-BEAMS: Final = 96
 LEAST: Final = 0.06
 """New area that makes a place worth going to, m^2."""
 BEHIND: Final = 4
@@ -350,7 +349,7 @@ class ExplorationView:
         sensor = np.column_stack((poses[:, 0] + c * mx - s * my, poses[:, 1] + s * mx + c * my, poses[:, 2] + turn))
         sensor[:, :2] = (sensor[:, :2] - self.known.origin[:2]) / resolution
         depth = getattr(config, "depth", 1.0)  # see ``new_area``, m
-        cells = new_areas(self.known.cells, sensor, config.view, config.reach / resolution, depth / resolution, BEAMS)
+        cells = new_areas(self.known.cells, sensor, config.view, config.reach / resolution, depth / resolution, 96)
         area: Array = cells * resolution**2
         return area
 

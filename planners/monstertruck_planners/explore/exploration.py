@@ -25,15 +25,10 @@ RETURNS: Final = 6
 """Attempts to drive home."""
 NEAR_START: Final = 1.0
 """Distance from a blocked start, as at a wall, within which the robot counts as back, m."""
-SPACING: Final = 0.25
-"""Distance between the places beside the start that are kept, m."""
 AGAIN: Final = 2.0
 """Seconds from a refused goal to the next one; while driving home twice as many after each failure."""
 STANDS: Final = 5.0
 """Seconds that a lost robot waits before it drives a little."""
-AROUND: Final = ((0.6, 0.0, 0.0), (0.6, 0.25, 0.8), (0.6, -0.25, -0.8))
-"""Poses in base to which a lost robot drives in turn, and back, to see more; not backward, where no scan has seen the
-ground."""
 STUCK: Final = 3
 """Goals in a row that fail at one place after which the robot drives back out of it."""
 LEFT: Final = 0.3
@@ -42,8 +37,6 @@ TRAIL: Final = 0.5
 """Distance between the poses kept for driving back, m."""
 REMEMBERED: Final = 8
 """Poses kept for driving back."""
-COUNTED: Final = 0.03
-"""Motion that counts, m: the pose of a standing robot moves by some millimetres with every scan."""
 PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
 """Outcomes of a goal that do not depend on its place."""
 BROKEN: Final = frozenset({Reason.WORKER_DIED, Reason.WORKER_TIMEOUT})
@@ -212,14 +205,14 @@ class Exploration:
     """Answers in a row without a viewpoint."""
     newest: ExploreAnswer = field(default_factory=ExploreAnswer)
     travelled: float = 0.0
-    """Metres, by poses apart by ``COUNTED``."""
+    """Metres, by poses 3 cm apart."""
     counted: Pose2 | None = None
     """The last of these."""
     before: Pose2 | None = None
     trail: tuple[Pose2, ...] = ()
     """Where it came from, the newest last."""
     near_home: tuple[Pose2, ...] = ()
-    """Where it passed first within ``NEAR_START`` of its start, ``SPACING`` apart."""
+    """Where it passed first within ``NEAR_START`` of its start, 0.25 m apart."""
     stuck: int = 0
     """Goals in a row that failed where the robot stands."""
     stuck_at: Pose2 | None = None
@@ -307,7 +300,8 @@ def _moved(run: Exploration, seen: Observed) -> Exploration:
     counted, distance = run.counted, 0.0
     if counted is None or seen.pose is None:
         counted = seen.pose
-    elif (moved := math.dist(counted[:2], seen.pose[:2])) >= COUNTED:
+    # 0.03: motion that counts, m: the pose of a standing robot moves by some millimetres with every scan
+    elif (moved := math.dist(counted[:2], seen.pose[:2])) >= 0.03:
         counted, distance = seen.pose, moved
     charge = seen.charge if run.charge is None else run.charge
     trail = run.trail
@@ -325,7 +319,7 @@ def _near_home(run: Exploration, pose: Pose2 | None) -> tuple[Pose2, ...]:
     if pose is None or len(places) == 3 or math.dist(pose[:2], run.home[:2]) > NEAR_START:  # how many of them
         return places
     apart = min(math.dist(pose[:2], place[:2]) for place in (run.home, *places))
-    return (*places, pose) if apart >= SPACING else places
+    return (*places, pose) if apart >= 0.25 else places  # distance between the places beside the start that are kept, m
 
 
 def _merged(before: ExploreAnswer, answer: ExploreAnswer) -> ExploreAnswer:
@@ -486,7 +480,10 @@ def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         return run, ()
     if run.goes_back and run.came_from is not None:
         return replace(run, target=Viewpoint(run.came_from, run.came_from[:2])), (Go(run.came_from),)
-    x, y, yaw = placed(np.array((AROUND[run.looks % len(AROUND)],)), seen.believed)[0].tolist()
+    # poses in base to which a lost robot drives in turn, and back, to see more; not backward, where no scan has seen
+    # the ground
+    around = ((0.6, 0.0, 0.0), (0.6, 0.25, 0.8), (0.6, -0.25, -0.8))
+    x, y, yaw = placed(np.array((around[run.looks % len(around)],)), seen.believed)[0].tolist()
     pose = x, y, math.remainder(yaw, math.tau)
     say = () if run.looks else (Notice(Reason.RECOVERING, Severity.INFO, "its place is not known: looks around"),)
     run = replace(run, target=Viewpoint(pose, pose[:2]), looks=run.looks + 1, came_from=seen.believed)

@@ -20,8 +20,6 @@ Cells = NDArray[np.int8]
 UNKNOWN: Final = -1
 BLOCK: Final = 64
 """The area grows by whole blocks of this many cells."""
-SPARE: Final = 2
-"""Cells by which the area grows beyond what is needed."""
 
 
 class FrontierMap:
@@ -114,10 +112,11 @@ class FrontierMap:
         size = np.array(self.cells.shape[::-1])
         low, high = low - 1, high + 1
         end = self.corner + size
+        spare = 2  # cells by which the area grows beyond what is needed
         if size.all():
             if (low >= self.corner).all() and (high <= end).all():
                 return
-            wider = np.where(low < self.corner, SPARE, 0), np.where(high > end, SPARE, 0)
+            wider = np.where(low < self.corner, spare, 0), np.where(high > end, spare, 0)
             low, high = np.minimum(low, self.corner), np.maximum(high, end)
         else:
             wider = np.zeros(2, np.int64), np.zeros(2, np.int64)

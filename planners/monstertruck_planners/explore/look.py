@@ -21,8 +21,6 @@ from monstertruck_planners.explore.kernels import shares_seen
 
 FACE: Final = 0.2
 """Faces of walls are counted by squares of this side, m, and eight directions."""
-WORTH: Final = 1.5
-"""Metres that a look costs besides its path."""
 NEAR_BANNED: Final = 0.3
 """A face this near to a banned place is skipped, m."""
 
@@ -68,6 +66,7 @@ class WallLooks:
         if current is not None and np.hypot(*(faces.points[left] - current.frontier).T).min() < FACE / 2:
             return current
         best, least = None, math.inf
+        worth = 1.5  # metres that a look costs besides its path
         # 60: faces for which a place is looked for, spread over all
         for i in left[np.unique(np.linspace(0, len(left) - 1, 60).astype(np.intp))]:
             pose = self._place(view, faces.points[i], faces.normals[i])
@@ -75,9 +74,9 @@ class WallLooks:
             if pose is None or length is None:
                 continue
             gain = int(np.count_nonzero(self._sees(view.known, faces, pose) & open_))
-            if gain and (length + WORTH) / gain < least:
+            if gain and (length + worth) / gain < least:
                 x, y = faces.points[i].tolist()
-                best, least = Viewpoint(pose, (x, y), length, gain * FACE), (length + WORTH) / gain
+                best, least = Viewpoint(pose, (x, y), length, gain * FACE), (length + worth) / gain
         return best
 
     def _place(self, view: ExplorationView, point: Array, normal: Array) -> Pose2 | None:

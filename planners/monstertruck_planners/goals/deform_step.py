@@ -7,7 +7,7 @@ it until the truck is back on it.
 import logging
 import math
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,10 +166,6 @@ def _moved(cells: NDArray[np.int16], rows: int, columns: int) -> NDArray[np.int1
     return fresh
 
 
-SHORTEST: Final = 0.02
-"""A deformed path shorter than this is none, m."""
-
-
 class DeformStep:
     """Answers scan by scan; equal scans give equal answers."""
 
@@ -281,9 +277,10 @@ class DeformStep:
     def _answer(self, result: LocalPlan) -> DeformAnswer:
         assert self._route is not None
         number, path = self._route.number, result.path
-        if path is not None and path.length < SHORTEST and self._place == len(self._guide.poses) - 1:
+        shortest = 0.02  # a deformed path shorter than this is none, m
+        if path is not None and path.length < shortest and self._place == len(self._guide.poses) - 1:
             return DeformAnswer(number, "kept", result.reason, place=self._place, complete=True)
-        if path is None or path.length < SHORTEST:
+        if path is None or path.length < shortest:
             why = Reason.PATH_BLOCKED if result.reason is Reason.OK else result.reason
             return DeformAnswer(number, "blocked", why, result.text, self._place)
         if result.statistics.get("kept"):

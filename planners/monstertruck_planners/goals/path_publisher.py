@@ -26,10 +26,6 @@ from monstertruck_schemas.state import GateState, Grid, Ground, Odometry
 SOURCE: Final = ServiceName.GOALS.value
 AT_REST: Final = 0.01
 """Speed of a truck at rest, m/s."""
-STANDSTILL_PATH: Final = 0.01
-"""Length of a path that leads nowhere, m."""
-CHECK_STEP: Final = 0.05
-"""Metres between two poses of a path check."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,8 +131,9 @@ class PathPublisher:
             return
         speed, report = abs(odometry.twist.vx), followed.report(self._in.tracker.latest)
         driven = followed.before + followed.along(report)
+        standstill_path = 0.01  # length of a path that leads nowhere, m
         if speed > AT_REST and report is not None:
-            rest = speed * speed / (2 * self._deceleration) + STANDSTILL_PATH
+            rest = speed * speed / (2 * self._deceleration) + standstill_path
             path = followed.message
             at_rest = stops(path.directions[1:], path.steering[1:])
             kept = kept_poses(followed.travelled, report.along, rest, np.flatnonzero(at_rest) + 1)
@@ -144,7 +141,7 @@ class PathPublisher:
             steering, clearance = path.steering[kept], path.clearance[kept]
             self._publish(poses, directions, steering, name, driven, clearance, halts=halts)
         else:
-            ahead = np.array([[0.0, 0.0, 0.0], [STANDSTILL_PATH, 0.0, 0.0]])
+            ahead = np.array([[0.0, 0.0, 0.0], [standstill_path, 0.0, 0.0]])
             self._publish(placed(ahead, pose_of(odometry)), np.ones(2), (), name, driven, halts=halts)
 
     def halt(self, name: str) -> None:
@@ -216,9 +213,10 @@ def poses_ahead(poses: Array, travelled: Array, along: float, reach: float, pose
     """
     first, last = np.searchsorted(travelled, (along, along + reach), side="right")
     chosen = poses[first : last + 1]
+    check_step = 0.05  # metres between two poses of a path check
     if len(chosen) > 2:
-        length = max(travelled[min(last, len(poses) - 1)] - along, CHECK_STEP)
-        spacing = max(round(CHECK_STEP * (len(chosen) - 1) / length), 1)
+        length = max(travelled[min(last, len(poses) - 1)] - along, check_step)
+        spacing = max(round(check_step * (len(chosen) - 1) / length), 1)
         chosen = np.vstack((chosen[:-1:spacing], chosen[-1]))
     return np.vstack((np.array(pose), chosen))
 

@@ -21,8 +21,6 @@ SOON: Final = 5.0
 """Time before a route begins, s."""
 PACE: Final = 0.1
 """Mean speed along a route by which it is estimated when it comes to some ground, m/s."""
-DIRECTIONS: Final = 12
-"""Directions in which they lie, and into which the robot faces there."""
 SHOWN: Final = 0.6
 """Share of the ground that has to be visible from such a place."""
 BESIDE: Final = 0.03
@@ -93,7 +91,8 @@ class Unseen:
             obstacles: of the map.
             margin: kept to them, m.
         """
-        around = np.arange(DIRECTIONS) * (math.tau / DIRECTIONS)
+        directions = 12  # directions in which they lie, and into which the robot faces there
+        around = np.arange(directions) * (math.tau / directions)
         x, y = places.mean(axis=0).tolist()
         # (0.7, 1.1, 1.5): distances from unseen ground at which places to look at it are tried, m
         poses = np.array(

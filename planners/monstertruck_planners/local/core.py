@@ -33,18 +33,8 @@ from monstertruck_planners.route.search import CHECK_MARGIN
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 
-ESCAPE_STEP = 0.01
-"""Distance between two checks of an escape motion, m."""
-
-
 PATH_CUSP_REACHED = 0.02
 """The same for a cusp of its path, m."""
-
-STANDOFF = 0.5
-"""A truck that finds no way around an obstacle approaches it along the route up to this distance, m."""
-
-GOAL_HEADINGS = (0.0, 1.0, -1.0)
-"""Headings tried at the goal of a local search, relative to that of the route, rad."""
 
 
 @njit(cache=True)
@@ -66,12 +56,13 @@ def escape_motion(
         A motion segment, shape (1, 3), or none, shape (0, 3).
     """
     least = clearance(field, cover, pose[0], pose[1], pose[2])
-    best, shortest = -1, 0.3 + ESCAPE_STEP  # longest escape motion, m
+    escape_step = 0.01  # distance between two checks of an escape motion, m
+    best, shortest = -1, 0.3 + escape_step  # longest escape motion, m
     if least >= -0.05:  # a truck that overlaps an obstacle by more has no escape motion, m
         for i in range(len(primitives)):
             sign = 1.0 if primitives[i, 0] > 0.0 else -1.0
-            known, travelled = least, ESCAPE_STEP
-            while travelled < shortest - 0.5 * ESCAPE_STEP:
+            known, travelled = least, escape_step
+            while travelled < shortest - 0.5 * escape_step:
                 x, y, yaw = advance(pose[0], pose[1], pose[2], sign * travelled, primitives[i, 1], primitives[i, 2])
                 present = clearance(field, cover, x, y, yaw)
                 if present < known - 2e-3:  # clearances that differ by less are equal, m
@@ -80,7 +71,7 @@ def escape_motion(
                 if safe_distance(field, footprint, margin, x, y, yaw) >= 0.0:
                     best, shortest = i, travelled
                     break
-                travelled += ESCAPE_STEP
+                travelled += escape_step
     result = np.empty((1 if best >= 0 else 0, 3))
     if best >= 0:
         result[0, 0] = shortest if primitives[best, 0] > 0.0 else -shortest
@@ -221,9 +212,11 @@ class LocalPlannerCore:
         inside = np.flatnonzero(self._in_window(band.poses, obstacles, 0.0) & free)
         last = int(inside[-1]) if len(inside) else len(band.poses) - 1
         goal = band.poses[last].copy()
+        # headings tried at the goal of a local search, relative to that of the route, rad
+        goal_headings = (0.0, 1.0, -1.0)
         if last < len(band.poses) - 1 or not local.final:
             # 5: searches without a result before another heading is tried
-            goal[2] += GOAL_HEADINGS[failed // 5 % len(GOAL_HEADINGS)]
+            goal[2] += goal_headings[failed // 5 % len(goal_headings)]
         path, reason = self._search_to(obstacles, pose, goal)
         if path is None:
             return None, None, reason
@@ -278,12 +271,13 @@ class LocalPlannerCore:
         return LocalPlan(reason, after, text=text)
 
     def _approach(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> MotionPath | None:
-        """Motion along the band to STANDOFF before what blocks it; None if the truck is there."""
+        """Motion along the band to 0.5 m before what blocks it; None if the truck is there."""
         free = obstacles.free(self.vehicle.footprint, band.poses, self.config.margin)
         broken = len(free) if free.all() else int(np.argmin(free))
         travelled = band.travelled
         first_run = next(end for _, end in direction_runs(band.directions))
-        near = np.flatnonzero(travelled[:first_run] <= travelled[max(broken - 1, 0)] - STANDOFF)
+        # 0.5: a truck that finds no way around an obstacle approaches it along the route up to this distance, m
+        near = np.flatnonzero(travelled[:first_run] <= travelled[max(broken - 1, 0)] - 0.5)
         if not len(near) or travelled[near[-1]] < self.config.shortest:
             return None
         path = self.vehicle.reeds_shepp().path(robot_pose, band.poses[near[-1]])

@@ -295,9 +295,6 @@ def _relax(
     return count, True
 
 
-DISC_DEPTH = 0.035
-"""Depth of the outline's disc centres inside it, m; the discs protrude by 0.4 of it."""
-
 SPACING = 0.2
 """Largest distance of bubbles, m."""
 
@@ -319,14 +316,15 @@ def cover_footprint(footprint: Footprint | DiscFootprint) -> CoveringDiscs:
     if isinstance(footprint, DiscFootprint):
         x = np.array(footprint.centres)
         return _discs(x, np.zeros(len(x)), np.full(len(x), footprint.radius))
-    length, width = footprint.half_length - DISC_DEPTH, footprint.half_width - DISC_DEPTH
-    along = np.linspace(-length, length, math.ceil(length / DISC_DEPTH) + 1)
-    across = np.linspace(-width, width, math.ceil(width / DISC_DEPTH) + 1)[1:-1]
+    disc_depth = 0.035  # depth of the outline's disc centres inside it, m; the discs protrude by 0.4 of it
+    length, width = footprint.half_length - disc_depth, footprint.half_width - disc_depth
+    along = np.linspace(-length, length, math.ceil(length / disc_depth) + 1)
+    across = np.linspace(-width, width, math.ceil(width / disc_depth) + 1)[1:-1]
     inner = np.linspace(-max(length - width, 0.0), max(length - width, 0.0), 3)
     x = np.concatenate((along, along, np.full(len(across), length), np.full(len(across), -length), inner))
     sides = (np.full(len(along), width), np.full(len(along), -width))
     y = np.concatenate((*sides, across, across, np.zeros(len(inner))))
-    radius = np.full(len(x), DISC_DEPTH * math.sqrt(2.0))
+    radius = np.full(len(x), disc_depth * math.sqrt(2.0))
     radius[-len(inner) :] = width
     return _discs(x + footprint.offset, y, radius)
 

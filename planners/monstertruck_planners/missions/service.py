@@ -80,8 +80,6 @@ PASSING: Final = frozenset(
 )
 """Refusals that pass: it is requested again. Busy is the robot with the step before: after a goal it brakes along a
 path, after an exploration the map is saved."""
-PATIENCE: Final = 180.0
-"""Seconds for which it is requested again; a planner compiles for a minute or two after an installation."""
 SILENT: Final = 10.0
 """Seconds without a report of what does a step, which comes twice a second, after which it has failed."""
 
@@ -512,9 +510,10 @@ class MissionService:
         """Number of what ``take`` requests; it is requested again while what refuses it passes.
 
         Raises:
-            TruckError: it was refused for another reason or for longer than ``PATIENCE``, or another source drives.
+            TruckError: it was refused for another reason or for longer than 3 minutes, or another source drives.
         """
-        until, refused = self._clock.now() + PATIENCE * SECOND, False
+        # 180.0: seconds for which it is requested again; a planner compiles for a minute or two after an installation
+        until, refused = self._clock.now() + 180.0 * SECOND, False
         while True:
             if (other := self.tasks.other()) is not None:
                 raise RequestRefusedError(Reason.CANCELLED, other)

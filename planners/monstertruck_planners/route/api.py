@@ -221,10 +221,6 @@ class Vehicle:
         return ReedsShepp(self.radius, self.crab_angle, *weights, self.steering, self.reference)
 
 
-WARM_UP_CLEARANCE = 0.02
-"""Distance from the start of the last route of ``warm_up`` to the edge of the map, m: less than the margin."""
-
-
 class Budget:
     """Limit of a planner: seconds, or an amount of work.
 
@@ -381,7 +377,9 @@ def warm_up(planner: RoutePlanner) -> None:
 
     The second one is the first with a wall whose gap is too narrow. The last route leaves the edge of the map.
     """
-    margin = max(planner.config.margin, 2 * WARM_UP_CLEARANCE)
+    # distance from the start of the last route of ``warm_up`` to the edge of the map, m: less than the margin
+    warm_up_clearance = 0.02
+    margin = max(planner.config.margin, 2 * warm_up_clearance)
     config = planner.config.model_copy(update={"effort": 6000, "margin": margin})  # see ``GoalConfig.effort``
     planner = make_planner(planner.vehicle, config)
     ends = (2.0, 4.0, 0.0), (6.0, 4.0, 1.0)
@@ -394,7 +392,7 @@ def warm_up(planner: RoutePlanner) -> None:
     cells[:60, 40] = cells[63:, 40] = 100
     planner.plan(RouteMap.from_cells(cells, 0.1, previous=route_map), *ends)
     footprint = planner.vehicle.footprint.data()
-    beside = (footprint.half_width or footprint.radius) + WARM_UP_CLEARANCE
+    beside = (footprint.half_width or footprint.radius) + warm_up_clearance
     planner.plan(route_map, (2.0, beside, 0.0), ends[1])
 
 

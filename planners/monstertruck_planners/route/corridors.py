@@ -17,18 +17,16 @@ from numpy.typing import NDArray
 from monstertruck_planners.collision_kernels import FieldData, FootprintData, safe_distance
 from monstertruck_planners.route.heuristic import NEIGHBOURS, UNREACHED
 
-HEADINGS = 72
-"""Checked in half a turn."""
-
 
 @njit(cache=True)
 def footprint_fits(field: FieldData, footprint: FootprintData, margin: float, x: float, y: float) -> bool:
     """Whether the footprint is free at a position in any heading."""
     symmetric = abs(footprint.centre) < 1e-9 and abs(footprint.discs.sum()) < 1e-9
-    count = (1 if symmetric else 2) * HEADINGS
+    headings = 72  # checked in half a turn
+    count = (1 if symmetric else 2) * headings
     for k in range(count):
         # 29: step between two headings tried in turn: neighbouring headings fit or do not fit alike
-        if safe_distance(field, footprint, margin, x, y, (k * 29 % count) * pi / HEADINGS) >= 0.0:
+        if safe_distance(field, footprint, margin, x, y, (k * 29 % count) * pi / headings) >= 0.0:
             return True
     return False
 

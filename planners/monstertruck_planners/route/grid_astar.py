@@ -15,8 +15,6 @@ from monstertruck_planners.route.api import Budget, Clock, RouteMap, RouteResult
 from monstertruck_planners.route.config import GridAstarConfig
 from monstertruck_schemas.reasons import Reason
 
-INSCRIBED_COST = 252.0
-
 
 class GridAstarPlanner:
     """Ways over the grid for one vehicle.
@@ -63,7 +61,7 @@ class GridAstarPlanner:
     def _cell_costs(self, distance: NDArray[np.float32]) -> NDArray[np.int16]:
         config = self.config
         beyond = distance - np.float32(self.vehicle.footprint.inscribed_radius)
-        value = np.where(beyond < config.inflation, INSCRIBED_COST * np.exp(-config.decay * np.maximum(beyond, 0)), 0.0)
+        value = np.where(beyond < config.inflation, 252.0 * np.exp(-config.decay * np.maximum(beyond, 0)), 0.0)
         cell_cost = np.minimum(config.neutral + config.cost_factor * value, config.lethal - 1)
         return np.where((value >= config.lethal - 1) | (beyond < 0), 0, cell_cost).astype(np.int16)
 

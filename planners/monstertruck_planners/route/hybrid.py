@@ -79,16 +79,9 @@ MAX_NODES = 400_000
 MAX_TABLE_CELLS = 1 << 26
 """Cells of one search: a table of 256 MB, of which only what is visited takes memory."""
 
-BATCH = 1000
-"""Smoothing trials between two checks of the budget."""
-
 
 FIRST_NODES = 512
 """Nodes of the coarse search before gaps are measured and the fine search alternates with it."""
-
-
-GAP_ERROR = 0.01
-"""Error of the positions and headings checked against the best ones, m."""
 
 
 NO_SEGMENTS = np.empty((0, 3))
@@ -658,8 +651,9 @@ class _PlanningRun:
     @property
     def _gap_margin(self) -> float:
         """Needed on both sides of a gap, m; without a margin, those just wide enough are left to the search."""
+        gap_error = 0.01  # error of the positions and headings checked against the best ones, m
         # 0.005: width needed in a gap beyond the margin on both sides, m: with less no search finds a path through it
-        return self.config.margin + (0.005 if self.config.margin >= GAP_ERROR else -GAP_ERROR)
+        return self.config.margin + (0.005 if self.config.margin >= gap_error else -gap_error)
 
     def _close_narrow_gaps(self, to_go: CostToGo) -> bool:
         """Close the narrow gaps on the shortest path, then on the next one around them, and so on; False: none."""
@@ -784,11 +778,12 @@ class _PlanningRun:
     def _shortcut(self, path: EditablePath, gain: float = 1e-3, shift: float = 0.25) -> None:
         """Shortcut trials until a batch gains less than a share of the cost."""
         last, reach = np.inf, 40.0 * self.vehicle.radius
+        batch = 1000  # smoothing trials between two checks of the budget
         while self.budget.remaining() > 0.0 and (cost := self._cost(current_segments(path))) < (1.0 - gain) * last:
-            last, random = cost, self.random.random((BATCH, 6))
+            last, random = cost, self.random.random((batch, 6))
             kept = shortcut(self.field, self.footprint, self.layer, self.model, path, reach, shift, random)
-            self.budget.work += BATCH
-            self.statistics["trials"] += BATCH
+            self.budget.work += batch
+            self.statistics["trials"] += batch
             self.statistics["kept"] += kept
 
     def _cost(self, segments: Array) -> float:

@@ -68,11 +68,6 @@ LONG = 8
 """Cells of the long straight primitive, about."""
 MAX_PRIMITIVE_SEGMENTS = 3
 
-MAX_STATES = 1 << 19
-
-MAX_CELLS = 1 << 15
-"""On either side of the start."""
-
 
 class Primitives(NamedTuple):
     """The motion primitives by the heading they start at."""
@@ -223,7 +218,8 @@ def _pose_of(lattice: Lattice, place: IntArray, out: Array) -> None:
 def _bucket_of(states: LatticeStates, column: int, row: int, heading: int) -> int:
     """Index in the hash table of a place: its own, or the empty one it would get."""
     mask = len(states.buckets) - 1
-    key = ((column + MAX_CELLS) << 20) ^ ((row + MAX_CELLS) << 4) ^ heading
+    max_cells = 1 << 15  # on either side of the start
+    key = ((column + max_cells) << 20) ^ ((row + max_cells) << 4) ^ heading
     i = (key * 0x9E3779B97F4A7C1) >> 12 & mask
     while states.buckets[i] > 0:
         k = states.buckets[i] - 1
@@ -397,7 +393,7 @@ class LatticePlanner:
         bound: float, statistics: dict[str, float],
     ) -> tuple[Array | None, float, Reason]:  # fmt: skip
         """Segments and cost of a solution cheaper than ``bound``, or the reason why there is none."""
-        lattice, n = Lattice(self.primitives, self.config.cell, ends.start), MAX_STATES
+        lattice, n = Lattice(self.primitives, self.config.cell, ends.start), 1 << 19
         states = LatticeStates(
             np.empty((n, 3), np.int64), np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64),
             np.empty(n, np.bool_), np.empty(4 * n), np.empty(4 * n, np.int64), np.zeros(2 * n, np.int64),

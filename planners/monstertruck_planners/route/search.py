@@ -31,9 +31,6 @@ CHECK_STEP = 0.01
 CHECK_MARGIN = 1e-3
 """Added to the margin, as the footprint may come nearer between two checks, m."""
 
-SPACING = 0.1
-"""Distance between two samples of the cost layer, m."""
-
 
 @njit(cache=True)
 def push(keys: Array, items: IntArray, size: int, key: float, item: int) -> int:
@@ -106,11 +103,11 @@ def extra_cost(distance: NDArray[np.float32], layer: CostLayer, row: int, column
 def layer_cost(
     field: FieldData, layer: CostLayer, x: float, y: float, yaw: float, length: float, curvature: float, sideslip: float
 ) -> float:
-    """Extra cost of a motion segment: the layer summed at the middles of pieces of about SPACING."""
+    """Extra cost of a motion segment: the layer summed at the middles of pieces of about 0.1 m."""
     if layer.terrain.size == 0 and layer.clearance_cost == 0.0:
         return 0.0
     rows, columns = field.distance.shape
-    pieces = max(ceil(abs(length) / SPACING), 1)
+    pieces = max(ceil(abs(length) / 0.1), 1)  # distance between two samples of the cost layer, m
     total = 0.0
     for i in range(pieces):
         px, py, _ = advance(x, y, yaw, length * (i + 0.5) / pieces, curvature, sideslip)

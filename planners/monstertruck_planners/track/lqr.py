@@ -17,8 +17,6 @@ from monstertruck_planners.track.error_model import BASES, discretise, riccati
 from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
 from monstertruck_schemas.plan import Steering
 
-SPEED_STEP: Final = 0.05
-"""Speeds this near to each other (relatively) share their gains."""
 BETWEEN: Final = 4
 """Samples per period whose mean is the reference."""
 
@@ -92,9 +90,10 @@ class GainTable:
 
     def at(self, steering: Steering, speed: float, lag: float) -> Gains:
         """Gains for a speed, m/s, not 0, and a lag, s."""
-        key = (steering, speed > 0, round(math.log(abs(speed)) / SPEED_STEP), lag)
+        speed_step = 0.05  # speeds this near to each other (relatively) share their gains
+        key = (steering, speed > 0, round(math.log(abs(speed)) / speed_step), lag)
         if key not in self._known:
-            size = math.exp(key[2] * SPEED_STEP)
+            size = math.exp(key[2] * speed_step)
             self._known[key] = self._design(steering, math.copysign(size, speed), lag)
         return self._known[key]
 

@@ -26,12 +26,8 @@ KEPT: Final = 100
 """Cells of history that are needed before the newest: the longest dead time and the longest pause between poses."""
 EARLY: Final = 1e-6
 """Cells by which rounding may make an instant early."""
-EXPECTED: Final = (0.05, 0.08)
-"""Mean and standard deviation of dead time and lag together of a truck that was not measured, s."""
 NOISE: Final = 0.003
 """Standard deviation of a measured turn before any was compared, rad."""
-BELIEVED: Final = 5.0
-"""Turns that this is worth."""
 
 
 class Response(NamedTuple):
@@ -74,7 +70,9 @@ class ResponseEstimator:
         self._rate = rate
         dead_times, by_lag = (a.ravel() for a in np.broadcast_arrays(CELL * np.arange(DEAD_TIMES), LAGS[:, None]))
         totals = dead_times + by_lag
-        self._prior = 0.5 * ((totals - EXPECTED[0]) / EXPECTED[1]) ** 2
+        # mean and standard deviation of dead time and lag together of a truck that was not measured, s
+        expected = (0.05, 0.08)
+        self._prior = 0.5 * ((totals - expected[0]) / expected[1]) ** 2
         self._keep = [math.exp(-CELL / lag) if lag else 0.0 for lag in LAGS.tolist()]
         self._powers = np.stack((np.ones(len(totals)), dead_times, by_lag, dead_times**2, totals**2))
         """Powers of the candidates; their weighted sums are the moments of the estimate."""
@@ -190,7 +188,8 @@ class ResponseEstimator:
         xx, xy = xx + by_gain, xy + by_gain
         explained = (xy * (dd * xy - 2 * self._yd * xd) + self._yd**2 * xx) / (xx * dd - xd * xd)
         most = float(explained.max())
-        self._variance = (self._yy + by_gain - most + BELIEVED * NOISE**2) / (self._count + BELIEVED)
+        believed = 5.0  # turns that this is worth
+        self._variance = (self._yy + by_gain - most + believed * NOISE**2) / (self._count + believed)
         # 3.0: turns that say as much as one independent turn: what the model does not know lasts longer than a step
         cost = (most - explained) / (2 * self._variance * 3.0) + self._prior
         moments = (self._powers @ np.exp(float(cost.min()) - cost)).tolist()

@@ -20,8 +20,6 @@ from monstertruck_schemas.reasons import Reason
 LEAST_STEP: Final = 1e-6
 """Shorter steps between two poses are left out, m."""
 
-MAX_STEP: Final = 100.0
-"""Metres between two poses."""
 MAX_NAME: Final = 128
 MANY: Final = 40
 """Steps from which on arrays find the nearest one sooner than floats do."""
@@ -215,8 +213,9 @@ def check_path(path: Path) -> None:
         _refuse(path, f"poses: expected finite ones, at most {MAX_COORDINATE:g} m and rad")
     step = np.diff(poses[:, :2], axis=0, append=poses[:1, :2] if path.closed else poses[-1:, :2])
     length = np.hypot(step[:, 0], step[:, 1])
-    if not LEAST_STEP < length.max() <= MAX_STEP:
-        _refuse(path, f"steps of up to {length.max():g} m: expected different poses, at most {MAX_STEP:g} m apart")
+    max_step = 100.0  # metres between two poses
+    if not LEAST_STEP < length.max() <= max_step:
+        _refuse(path, f"steps of up to {length.max():g} m: expected different poses, at most {max_step:g} m apart")
     if len(path.name) > MAX_NAME:
         _refuse(path, f"name: expected at most {MAX_NAME} characters")
 

@@ -38,8 +38,6 @@ UNSEEN_AFTER: Final = SECOND
 """Time before unseen ground after which a path is left, ns: no waiting changes what was seen there."""
 STUCK_AFTER: Final = 1.0
 """Distance commanded without progress after which the truck is stuck, m."""
-PROGRESS: Final = 0.2
-"""Motion, in space or along the path, that counts as progress, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +109,8 @@ class _ProgressChecker:
         """Whether it is stuck, from then on always; ``gate`` is None while the tracker does not drive."""
         if self.asked >= STUCK_AFTER:
             return True
-        if along - self.along > PROGRESS or math.dist(place, self.place) > PROGRESS:
+        progress = 0.2  # motion, in space or along the path, that counts as progress, m
+        if along - self.along > progress or math.dist(place, self.place) > progress:
             self.place, self.along, self.asked = place, along, 0.0
         elif gate is not None and gate.twist is not None:
             self.asked += math.hypot(gate.twist.vx, gate.twist.vy) * (now - self.looked) / SECOND

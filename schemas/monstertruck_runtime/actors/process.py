@@ -21,7 +21,6 @@ from typing import Any
 
 from monstertruck_runtime.errors import WorkerError
 
-NICE = 5
 _TIMEVAL = struct.Struct("@ll")
 """Seconds and microseconds, see socket(7)."""
 _SINGLE_THREADED = {
@@ -128,7 +127,7 @@ def main() -> int:
     """Serve one parent; returns the exit code."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    os.nice(NICE)
+    os.nice(5)
     connection = Connection(int(sys.argv[1]))
     steps: queue.SimpleQueue[Any] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(connection, steps), daemon=True).start()

@@ -33,8 +33,6 @@ POLL: Final = 2.0
 """Seconds a caller waits for work."""
 PART: Final = 8192
 """Characters of outputs in one call."""
-MOST: Final = 1_000_000
-"""Characters of outputs at all."""
 RETRY: Final = 1.0
 """Seconds between two tries to reach a robot."""
 _DTYPES: Final = ("float64", "int8", "uint8", "int64")
@@ -245,9 +243,10 @@ class RemoteActor:
     def _take(self, payload: dict[str, Any]) -> bool:
         """Whether these outputs are complete."""
         self._parts.append(str(payload["part"]))
-        if sum(map(len, self._parts)) > MOST:
+        most = 1_000_000  # characters of outputs at all
+        if sum(map(len, self._parts)) > most:
             self._parts = []
-            raise InputError(f"outputs: more than {MOST} characters")
+            raise InputError(f"outputs: more than {most} characters")
         if not payload.get("last"):
             return False
         text, self._parts = "".join(self._parts), []

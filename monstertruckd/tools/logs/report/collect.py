@@ -26,8 +26,6 @@ from monstertruckd.tools.logs.report.scan_map import ScanMap
 from monstertruckd.tools.logs.report.signals import FIGURES, Curve, DrivenPath, Trace
 from monstertruckd.tools.logs.report.states import StateTimeline
 
-_SEQUENCES: Final = 1 << 32
-
 
 @dataclass(slots=True)
 class Traffic:
@@ -75,9 +73,10 @@ class Traffic:
         self.last = max(self.last, now)
 
     def _count_lost(self, sequence: int) -> None:
+        sequences = 1 << 32
         if self._sequence is not None:
-            skipped = (sequence - self._sequence - 1) % _SEQUENCES
-            self.lost += skipped if skipped < _SEQUENCES // 2 else 0  # else the sequence restarted
+            skipped = (sequence - self._sequence - 1) % sequences
+            self.lost += skipped if skipped < sequences // 2 else 0  # else the sequence restarted
         self._sequence = sequence
 
     def _watch(self, now: int, nominal: float) -> None:

@@ -23,8 +23,6 @@ WIDTH, HEIGHT = 1000.0, 100.0
 """View box of every plot."""
 
 _TIME_STEPS: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400)
-_TIME_TICKS: Final = 9
-_VALUE_TICKS: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +52,7 @@ def value_axis(values: Iterable[float], span: float, *, zero: bool) -> Axis:
         middle = (low + high) / 2
         below = span / 2 if not zero or low < 0 < high else (span if high <= 0 and low < 0 else 0.0)
         low, high = (middle - below, middle - below + span) if not zero or low < 0 < high else (-below, span - below)
-    step = round_step((high - low) / _VALUE_TICKS)
+    step = round_step((high - low) / 4)  # ticks of a value's axis
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
     return Axis(first * step, last * step, tuple(n * step for n in range(first, last + 1)))
 
@@ -67,7 +65,7 @@ def round_step(about: float) -> float:
 
 def time_ticks(seconds: float) -> list[float]:
     """Round instants of a run of ``seconds``."""
-    step = next((s for s in _TIME_STEPS if seconds / s <= _TIME_TICKS), 86400.0)
+    step = next((s for s in _TIME_STEPS if seconds / s <= 9), 86400.0)  # ticks of the time axis at most
     return [n * step for n in range(math.floor(seconds / step) + 1)]
 
 
@@ -172,8 +170,6 @@ def time_labels(seconds: float) -> str:
 
 
 SEVERITY_TONE = {Severity.INFO: Tone.CALM, Severity.WARNING: Tone.WARNING, Severity.ERROR: Tone.BAD}
-_MARGIN = 0.35
-"""Metres shown round everything on the map."""
 
 Lines = list[tuple[str, Trace]]
 
@@ -306,7 +302,8 @@ def _around(points: list[tuple[float, float]], area: Area | None) -> Area:
     xs, ys = [x for x, _ in points], [y for _, y in points]
     if area is not None:
         xs, ys = [*xs, area.x0, area.x1], [*ys, area.y0, area.y1]
-    return Area(min(xs) - _MARGIN, min(ys) - _MARGIN, max(xs) + _MARGIN, max(ys) + _MARGIN)
+    margin = 0.35  # metres shown round everything on the map
+    return Area(min(xs) - margin, min(ys) - margin, max(xs) + margin, max(ys) + margin)
 
 
 def _grid(area: Area, step: float) -> str:

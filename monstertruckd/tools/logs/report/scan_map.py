@@ -23,9 +23,6 @@ from monstertruckd.recorder.occupancy import Area, OccupancyRaster
 _MAX_TILT: Final = math.radians(3)
 _STEP, _TURN, _REST = 0.08, 0.1, 20 * SECOND
 """A scan is taken after this way (m), this turn (rad) or this time (ns) since the one before."""
-_POSES: Final = 64
-_GREATEST_SIDE: Final = 1400
-"""Pixels of the picture's longer side."""
 _WALL, _FREE = 28.0, 255.0
 
 
@@ -42,7 +39,7 @@ class PlacedScans:
 
     def __init__(self) -> None:
         self._mounts = FrameTree()
-        self._poses: deque[tuple[int, float, float, float]] = deque(maxlen=_POSES)
+        self._poses: deque[tuple[int, float, float, float]] = deque(maxlen=64)
 
     @property
     def newest(self) -> tuple[int, float, float, float] | None:
@@ -141,7 +138,8 @@ def _picture(occupancy: Array, area: Area) -> Picture:
     wall = np.clip(np.nan_to_num(occupancy[part]) * 2.0, 0.0, 1.0)
     shade = np.stack([_FREE + (_WALL - _FREE) * wall, np.where(known[part], 255.0, 0.0)], axis=-1)
     image = Image.fromarray(np.flipud(shade).astype(np.uint8), "LA")
-    image.thumbnail((_GREATEST_SIDE, _GREATEST_SIDE))
+    greatest_side = 1400  # pixels of the picture's longer side
+    image.thumbnail((greatest_side, greatest_side))
     data = io.BytesIO()
     image.save(data, "PNG", optimize=True)
     x0, y0 = area.x0 + columns[0] * cell, area.y0 + rows[0] * cell

@@ -254,7 +254,6 @@ FIGURES: Final = (
 
 _LEAST_STEP: Final = 0.02
 """Least distance between two positions, m; nearer ones are noise at standstill."""
-_MOST_POINTS: Final = 1500
 
 
 @dataclass(slots=True)
@@ -280,6 +279,6 @@ class DrivenPath:
         self._last = x, y
         if math.dist(self.points[-1][1:], (x, y)) >= self._spacing:
             self.points.append((time, x, y))
-            if len(self.points) > _MOST_POINTS:
+            if len(self.points) > 1500:
                 self.points = self.points[::2]
                 self._spacing *= 2

@@ -14,19 +14,12 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
 
-NOISE_SHARE: Final = 0.01
 TIGHT: Final = 3.0
 """Residual, in standard deviations, up to which a line explains an echo."""
 GUESSES: Final = 24, 5
 """Start directions of a line fit without an earlier estimate, and the best of these that are fitted to the end."""
-DISTINCT: Final = 0.05
-"""Least difference between these, rad or m."""
 STEPS: Final = 4, 4, 6
 """Gauss-Newton steps: from an estimate, from all guesses, and further from the best ones."""
-SAMPLED: Final = 40
-"""Echoes to which all guesses are fitted, taken evenly out of more."""
-LONGEST: Final = 0.3
-"""Greatest step of a fit, rad and m."""
 FREE: Final = (math.inf, math.inf)
 """Inertia without an estimate before."""
 
@@ -106,8 +99,8 @@ class EstimateFit(NamedTuple):
 
 def deviation(ranges: Array) -> Array:
     """Standard deviation of ranges, m."""
-    # 0.005: standard deviation of a range, m, to which ``NOISE_SHARE`` of the range is added in quadrature
-    return np.asarray(np.hypot(0.005, NOISE_SHARE * ranges))
+    # 0.005: standard deviation of a range, m, to which 0.01 of the range is added in quadrature
+    return np.asarray(np.hypot(0.005, 0.01 * ranges))
 
 
 def residuals(echoes: Array, line: WallEstimate, cone: Cone) -> Array:
@@ -141,8 +134,9 @@ def search(echoes: Array, at: tuple[float, float], cone: Cone, before: WallEstim
     """
     normals = np.linspace(-math.pi, math.pi, GUESSES[0], endpoint=False)
     sample = echoes
-    if len(echoes) > SAMPLED:  # not every so many-th one, which could all be of one sonar
-        sample = echoes[np.linspace(0, len(echoes) - 1, SAMPLED).astype(int)]
+    sampled = 40  # echoes to which all guesses are fitted, taken evenly out of more
+    if len(echoes) > sampled:  # not every so many-th one, which could all be of one sonar
+        sample = echoes[np.linspace(0, len(echoes) - 1, sampled).astype(int)]
     offsets = sample[:, :2] - at
     along = offsets[:, 0] * np.cos(normals)[:, None] + offsets[:, 1] * np.sin(normals)[:, None]
     share, _, _ = cone.shares(sample[:, 2], normals[:, None])
@@ -159,9 +153,10 @@ def _distinct(normals: Array, distances: Array, cost: Array) -> list[int]:
     """The best guesses, without those that lead to the same line as a better one."""
     found: list[tuple[float, float]] = []
     best = []
+    distinct = 0.05  # least difference between these, rad or m
     for i in np.argsort(cost, kind="stable").tolist():
         normal, distance = float(normals[i]), float(distances[i])
-        if any(abs(math.remainder(normal - n, math.tau)) < DISTINCT and abs(distance - d) < DISTINCT for n, d in found):
+        if any(abs(math.remainder(normal - n, math.tau)) < distinct and abs(distance - d) < distinct for n, d in found):
             continue
         found.append((normal, distance))
         best.append(i)
@@ -191,6 +186,7 @@ def _fitted(
     terms = np.empty((len(normals), 3, len(echoes)))
     """Of every fit and echo: derivatives of the range by direction and distance, and what is missing of it."""
     across, step = np.empty((len(normals), len(echoes))), np.empty_like(first)
+    longest = 0.3  # greatest step of a fit, rad and m
     # Arrays are small: what costs time is the number of calls, so most of them write where there is room already.
     for _ in range(steps):
         angle = lines[0][:, None]
@@ -222,8 +218,8 @@ def _fitted(
         np.subtract(dd * ga, ad * gd, out=step[0])
         np.subtract(aa * gd, ad * ga, out=step[1])
         step /= determinant
-        np.maximum(step, -LONGEST, out=step)
-        np.minimum(step, LONGEST, out=step)
+        np.maximum(step, -longest, out=step)
+        np.minimum(step, longest, out=step)
         lines = lines + step
         if np.abs(step).max() < 1e-4:  # a step of all fits below this, rad and m, is the last one
             break

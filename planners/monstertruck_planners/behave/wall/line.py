@@ -50,26 +50,12 @@ NEARER: Final = 5.0
 """Standard deviations by which an echo of the diagonal sonar is nearer than the wall beside: of something ahead."""
 LEAST: Final = 6
 """Echoes that make a wall."""
-FITS: Final = 2
-"""Lines fitted for a round of echoes: one in a step where there are as many steps: the event loop waits for them."""
 TOUCHING: Final = 0.16
 """A range from which on the robot stops at once, m."""
-CATCH_UP: Final = 1.5
-"""Speed by which a lag is made up for, of the lag, 1/s."""
-LAG: Final = (0.05, 0.15)
-"""Greatest lag that is made up for: distance, m, and angle, rad."""
-TURNS: Final = 0.5
-"""Greatest yaw rate along the wall, rad/s."""
 STRAY: Final = (0.3, 0.4)
 """Yaw rate that is not the one requested, rad/s, and the seconds after which a motor counts as stalled."""
-SLOW: Final = 0.2
-"""Share of the requested speed below which the robot does not move."""
-EQUAL: Final = 12, 0.1
-"""Equal echoes in a row, and the distance over which they came, m, from which on a sonar counts as stuck."""
 DISAGREES, AGREES = 0.2, 0.7
 """Share of them on the wall below which a sonar contradicts another one, whose share is above the second figure."""
-PLACED: Final = 0.5
-"""Distance between two places at which a lap may be complete, m."""
 
 STANDSTILL: Final = TimedRamp(0.0, CubicRamp(0.0, 0.0, 1.0))
 
@@ -134,7 +120,7 @@ class LineState(NamedTuple):
     sense: float = -1.0
     """Sense of the turn: 1 = left."""
     places: Array = np.empty((0, 4))
-    """(n, 4) ``travelled`` and pose where the lap began and every ``PLACED`` metres since; empty = no wall yet."""
+    """(n, 4) ``travelled`` and pose where the lap began and every half a metre since; empty = no wall yet."""
     laps: int = 0
     strays: tuple[float | None, float | None] = (None, None)
     """Since when yaw rate and speed are not those requested, s."""
@@ -155,7 +141,9 @@ class WallLine:
         self._config = config
         self._names = NAMES[config.side]
         self._mirror = 1.0 if config.side == "left" else -1.0
-        self._fits = math.ceil(FITS * (SONAR.rate or 0.0) / config.rate)
+        # 2: lines fitted for a round of echoes: one in a step where there are as many steps: the event loop waits for
+        # them
+        self._fits = math.ceil(2 * (SONAR.rate or 0.0) / config.rate)
 
     def begin(self) -> LineState:
         """Before the first step."""
@@ -185,7 +173,8 @@ class WallLine:
             return BehaviourStep(None, state, state.phase, Reason.BEHAVIOUR_DONE, text)
         v, w = state.v.at(due), state.w.at(due)
         state = state._replace(sent=(*(entry for entry in state.sent if entry[0] > t - KEPT), (due, v, w)))
-        v, w = v + CATCH_UP * state.lag[0], w + CATCH_UP * state.lag[1]
+        catch_up = 1.5  # speed by which a lag is made up for, of the lag, 1/s
+        v, w = v + catch_up * state.lag[0], w + catch_up * state.lag[1]
         motion = RequestedMotion(min(max(v, 0.0), 0.3), w * self._mirror)  # m/s
         error = None if state.wall is None else self.error(state)
         return BehaviourStep(motion, state, state.phase, values=_values(state, error))
@@ -227,13 +216,14 @@ class WallLine:
         dt = 0.0 if state.before is None else t - state.before
         v, w = _asked(state, t)
         behind = state.lag[0] + (v - speed) * dt, state.lag[1] + (w - (rate - bias)) * dt
+        lag = (0.05, 0.15)  # greatest lag that is made up for: distance, m, and angle, rad
         return state._replace(
             bias=(bias, count),
             poses=poses,
             pose=pose,
             travelled=state.travelled + distance,
             turned=state.turned + turn,
-            lag=(clip(behind[0], -LAG[0], LAG[0]), clip(behind[1], -LAG[1], LAG[1])),
+            lag=(clip(behind[0], -lag[0], lag[0]), clip(behind[1], -lag[1], lag[1])),
             before=t,
             strays=_strays(state.strays, (v, w), (speed, rate - bias), t),
         )
@@ -269,7 +259,7 @@ class WallLine:
     # Walls
 
     def _estimate(self, state: LineState, cone: Cone, *, heard: bool) -> LineState:
-        """Fit lines again after a round of echoes, as many in a step as ``FITS`` says, the longest waiting first."""
+        """Fit lines again after a round of echoes, two in each round, the longest waiting first."""
         wanted: tuple[Fit, ...] = ("beside", "right") if state.wall is not None else ("left", "right")
         if state.phase == "turn":
             wanted = ("turned",)
@@ -380,8 +370,10 @@ class WallLine:
         """Why it cannot go on."""
         if (found := state.monitor.fault(state.turned, t)) is not None:
             return found
+        # equal echoes in a row, and the distance over which they came, m, from which on a sonar counts as stuck
+        equal = 12, 0.1
         for name, (value, count, first) in zip(self._names, state.equal, strict=True):
-            if count >= EQUAL[0] and state.travelled - first >= EQUAL[1]:
+            if count >= equal[0] and state.travelled - first >= equal[1]:
                 distance = state.travelled - first
                 return Reason.INPUT_CONTRADICTORY, f"sonar {name} measured {value:.3f} m all along {distance:.2f} m"
         turns, stands = state.strays
@@ -539,7 +531,8 @@ class WallLine:
             away = math.remainder(state.pose[2] - wall.heading, math.tau)
             stiff = config.stiffness
             target = state.v.at(t) * (max(min(error, stiff), -stiff) / stiff**2 - 2.0 * away / stiff)
-        return state._replace(w=self._ramp(state.w, clip(target, -TURNS, TURNS), t))
+        turns = 0.5  # greatest yaw rate along the wall, rad/s
+        return state._replace(w=self._ramp(state.w, clip(target, -turns, turns), t))
 
     def error(self, state: LineState) -> float:
         """Distance of the side sonar from the wall less the one wanted, m; of a state with a wall."""
@@ -561,7 +554,7 @@ class WallLine:
         Where it began need not be such a place: a robot that begins along a door post leaves it for the wall.
         """
         config, (x, y, yaw), places = self._config, state.pose, state.places
-        if state.travelled - places[-1, 0] >= PLACED:
+        if state.travelled - places[-1, 0] >= 0.5:  # distance between two places at which a lap may be complete, m
             places = np.vstack([places, (state.travelled, x, y, yaw)])
             state = state._replace(places=places)
         if state.travelled - places[0, 0] < config.lap_length:
@@ -592,7 +585,8 @@ def _strays(
 ) -> tuple[float | None, float | None]:
     """Since when yaw rate and speed are not those requested."""
     (v, w), (speed, rate) = asked, measured
-    stray = abs(w - rate) > STRAY[0], (v > 0.05 and speed < SLOW * v) or (abs(w) > 0.2 and abs(rate) < SLOW * abs(w))
+    slow = 0.2  # share of the requested speed below which the robot does not move
+    stray = abs(w - rate) > STRAY[0], (v > 0.05 and speed < slow * v) or (abs(w) > 0.2 and abs(rate) < slow * abs(w))
     turns, stands = ((t if since is None else since) if now else None for now, since in zip(stray, before, strict=True))
     return turns, stands
 

@@ -25,15 +25,8 @@ DIAGONAL: Final = math.radians(45)
 """Angle between the side sonar and the diagonal one."""
 FOLLOWING: Final = ("follow", "free")
 """Phases in which a lap may begin: the robot drives along the wall."""
-JUMP: Final = 0.06, 0.15
-"""Growth of the range of the side sonar over two steps, and of the diagonal one over one, by which it begins to look
-into a gap, m."""
 EDGE: Final = 0.1
 """Distance behind the edge of a gap over which the side sonar may measure the gap's own side wall, m."""
-LINE_GAINS: Final = 5.0, 2.0
-"""Yaw rate per distance error from it, rad/s/m, and per heading error, 1/s: critically damped at 0.2 m/s."""
-AT_REST: Final = 0.01
-"""m/s."""
 
 Phase = Literal["approach", "follow", "turn_away", "free", "turn_back", "stop"]
 
@@ -292,7 +285,9 @@ class WallPd(_Wall):
         along *= math.copysign(1.0, along @ (math.cos(yaw), math.sin(yaw)))
         error = float(along[0] * (middle[1] - y) - along[1] * (middle[0] - x)) - self._config.distance
         away = math.remainder(math.atan2(along[1], along[0]) - yaw, math.tau)
-        return LINE_GAINS[0] * error + LINE_GAINS[1] * away
+        # yaw rate per distance error from it, rad/s/m, and per heading error, 1/s: critically damped at 0.2 m/s
+        line_gains = 5.0, 2.0
+        return line_gains[0] * error + line_gains[1] * away
 
     def _gaps(self, state: WallState, ranges: Ranges) -> WallState:
         """Which sonars look into a gap: from a jump up on, until they measure the wall again or it is too long.
@@ -301,13 +296,16 @@ class WallPd(_Wall):
         begins, a diagonal range much longer than that along a wall is one into a gap as well.
         """
         before, (side, diagonal), now = state.before, state.gaps, state.travelled
-        niche = side is None and bool(before) and before[-1].side - ranges.side > JUMP[1]
-        if before and ranges.side - min(sample.side for sample in before) > JUMP[0]:
+        # growth of the range of the side sonar over two steps, and of the diagonal one over one, by which it begins to
+        # look into a gap, m
+        jump = 0.06, 0.15
+        niche = side is None and bool(before) and before[-1].side - ranges.side > jump[1]
+        if before and ranges.side - min(sample.side for sample in before) > jump[0]:
             side = now if side is None else side
         elif side is not None and ranges.side < self._config.seen and now - side > EDGE:
             side = None
         known = before[-1].diagonal if before else ranges.side / math.cos(DIAGONAL)
-        if ranges.diagonal - known > JUMP[1]:
+        if ranges.diagonal - known > jump[1]:
             diagonal = now
         # 0.05: diagonal range times cos 45 degrees less side range below which it ends, m
         elif ranges.diagonal * math.cos(DIAGONAL) - ranges.side < 0.05:
@@ -390,7 +388,8 @@ def _moved(state: WallState, odometry: Odometry) -> WallState:
 
 def _stall_timed(state: WallState, speed: float, t: float) -> WallState:
     """Since when the robot stands although it was asked to drive."""
-    stalled = state.asked > AT_REST * 5 and abs(speed) < AT_REST
+    at_rest = 0.01  # m/s
+    stalled = state.asked > at_rest * 5 and abs(speed) < at_rest
     if not stalled:
         return replace(state, moving_since=None)
     return state if state.moving_since is not None else replace(state, moving_since=t)
