@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from monstertruck_runtime.clock import SECOND
-from monstertruckd.tools.drill.observer import AT_REST
+from monstertruckd.tools.drill.observer import STANDING_SPEED
 from monstertruckd.tools.simulation.config import DEADMAN_LINE
 from tests.daemon.wall_kit import ROOT, Robot, end, robot
 
@@ -102,7 +102,7 @@ async def trial(way: Way, cruise: float) -> tuple[float, float]:
             await asyncio.sleep(WATCHED)
             truth = await truck.truth()
     later = truth[truth[:, 0] >= began]
-    moving = np.flatnonzero(np.abs(later[:, 4]) > AT_REST)
+    moving = np.flatnonzero(np.abs(later[:, 4]) > STANDING_SPEED)
     last = int(moving[-1]) + 1 if len(moving) else 0
     seconds = float(later[last, 0] - began) if last < len(later) else float("inf")
     return seconds, float(np.hypot(*np.diff(later[: last + 1, 1:3], axis=0).T).sum())

@@ -60,7 +60,7 @@ from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode, GateState
-from monstertruckd.config.load import VERSION
+from monstertruckd.config.load import FILE_VERSION
 from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
 from monstertruckd.tools.simulation import simulate
 from monstertruckd.tools.simulation.config import load_simulated
@@ -303,7 +303,7 @@ async def trials(clock: Clock, folder: Path, kind: str, count: int) -> dict[str,
     """All trials of one flood."""
     endpoint = free_endpoint()
     base, access = folder / "to_and_fro.yaml", {"zenoh": {"access_control": True}} if kind == "forged" else {}
-    demo = {"include": str(ROOT / "configs" / "demo.yaml"), "version": VERSION}
+    demo = {"include": str(ROOT / "configs" / "demo.yaml"), "version": FILE_VERSION}
     base.write_text(yaml_text(demo | TO_AND_FRO | access))
     config = write_overlay(base, folder, endpoint)
     cores = sorted(os.sched_getaffinity(0))

@@ -28,7 +28,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.bootstrap import find_uv
 from monstertruckd.host.logging_queue import PRIORITIES
-from monstertruckd.tools.drill.observer import AT_REST, written
+from monstertruckd.tools.drill.observer import STANDING_SPEED, written
 
 ROOT = Path(__file__).resolve().parents[1]
 PARTS = Path(__file__).resolve().parent / "service_parts"
@@ -105,7 +105,7 @@ class Wire:
 
     def stood(self) -> float | None:
         """Instant of standstill, s."""
-        return next((at for at, speed in self.speeds if abs(speed) < AT_REST), None)
+        return next((at for at, speed in self.speeds if abs(speed) < STANDING_SPEED), None)
 
     def metres(self, end: float) -> float:
         """Travelled until then, m."""

@@ -22,7 +22,7 @@ from monstertruck_schemas.state import GateState
 from monstertruck_schemas.topics import Topic, Writer
 from monstertruck_sim.world.config import ServoModelConfig, SteadyTilt
 from monstertruck_sim.world.noise import IMU_FIXED, generator
-from monstertruck_sim.world.plant import GRAVITY, TruthState
+from monstertruck_sim.world.plant import PLANT_GRAVITY, TruthState
 from monstertruckd.config.calibration import CalibrationStore, Result, Value, WizardName, with_values
 from monstertruckd.daemon import Daemon
 from monstertruckd.tools.calibrate.steps import Confirm, Number
@@ -370,7 +370,7 @@ def truths(config: SimulatedTruckConfig) -> dict[WizardName, dict[str, Value]]:
     """True values of what the wizards estimate, by wizard and name, in the plane."""
     world = config.sim.world
     truck, iron = world.truck, world.compass.iron
-    rolling = truck.slip_per_newton * truck.rolling_resistance * truck.mass * GRAVITY
+    rolling = truck.slip_per_newton * truck.rolling_resistance * truck.mass * PLANT_GRAVITY
     turns = truck.motor.ratio / (2 * math.pi * truck.wheel_radius) / (1 - rolling)
     soft = np.linalg.inv(((iron.soft_x, iron.soft_xy), (iron.soft_xy, iron.soft_y)))
     soft /= math.sqrt(np.linalg.det(soft))

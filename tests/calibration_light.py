@@ -72,7 +72,7 @@ def judged(result: Result, truth: dict[str, float]) -> list[Verdict]:
 def battery_fit(rng: np.random.Generator) -> list[Verdict]:
     """A multimeter at a full and at an emptier pack."""
     wizard = battery.BatteryWizard()
-    gain, offset = rng.uniform(0.94, 1.06), rng.uniform(-battery.GROUND, battery.GROUND)
+    gain, offset = rng.uniform(0.94, 1.06), rng.uniform(-battery.EARTHING, battery.EARTHING)
     share, readings = wizard.meter_share * rng.uniform(-1, 1), []
     for volts in (16.4, 13.4):
         raw, noise = (volts - offset) / gain, 0.003
@@ -213,7 +213,7 @@ def odometry_fit(rng: np.random.Generator) -> list[Verdict]:
     model = odometry.SquareModel(SteeringModel(CHASSIS), MAPS, AHEAD)
     true = np.array((rng.uniform(0.95, 1.05), rng.uniform(0.95, 1.05), rng.uniform(-0.04, 0.04)))
     # What the interval's bounds cover besides: floor, linkage and wheels that are steered while the truck stands.
-    besides = odometry.FLOOR, math.hypot(odometry.LINKAGE, odometry.ON_THE_SPOT), 0.0
+    besides = odometry.FLOOR_DIFFERENCE, math.hypot(odometry.LINKAGE, odometry.ON_THE_SPOT), 0.0
     actual = true * (1 + np.array(besides) * rng.normal(size=3) / NORMAL)
     squares = square_legs(model, actual, rng)
     fit = model.fit(squares, 0.002, 0.0035)
@@ -268,7 +268,7 @@ def lidar_fit(rng: np.random.Generator) -> list[Verdict]:
         for way, turn in ((1.0, 0.0), (-1.0, 0.0), *((0.665, side * 1.52),) * 4):
             turn = turn + 0.01 * rng.normal()
             sigma = 0.006
-            actual = true + np.array((centre, 0.0, 0.0, lidar.DRIFT * rng.normal(), lidar.CRAB * rng.normal()))
+            actual = true + np.array((centre, 0.0, 0.0, lidar.LEG_DRIFT * rng.normal(), lidar.CRAB * rng.normal()))
             seen = lidar.seen_motion(actual, np.array((way,)), np.array((turn,)), np.zeros(1))[0]
             seen[:2] += sigma * rng.normal(size=2)
             legs.append(lidar.LidarLeg(way, (float(seen[0]), float(seen[1]), float(seen[2])), sigma))
@@ -290,9 +290,9 @@ def imu_fit(rng: np.random.Generator) -> list[Verdict]:
             angular_velocity=_vector([b + 0.003 * rng.normal() for b in bias.values()]),
             linear_acceleration=_vector(
                 [
-                    -imu.GRAVITY * math.sin(lean[0]) + force["force_x"] + 0.05 * rng.normal(),
-                    imu.GRAVITY * math.cos(lean[0]) * math.sin(lean[1]) + force["force_y"] + 0.05 * rng.normal(),
-                    imu.GRAVITY,
+                    -imu.ONE_G * math.sin(lean[0]) + force["force_x"] + 0.05 * rng.normal(),
+                    imu.ONE_G * math.cos(lean[0]) * math.sin(lean[1]) + force["force_y"] + 0.05 * rng.normal(),
+                    imu.ONE_G,
                 ]
             ),
         )
@@ -329,7 +329,7 @@ def slip_fit(rng: np.random.Generator) -> list[Verdict]:
             vx, vy, wz = robot.forward((sign * left, sign * right))
             x, y, yaw = integrate((0.0, 0.0, 0.0), vx, vy, wz, 1.0)
             way = slip.SLIDING * 0.021 * max(left, right)
-            place, aim = math.hypot(slip.FLOOR, way), math.hypot(slip.AIM, slip.SLIDING * abs(yaw))
+            place, aim = math.hypot(slip.POSITION_FLOOR, way), math.hypot(slip.AIM, slip.SLIDING * abs(yaw))
             motion = x + place * rng.normal(), y + place * rng.normal(), yaw + aim * rng.normal()
             arcs.append(slip.SkidArc(sign * left, sign * right, motion, (0.0003, 0.0005)))
     return judged(slip.result_of(arcs, 0.021, 0.0525), truth)
@@ -371,7 +371,7 @@ def sonar_legs(
             angles = np.arange(0.0, turn, step)[::way] * side
             radius = side * ARC
             poses = np.column_stack((radius * np.sin(angles), radius * (1 - np.cos(angles)), angles))
-            nearer, drift, more = (np.array(sonar.DRIFT) * rng.normal(size=3)).tolist()
+            nearer, drift, more = (np.array(sonar.ARC_DRIFT) * rng.normal(size=3)).tolist()
             nearer, drift = (nearer, drift) if legs else (0.0, 0.0)
             actual = _drifted(poses, aside + nearer, turned + drift, more, further)
             aside, turned = (actual[-1] - poses[-1])[1:].tolist()

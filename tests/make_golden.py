@@ -12,7 +12,7 @@ import numpy as np
 
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruckd import __version__
-from monstertruckd.config.load import VERSION, load_tree
+from monstertruckd.config.load import FILE_VERSION, load_tree
 from monstertruckd.tools.demo.runs import run_fast_demo
 from monstertruckd.tools.logs.report.collect import collect
 from monstertruckd.tools.logs.summary import info
@@ -25,7 +25,7 @@ LENGTH = 0.15
 
 def write_config(source: Path, target: Path, **changes: object) -> None:
     """``source`` with all it includes as one file without includes, its path straight and short."""
-    config = load_tree(source).data | {"version": VERSION} | changes
+    config = load_tree(source).data | {"version": FILE_VERSION} | changes
     config.pop("include", None)
     config["path"] = {"file": "path.csv"}
     target.write_text(yaml_text(config), encoding="utf-8")

@@ -19,7 +19,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.req import GoalRequest, Role
 from monstertruck_sim.world.obstacles import Box
-from monstertruckd.config.load import VERSION, load_config, load_tree
+from monstertruckd.config.load import FILE_VERSION, load_config, load_tree
 from monstertruckd.tools.demo.runs import run_fast_demo, write_overlay
 from monstertruckd.tools.logs.summary import info
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
@@ -43,7 +43,7 @@ PLANNER = {
 
 def short_config(source: Path, folder: Path, **changes: Any) -> Path:
     """``source`` with all it includes and ``changes``, without what fills a log: pictures, every beam."""
-    config: dict[str, Any] = load_tree(source).data | {"version": VERSION} | changes
+    config: dict[str, Any] = load_tree(source).data | {"version": FILE_VERSION} | changes
     config.pop("include", None)
     config["recorder"] = {"compression": "zstd"}
     config["map"] = None

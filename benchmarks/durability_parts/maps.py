@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from benchmarks.durability_parts.subject import Death, Subject
-from monstertruck_estimation.ground.grid import RESOLUTION, GroundGrid
+from monstertruck_estimation.ground.grid import GROUND_RESOLUTION, GroundGrid
 from monstertruck_estimation.points import files
 from monstertruck_estimation.slam import storage
 from monstertruck_estimation.slam.worker_io import GridPatch
@@ -62,7 +62,7 @@ def check(folder: Path, acknowledged: list[str], death: Death) -> str | None:
     ground = GroundGrid.load(place)
     if not ground.empty:
         origin = ground.message(0, 0, "map").origin
-        found["ground"] = _numbers(origin.x / RESOLUTION, origin.y / RESOLUTION)
+        found["ground"] = _numbers(origin.x / GROUND_RESOLUTION, origin.y / GROUND_RESOLUTION)
     for point, picture in files.load(place):
         found["points"] = _numbers(point.x, point.y)
         if picture.split() != [b"%d" % value for value in found["points"]]:
@@ -113,7 +113,7 @@ def _graph(run: int, number: int) -> storage.SavedGraph:
 
 def _ground(run: int, number: int) -> GroundGrid:
     grid = GroundGrid()
-    grid.observe(np.array([((run + 0.5) * RESOLUTION, (number + 0.5) * RESOLUTION)]), 0.1, 0.0)
+    grid.observe(np.array([((run + 0.5) * GROUND_RESOLUTION, (number + 0.5) * GROUND_RESOLUTION)]), 0.1, 0.0)
     return grid
 
 

@@ -21,7 +21,7 @@ from monstertruck_estimation.slam.storage import load
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2
 from monstertruck_planners.collision import DistanceField
-from monstertruck_planners.explore.frontier import UNKNOWN, FrontierMap
+from monstertruck_planners.explore.frontier import UNKNOWN_CELL, FrontierMap
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics
@@ -210,9 +210,9 @@ def known(run: RunRecord) -> tuple[dict[float, float], float]:
         column, row = np.floor(rest / grid.resolution).astype(int).T - grid.corner[:, None]
         rows, columns = grid.cells.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        value = np.full(len(rest), UNKNOWN)
+        value = np.full(len(rest), UNKNOWN_CELL)
         value[inside] = grid.cells[row[inside], column[inside]]
-        rest = rest[value == UNKNOWN]
+        rest = rest[value == UNKNOWN_CELL]
         share = 1.0 - len(rest) / count
         for wanted in SHARES:
             if share >= wanted:

@@ -27,7 +27,7 @@ from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import Topic
 from monstertruck_sim.faults import Fault, SimContext, apply
 from monstertruckd.bus.local import Bus
-from monstertruckd.tools.drill.observer import AT_REST, STOP_CONTROLS, Violation, WireTap, written
+from monstertruckd.tools.drill.observer import STANDING_SPEED, STOP_CONTROLS, Violation, WireTap, written
 from monstertruckd.tools.drill.truck import DaemonReport, DrillTruck, DrivingStation
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 
@@ -249,7 +249,7 @@ class _ScenarioRun:
             recovered = await self.truck.until(self._drivable, scenario.timeout)
             after = (self.clock.now() - self.ended) / SECOND if recovered else None
             await self.clock.sleep(0.5)
-            moved = abs(self.observer.speed) > AT_REST
+            moved = abs(self.observer.speed) > STANDING_SPEED
             again = recovered and await self._drives_again()
             return self._reaction(recovered_after_s=after, moved_by_itself=moved, drove_again=again)
 
@@ -387,7 +387,7 @@ def _reaction(scenario: Scenario, got: Reaction) -> Iterator[str]:
             yield from _late(got.standstill_after_s, limit, "standstill")
         case Expect.GO_ON | Expect.SLOW_DOWN if got.reason is not None or got.standstill_after_s is not None:
             yield f"stopped: {got.reason}"
-        case Expect.REFUSE if got.top_speed > AT_REST:
+        case Expect.REFUSE if got.top_speed > STANDING_SPEED:
             yield f"moved at {got.top_speed:.2f} m/s"
         case Expect.EXIT:
             yield from _stops_in_time(got)

@@ -17,7 +17,7 @@ from monstertruck_estimation.gyro import GyroConfig
 from monstertruck_estimation.inertial import Inertial
 from monstertruck_estimation.odometry import OdometryContext
 from monstertruck_estimation.points.config import PointsConfig
-from monstertruck_estimation.points.service import START_TIMEOUT as READER_START
+from monstertruck_estimation.points.service import READER_START_TIMEOUT as READER_START
 from monstertruck_estimation.points.service import TARGET as READER
 from monstertruck_estimation.points.service import PointFolders, PointInputs, PointService
 from monstertruck_estimation.slam.service import SlamService

@@ -164,7 +164,7 @@ def with_response(tracker: TrackerConfig, devices: Devices) -> TrackerConfig:
     return tracker.model_copy(update={"dead_time": steering[1].dead_time, "lag": steering[1].lag})
 
 
-START_TIMEOUT: Final = 180.0
+PLANNER_START_TIMEOUT: Final = 180.0
 """Real seconds the worker may take to start: the first time it compiles."""
 
 
@@ -204,7 +204,7 @@ def build_goals(
             PLANNING_BY_KIND.get(kind_of(type(planner.route)) or "", STEPS[PLANNING]),
             latency=planner.latency,
             deadline=planner.deadline,
-            start_timeout=START_TIMEOUT,
+            start_timeout=PLANNER_START_TIMEOUT,
         ),
         deceleration=config.tracker.deceleration,
         max_age=config.gate.max_request_age,
@@ -249,7 +249,7 @@ def _build_explorer(
         STEPS[EXPLORING],
         latency=explorer.latency,
         deadline=explorer.deadline,
-        start_timeout=START_TIMEOUT,
+        start_timeout=PLANNER_START_TIMEOUT,
     )
     inputs = ExplorerInputs(
         gate=bus.subscribe(topics.GATE, latest()),
@@ -320,7 +320,7 @@ def _deformation(
             STEPS[DEFORMING],
             latency=local.latency,
             deadline=local.deadline,
-            start_timeout=START_TIMEOUT,
+            start_timeout=PLANNER_START_TIMEOUT,
         ),
         scan=bus.subscribe(topics.SCAN, latest()),
         pose=bus.subscribe(topics.POSE if mapped else topics.ODOMETRY, latest()),

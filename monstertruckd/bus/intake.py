@@ -28,7 +28,7 @@ from monstertruck_schemas.topics import ESTOP_WAY, REQ_CONTROL, REQ_DRIVE, REQ_P
 from monstertruckd.bus.access import Sender, role_needed
 from monstertruckd.bus.local import Bus
 
-DEPTH: Final = 64
+REQUEST_QUEUE: Final = 64
 """Requests of one topic that may wait for the loop."""
 
 
@@ -225,9 +225,9 @@ class Intake:
             guard(lambda: bus.inject(topic, request))
 
         self._requests: ThreadHop[Message] = ThreadHop(
-            deliver, DEPTH, bus.add_drops, lambda request: _order(request) in UNCONDITIONAL
+            deliver, REQUEST_QUEUE, bus.add_drops, lambda request: _order(request) in UNCONDITIONAL
         )
-        self._estops: ThreadHop[Message] = ThreadHop(deliver, DEPTH, bus.add_drops)
+        self._estops: ThreadHop[Message] = ThreadHop(deliver, REQUEST_QUEUE, bus.add_drops)
         """Emergency stops wait for no other order."""
         self._repeats = {Order.ESTOP: Repeats(self._estops.put), Order.STOP: Repeats(self._requests.put)}
 
@@ -322,7 +322,7 @@ class StandIntake:
         self._refusals = refusals
         self._rates = OwnerRates(self.RATE, clock)
         self._poses: ThreadHop[StandPose] = ThreadHop(
-            lambda pose: guard(lambda: bus.put_stand(STAND_POSE, pose)), DEPTH, bus.add_drops
+            lambda pose: guard(lambda: bus.put_stand(STAND_POSE, pose)), REQUEST_QUEUE, bus.add_drops
         )
 
     def take(self, size: int, read: Callable[[], bytes]) -> None:

@@ -40,7 +40,7 @@ from monstertruckd.config.wizards import WIZARDS
 
 DAY: Final = 86_400 * SECOND
 """ns."""
-PERIOD: Final = 1.0
+DRIVE_CHECK_PERIOD: Final = 1.0
 """Seconds between two checks of the drive's position: half of it at most is missing of every reversal."""
 
 
@@ -237,7 +237,7 @@ class CalibrationWatch:
             before: float | None = None
             try:
                 for count in itertools.count(1):
-                    await self._clock.sleep(PERIOD)
+                    await self._clock.sleep(DRIVE_CHECK_PERIOD)
                     if drive.latest is not None:
                         here = drive.latest.position
                         if before is not None:

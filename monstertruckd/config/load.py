@@ -30,7 +30,7 @@ from monstertruck_runtime.map_folders import YAML as MAP_YAML
 from monstertruck_runtime.outside import reading
 from monstertruck_runtime.plugins import models_in
 from monstertruck_runtime.small_files import make_folder, replace_file, require_file
-from monstertruck_runtime.yaml_files import DEEPEST, MOST_BYTES, bounded_yaml
+from monstertruck_runtime.yaml_files import DEEPEST, LARGEST_YAML, bounded_yaml
 from monstertruck_schemas.base import LiveValue, Schema, field_docs, first_mistake, live_settings
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values, unused
 from monstertruckd.config.real_ports import mixed
@@ -508,10 +508,10 @@ class YamlText:
         """Content of a file.
 
         Raises:
-            ConfigError: it cannot be read, is longer than ``MOST_BYTES``, or is refused as above.
+            ConfigError: it cannot be read, is longer than ``LARGEST_YAML``, or is refused as above.
         """
         try:
-            require_file(path, MOST_BYTES)
+            require_file(path, LARGEST_YAML)
             return cls(path.read_text(encoding="utf-8"), path)
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
@@ -583,7 +583,7 @@ def _rename_keys(names: Mapping[str, str], text: YamlText) -> None:
         text.rename(tuple(key.split(".")), name)
 
 
-VERSION: Final = 2
+FILE_VERSION: Final = 2
 """Version of the configuration files that this program writes."""
 STEPS: Final[dict[int, Step]] = {version: partial(_rename_keys, names) for version, names in RENAMED.items()}
 """Migration steps by the version they start from."""
@@ -615,9 +615,9 @@ def bring_up_to_date(text: YamlText, inherited: int | None) -> int | None:
     """
     said = text.value("version")
     version = inherited if text.node("version") is None else int(said) if said and said.isdecimal() else None
-    if version is None or not OLDEST <= version <= VERSION:
+    if version is None or not OLDEST <= version <= FILE_VERSION:
         return None
-    run_steps(text, version, STEPS, VERSION)
+    run_steps(text, version, STEPS, FILE_VERSION)
     return version
 
 
@@ -627,11 +627,11 @@ def bring_up_to_date(text: YamlText, inherited: int | None) -> int | None:
 def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
     """Validate what was read and merged from ``path``; see ``load_config``."""
     version = tree.data.get("version")
-    if version != VERSION:
+    if version != FILE_VERSION:
         if version is None:
-            raise ConfigError(f"{path}:1: version: missing; write `version: {VERSION}`")
+            raise ConfigError(f"{path}:1: version: missing; write `version: {FILE_VERSION}`")
         origin = tree.origin(("version",)) or f"{path}:1"
-        raise ConfigError(f"{origin}: version: expected {OLDEST} to {VERSION}, found {version!r}")
+        raise ConfigError(f"{origin}: version: expected {OLDEST} to {FILE_VERSION}, found {version!r}")
     _require_kind(tree.data, path, model)
     _locate_files(tree, getattr(model, "FILE_KEYS", ()))
     _give_ports(tree.data)

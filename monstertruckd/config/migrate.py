@@ -13,7 +13,7 @@ from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.small_files import replace_file
-from monstertruckd.config.load import STEPS, VERSION, Step, YamlText, included, run_steps
+from monstertruckd.config.load import FILE_VERSION, STEPS, Step, YamlText, included, run_steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Upgrade:
         return self.path.with_name(f"{self.path.name}.v{self.version}")
 
 
-def plan(path: Path, steps: Mapping[int, Step] = STEPS, target: int = VERSION) -> list[Upgrade]:
+def plan(path: Path, steps: Mapping[int, Step] = STEPS, target: int = FILE_VERSION) -> list[Upgrade]:
     """Upgrades of ``path`` and of all it includes, in the order in which they are to be written.
 
     Args:

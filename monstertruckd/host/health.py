@@ -20,7 +20,7 @@ from monstertruckd.recorder.recorder import Recorder
 
 log = logging.getLogger(__name__)
 
-PERIOD = 1.0
+HEALTH_PERIOD = 1.0
 
 PASSING: Final = frozenset({Reason.SLOW_LINK})
 """Reasons of a service that works, but badly: its warning says so, its information that it is over."""
@@ -132,7 +132,7 @@ class HealthBoard:
         complete = False
         summary_after = 5  # periods after the start at which the log says what is there and what is not
         for periods in count(1):
-            await self._clock.sleep(PERIOD)
+            await self._clock.sleep(HEALTH_PERIOD)
             self._publish()
             if periods >= summary_after and not complete:
                 complete = self._summarise(missing=periods == summary_after)
@@ -204,7 +204,7 @@ class ClockService:
             now = self._clock.now()
             self._out.put(ClockOffset(stamp=now, received=now, seq=self._out.next_seq(), offset=offset, stepped=step))
             before = offset
-            await self._clock.sleep(PERIOD)
+            await self._clock.sleep(HEALTH_PERIOD)
 
 
 class MeterService:
@@ -241,7 +241,7 @@ class MeterService:
         """Publish until cancelled."""
         ready()
         while True:
-            await self._clock.sleep(PERIOD)
+            await self._clock.sleep(HEALTH_PERIOD)
             now = self._clock.now()
             late = self._gate.lateness()
             health = LoopHealth(

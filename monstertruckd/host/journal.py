@@ -14,7 +14,7 @@ from monstertruck_runtime.threads import ThreadHop
 from monstertruck_schemas.event import LogLevel, LogRecord
 from monstertruckd.host.logging_queue import shown
 
-DEPTH: Final = 256
+JOURNAL_QUEUE: Final = 256
 """Records on their way to the loop; beyond that the oldest of the lowest level is lost and counted."""
 
 _LEVELS: Final = (
@@ -58,7 +58,7 @@ class Journal(logging.Handler):
         self._loop_thread = threading.get_ident()
         self._reproducible = reproducible
         self._publishing = False
-        self._hop: ThreadHop[_Line] = ThreadHop(self._publish, DEPTH, on_loss, rank=lambda line: line.level)
+        self._hop: ThreadHop[_Line] = ThreadHop(self._publish, JOURNAL_QUEUE, on_loss, rank=lambda line: line.level)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Queue the record; never waits, and complains of a wrong log call as every handler does."""

@@ -12,14 +12,14 @@ from collections.abc import Mapping
 from copy import copy
 from typing import Final, TextIO
 
-DEPTH: Final = 1000
+LOG_QUEUE: Final = 1000
 """Records waiting for a stuck terminal or journal; beyond that they are lost and counted."""
-TIMEOUT: Final = 1.0
+OUTPUT_TIMEOUT: Final = 1.0
 """Seconds the end of the process waits for a stuck output."""
 PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 """Levels of syslog, which journald reads from a line's head."""
 
-LONGEST: Final = 16_384
+LONGEST_RECORD: Final = 16_384
 """Characters of one record; what is beyond is cut off."""
 
 _KEYS: Final = r"(?:password|passwd|passphrase|secret|token|authorization|(?<![a-z])psk|api[_-]?key)"
@@ -54,18 +54,18 @@ def redacted(text: str) -> str:
 
 
 def shown(text: str) -> str:
-    """What of a record's ``text`` is shown: no secrets, and ``LONGEST`` characters at most."""
+    """What of a record's ``text`` is shown: no secrets, and ``LONGEST_RECORD`` characters at most."""
     margin = 1024  # characters beyond the cut that are searched as well, so that no secret is cut in half and missed
-    safe = redacted(text[: LONGEST + margin])
-    beyond = len(safe) - LONGEST + max(0, len(text) - LONGEST - margin)
-    return f"{safe[:LONGEST]} ... {beyond} characters more" if beyond > 0 else safe
+    safe = redacted(text[: LONGEST_RECORD + margin])
+    beyond = len(safe) - LONGEST_RECORD + max(0, len(text) - LONGEST_RECORD - margin)
+    return f"{safe[:LONGEST_RECORD]} ... {beyond} characters more" if beyond > 0 else safe
 
 
 class LossyQueueHandler(logging.handlers.QueueHandler):
     """Counts what does not fit instead of waiting or complaining."""
 
     def __init__(self) -> None:
-        self.records: queue.Queue[logging.LogRecord | None] = queue.Queue(DEPTH)
+        self.records: queue.Queue[logging.LogRecord | None] = queue.Queue(LOG_QUEUE)
         super().__init__(self.records)
         self.lost = 0
 
@@ -93,12 +93,12 @@ class LogOutputThread:
         self._thread.start()
 
     def stop(self) -> None:
-        """Write what still waits, as far as the output takes it within ``TIMEOUT``."""
+        """Write what still waits, as far as the output takes it within ``OUTPUT_TIMEOUT``."""
         try:
-            self._handler.records.put(None, timeout=TIMEOUT)
+            self._handler.records.put(None, timeout=OUTPUT_TIMEOUT)
         except queue.Full:
             return
-        self._thread.join(TIMEOUT)
+        self._thread.join(OUTPUT_TIMEOUT)
 
     def _run(self) -> None:
         while (record := self._handler.records.get()) is not None:

@@ -11,7 +11,7 @@ from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateMode
 
-PERIOD: Final = 1.0
+UNWATCHED_PERIOD: Final = 1.0
 """Seconds between two looks without a watchdog."""
 
 
@@ -71,7 +71,7 @@ class NotifyService:
     ) -> None:
         self._send = send
         self._ping = ("WATCHDOG=1",) if watchdog is not None else ()
-        self._period = PERIOD if watchdog is None else watchdog / 3
+        self._period = UNWATCHED_PERIOD if watchdog is None else watchdog / 3
         self._clock = clock
         self._ticks = ticks
         # 0.5: part of the nominal ticks between two looks without which the tick counts as hanging

@@ -17,7 +17,7 @@ from monstertruck_schemas.roles import ServiceName
 
 log = logging.getLogger(__name__)
 
-KEPT: Final = 20
+KEPT_DUMPS: Final = 20
 """Dumps kept in the folder."""
 
 _NAME: Final = re.compile(r"stall-(\d{6,})\.txt")
@@ -110,7 +110,7 @@ class StallWatch:
         """Remove the oldest dumps; the next one's number."""
         self._folder.mkdir(parents=True, exist_ok=True)
         found = sorted((int(name[1]), path) for path in self._folder.iterdir() if (name := _NAME.fullmatch(path.name)))
-        for _, path in found[: max(0, len(found) - KEPT + 1)]:
+        for _, path in found[: max(0, len(found) - KEPT_DUMPS + 1)]:
             path.unlink(missing_ok=True)
         return found[-1][0] + 1 if found else 1
 

@@ -20,7 +20,7 @@ from monstertruck_schemas.state import Odometry
 from monstertruckd.recorder.config import MapRender
 
 TARGET = "monstertruckd.recorder.picture_worker:MapRenderer"
-SPACING = 0.02
+FIRST_SPACING = 0.02
 """Metres between two remembered poses of the driven path, at first."""
 
 
@@ -61,7 +61,7 @@ class MapService:
         self._tracker = tracker
         self._events = events
         self._driven: list[tuple[float, float, float]] = []
-        self._spacing = SPACING
+        self._spacing = FIRST_SPACING
         self._before = Reason.DRIVING
 
     async def run(self, ready: Ready) -> None:

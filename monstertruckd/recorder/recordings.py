@@ -29,7 +29,7 @@ DELETE: Final = "recording_delete"
 
 CHUNK: Final = 65_536
 """Bytes of one answer at most."""
-RATE: Final = 1_000_000.0
+DOWNLOAD_RATE: Final = 1_000_000.0
 """Bytes a second that all downloads take together."""
 TURN: Final = 5.0
 """Seconds without a chunk after which another source may download."""
@@ -139,7 +139,7 @@ class Recordings:
 
             text, size, whole = await self._offload(read)
             now = self._clock.now()
-            self._free = max(self._free, now) + round(size / RATE * SECOND)
+            self._free = max(self._free, now) + round(size / DOWNLOAD_RATE * SECOND)
             self._until = now + round(TURN * SECOND) if offset + size < whole else now
         return {"data": text, "bytes": whole}
 

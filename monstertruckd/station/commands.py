@@ -9,7 +9,7 @@ from monstertruck_schemas.base import first_mistake
 from monstertruck_schemas.req import UNCONDITIONAL, BehaviourOrder, ExploreOrder, GoalOrder, MissionOrder, Order, Role
 from monstertruck_schemas.roles import AccessRole
 
-MOST_BYTES: Final = 16_384
+LONGEST_MESSAGE: Final = 16_384
 """Size of a message; a longer one ends the connection."""
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -117,7 +117,7 @@ class DoMission(Asked):
 
     do: Literal["mission"]
     order: MissionOrder
-    text: Annotated[str, Field(max_length=MOST_BYTES)] = ""
+    text: Annotated[str, Field(max_length=LONGEST_MESSAGE)] = ""
     """Of a start: the mission's file, YAML."""
     moved: bool = False
     """Of a resume: the robot is not where the mission was interrupted, and its pose is right."""

@@ -18,7 +18,7 @@ from monstertruckd.station.address import RobotAddress
 
 log = logging.getLogger(__name__)
 
-RETRY: Final = 1.0
+ROUTER_RETRY: Final = 1.0
 """Seconds between two attempts to reach a router, and in which it answers."""
 MOST_ROBOTS: Final = 64
 """Robots that one router may add; a page cannot show more of them sensibly."""
@@ -49,18 +49,18 @@ class Discovery:
                 if str(error) != said:
                     said = str(error)
                     log.warning("no robots from %s: %s", self._endpoint, said)
-                await self._clock.sleep(RETRY)
+                await self._clock.sleep(ROUTER_RETRY)
                 continue
             await self._watch(session)
 
     def _open(self) -> zenoh.Session:
         tls = tls_for(self._endpoint)
-        config = session_config(self._endpoint, RETRY, tls)
+        config = session_config(self._endpoint, ROUTER_RETRY, tls)
         try:
             return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:
             require_certificates(self._endpoint, tls)
-            raise NotFoundError(f"nothing answers at {self._endpoint} within {RETRY} s") from error
+            raise NotFoundError(f"nothing answers at {self._endpoint} within {ROUTER_RETRY} s") from error
 
     async def _watch(self, session: zenoh.Session) -> None:
         hop: ThreadHop[str] = ThreadHop(self._take, 4 * MOST_ROBOTS, lambda _: None)

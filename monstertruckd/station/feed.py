@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 M = TypeVar("M", bound=Message)
 
-TICK: Final = 0.05
+FEED_PERIOD: Final = 0.05
 """Seconds between two checks of what is new."""
 PING: Final = 1.0
 """Seconds between two measurements of the round trip to the robot."""
@@ -270,7 +270,7 @@ class RobotFeed:
                     self._take_map(maps, tiles)
                     for event in events.drain():
                         self._take_event(event)
-                    await self._clock.sleep(TICK)
+                    await self._clock.sleep(FEED_PERIOD)
             # Whoever looks next begins with what is published then, not with what was true long ago.
             self._viewers.newest.clear()
 
@@ -278,7 +278,7 @@ class RobotFeed:
         newest = box.latest
         before, due = taken.get(shown.kind, (None, now))
         # Half a tick of tolerance: the looks themselves come a little early or late.
-        if newest is None or newest is before or now < due - TICK / 2 * SECOND:
+        if newest is None or newest is before or now < due - FEED_PERIOD / 2 * SECOND:
             return
         frame = shown.encode(newest)
         pause = max(shown.period, 0.0 if shown.budget is None else len(frame) / shown.budget)

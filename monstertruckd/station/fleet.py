@@ -15,7 +15,7 @@ from monstertruckd.station import frames
 from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.viewer import Viewer
 
-PERIOD: Final = 0.5
+FLEET_PERIOD: Final = 0.5
 """Seconds between two checks of all robots."""
 
 
@@ -96,7 +96,7 @@ class FleetBoard:
                 frame = self._look()
                 for viewer in self._viewers:
                     viewer.show("fleet", frame)
-                await self._clock.sleep(PERIOD)
+                await self._clock.sleep(FLEET_PERIOD)
                 if not self._viewers:
                     self._leave()
         finally:

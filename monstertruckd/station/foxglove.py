@@ -36,7 +36,7 @@ PORT: Final = 8765
 LAYOUT: Final = Path(__file__).parent / "foxglove_layout.json"
 TELEOP: Final = "/teleop"
 """Topic of the layout's teleop panel."""
-RETRY: Final = 1.0
+ROBOT_RETRY: Final = 1.0
 """Seconds between two attempts to reach the robot, and in which it answers."""
 
 
@@ -124,9 +124,9 @@ class FoxgloveServer:
             ready()
             while True:
                 with suppress(TruckError):  # the page says what is wrong
-                    async with self._address.session("foxglove", self._clock, RETRY) as client:
+                    async with self._address.session("foxglove", self._clock, ROBOT_RETRY) as client:
                         await self._follow(client)
-                await self._clock.sleep(RETRY)
+                await self._clock.sleep(ROBOT_RETRY)
         finally:
             self._client = None
             self._remarks.tell()
@@ -142,7 +142,7 @@ class FoxgloveServer:
                     self._parameters = parameters(await client.call("config"))
                     self._server.publish_parameter_values(self._parameters)
                     break
-                await self._clock.sleep(RETRY)
+                await self._clock.sleep(ROBOT_RETRY)
             await asyncio.Event().wait()
         finally:
             self._client = None
@@ -199,7 +199,7 @@ class FoxgloveServer:
         answer = MessageSchema(encoding="json", schema=Schema(name="outcome", encoding="jsonschema", data=_OUTCOME))
 
         def handle(_: ServiceRequest) -> bytes:
-            return asyncio.run_coroutine_threadsafe(self._order(order), loop).result(ORDER_TIMEOUT + RETRY)
+            return asyncio.run_coroutine_threadsafe(self._order(order), loop).result(ORDER_TIMEOUT + ROBOT_RETRY)
 
         schema = ServiceSchema(name="monstertruckd/order", request=empty, response=answer)
         return Service(f"/{order.value}", schema=schema, handler=handle)

@@ -10,11 +10,11 @@ from typing import Any, Final
 
 from monstertruckd.station.users import network_of
 
-LONGEST: Final = 5.0
+HANDSHAKE_LIMIT: Final = 5.0
 """Seconds that a handshake may take."""
 MOST_OF_NETWORK: Final = 32
 """Connections of one network that are being set up; further connections are closed at once."""
-PAUSE: Final = 0.2
+DESCRIPTOR_PAUSE: Final = 0.2
 """Seconds before connections are taken again after there was no file descriptor for one."""
 
 
@@ -82,7 +82,7 @@ class WebListener:
                 taken, name = await loop.sock_accept(sock)
             except OSError as error:  # too many open files, or the other end is gone already
                 self._refused("?", f"a connection cannot be taken: {error.strerror or error}")
-                await asyncio.sleep(PAUSE)
+                await asyncio.sleep(DESCRIPTOR_PAUSE)
                 continue
             address = str(name[0])
             network = network_of(address)
@@ -94,7 +94,7 @@ class WebListener:
                 self._refused(address, f"{MOST_OF_NETWORK} connections of {network} are being set up: no further one")
 
     async def _greet(self, taken: socket.socket, address: str, network: str) -> None:
-        longest = None if self._tls is None else LONGEST
+        longest = None if self._tls is None else HANDSHAKE_LIMIT
         try:
             await asyncio.get_running_loop().connect_accepted_socket(
                 self._inside, taken, ssl=self._tls, ssl_handshake_timeout=longest

@@ -5,20 +5,20 @@ import logging
 from collections import Counter
 from typing import Final
 
-WINDOW: Final = 60.0
+COUNTING_WINDOW: Final = 60.0
 """Seconds over which lines are counted."""
 BURST: Final = 20
 """Lines of one address in that time; further ones are counted, and their number is reported at its end."""
 MOST_PEERS: Final = 32
 """Addresses that are distinguished in that time; all further ones share one count."""
 OTHERS: Final = "other addresses"
-LONGEST: Final = 300
+LONGEST_LINE: Final = 300
 """Characters of a line."""
 
 
 def printable(text: str) -> str:
     """One line that a terminal shows as it is: control characters are written as escapes."""
-    short = text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+    short = text if len(text) <= LONGEST_LINE else f"{text[:LONGEST_LINE]}..."
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in short)
 
 
@@ -43,7 +43,7 @@ class Remarks:
         if self._counts[known] <= BURST:
             self._log.log(level, "%s", printable(text))
         if self._timer is None:
-            self._timer = asyncio.get_running_loop().call_later(WINDOW, self.tell)
+            self._timer = asyncio.get_running_loop().call_later(COUNTING_WINDOW, self.tell)
 
     def tell(self) -> None:
         """Write how many lines were left out, and count again."""

@@ -11,7 +11,7 @@ from monstertruck_runtime.errors import InputError, TruckError
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
 from monstertruckd.station import frames
-from monstertruckd.station.feed import POSE, SHOWN, TICK, MapStore
+from monstertruckd.station.feed import FEED_PERIOD, POSE, SHOWN, MapStore
 from monstertruckd.station.frames import Frame
 from monstertruckd.station.viewer import Viewer, Viewers
 
@@ -185,7 +185,7 @@ class ReplayFeed:
         before = self._clock.now()
         due = 0
         while True:
-            await self._clock.sleep(TICK)
+            await self._clock.sleep(FEED_PERIOD)
             now = self._clock.now()
             if self._viewers and self._playing:
                 self._play(min(self._at + round((now - before) * self._rate), self._end))

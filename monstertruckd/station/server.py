@@ -48,7 +48,7 @@ MOST_REPLAYS: Final = 4
 """Recordings that are shown, and kept in memory, at once."""
 RECORDING: Final = re.compile(r"[A-Za-z0-9_.-]{1,120}\.mcap")
 TYPES: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
-LOOK: Final = 1.0
+CHECK_PERIOD: Final = 1.0
 """Seconds between two checks of robots that appeared, users that were revoked, and the number of connections."""
 END: Final = 5.0
 """Seconds that sessions with robots may take to close at the end."""
@@ -193,7 +193,7 @@ class Station:
             ready()
             while True:  # robots may come while others are followed, and users go
                 done, _ = await asyncio.wait(
-                    [*self._following.values(), *discovering], return_when=asyncio.FIRST_COMPLETED, timeout=LOOK
+                    [*self._following.values(), *discovering], return_when=asyncio.FIRST_COMPLETED, timeout=CHECK_PERIOD
                 )
                 for task in done:
                     if not task.cancelled():  # of a recording that was dropped
@@ -299,7 +299,7 @@ class Station:
 
     def application(self) -> web.Application:
         """All routes."""
-        application = web.Application(middlewares=[self._guard], client_max_size=commands.MOST_BYTES)
+        application = web.Application(middlewares=[self._guard], client_max_size=commands.LONGEST_MESSAGE)
         application.add_routes(
             [
                 web.get("/", self._index),
@@ -417,7 +417,7 @@ class Station:
         name, peer = browser.name, request.remote
         # 10.0: seconds between two pings of the WebSocket itself; a browser that does not answer for half of it is let
         # go
-        socket = web.WebSocketResponse(max_msg_size=commands.MOST_BYTES, heartbeat=10.0, compress=False)
+        socket = web.WebSocketResponse(max_msg_size=commands.LONGEST_MESSAGE, heartbeat=10.0, compress=False)
         await socket.prepare(request)
         self._remarks.add(peer, f"browser {name} connected from {peer}", logging.INFO)
         self._viewers.add(browser.viewer)

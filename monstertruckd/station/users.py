@@ -29,9 +29,9 @@ log = logging.getLogger(__name__)
 COST: Final = {"n": 2**14, "r": 8, "p": 1}
 """Parameters of scrypt: 16 MB and some 50 ms for each attempt."""
 LENGTH: Final = 32
-PAUSE: Final = 1.0
+WRONG_PASSWORD_PAUSE: Final = 1.0
 """Seconds that a wrong password costs, one attempt after the other."""
-MOST_WAITING: Final = 16
+MOST_ATTEMPTS: Final = 16
 """Attempts of one address that wait for their turn; further ones are wrong at once."""
 HASH: Final = re.compile(rf"[0-9a-f]{{{2 * LENGTH}}}:[0-9a-f]{{{2 * LENGTH}}}")
 NO_HASH: Final = ":".join(("00" * LENGTH,) * 2)
@@ -123,13 +123,13 @@ class StationUsers:
             name, password = credentials
             role, kept = self._rows.get(name, (AccessRole.OBSERVER, NO_HASH))
             user, network = StationUser(name, role, kept), network_of(address)
-            if self._turns.get(network, (None, 0))[1] >= MOST_WAITING:
+            if self._turns.get(network, (None, 0))[1] >= MOST_ATTEMPTS:
                 return None
             async with self._turn(network):
                 async with self._hashing:
                     right = await in_thread(lambda: _matches(password, kept))
                 if not right or not self.stands(user):
-                    await asyncio.sleep(PAUSE)
+                    await asyncio.sleep(WRONG_PASSWORD_PAUSE)
                     return None
             self._known[mark] = user
             while len(self._known) > 256:

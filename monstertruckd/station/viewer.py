@@ -8,7 +8,7 @@ from monstertruckd.station.frames import Frame
 
 Place = tuple[float, float]
 """Where a part of the map begins, m."""
-MOST_WAITING: Final = 256
+MOST_ANSWERS: Final = 256
 """Events and answers that wait; beyond that the oldest is lost."""
 MOST_TILES: Final = 400
 """Changed parts of the map that wait; beyond that the oldest is lost, until the whole map comes again."""
@@ -20,7 +20,7 @@ class Viewer:
     def __init__(self) -> None:
         self._newest: dict[str, Frame] = {}
         self._tiles: dict[Place, Frame] = {}
-        self._ordered: deque[Frame] = deque(maxlen=MOST_WAITING)
+        self._ordered: deque[Frame] = deque(maxlen=MOST_ANSWERS)
         self._news = asyncio.Event()
         self.lost = 0
         """Frames of the ordered queue that were dropped."""
@@ -40,7 +40,7 @@ class Viewer:
 
     def send(self, frame: Frame) -> None:
         """Send ``frame`` behind all that were given so."""
-        self.lost += len(self._ordered) == MOST_WAITING
+        self.lost += len(self._ordered) == MOST_ANSWERS
         self._ordered.append(frame)
         self._news.set()
 

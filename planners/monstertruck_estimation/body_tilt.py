@@ -14,7 +14,7 @@ from monstertruck_schemas.sensor import Attitude
 from monstertruck_schemas.state import Odometry
 
 GRAVITY: Final = 9.81
-KEPT: Final = 64
+KEPT_ODOMETRY: Final = 64
 """Readings of the odometry."""
 
 
@@ -35,7 +35,7 @@ class BodyAcceleration:
     # 0.06: seconds over which the odometry's acceleration is averaged, as the compass's accelerometer feels it
     def __init__(self, felt: float = 0.06) -> None:
         self._felt = round(felt * SECOND)
-        self._speeds: deque[tuple[int, float, float]] = deque(maxlen=KEPT)
+        self._speeds: deque[tuple[int, float, float]] = deque(maxlen=KEPT_ODOMETRY)
 
     def observe(self, odometry: Odometry) -> None:
         """Take a reading; older ones than the newest are passed over."""

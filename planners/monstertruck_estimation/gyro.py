@@ -9,7 +9,7 @@ from pydantic import Field
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Positive, Schema
 
-STILL: Final = 1e-4
+RESTING_DISTANCE: Final = 1e-4
 """Distance of the fastest shaft between two readings, m, up to which the robot stands."""
 
 
@@ -82,7 +82,7 @@ class Gyro:
             self._forget()
             return None
         mean, dt = math.fsum(found) / len(found), (stamp - since) / SECOND
-        if distance <= STILL:
+        if distance <= RESTING_DISTANCE:
             self._stand(mean, dt, stamp)
             return 0.0 if self.trusted else None
         self._rest, self._rested = [], 0.0
@@ -101,7 +101,7 @@ class Gyro:
 
         A bias that has changed at a rate d for the time T has turned the heading by d T^2 / 2.
         """
-        if distance <= STILL or self.bias is None:
+        if distance <= RESTING_DISTANCE or self.bias is None:
             return 0.0
         rested = (stamp - self._known) / SECOND
         return self._config.drift**2 * rested**3 * dt

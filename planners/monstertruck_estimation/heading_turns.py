@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 from monstertruck_estimation.transforms import wrap_angle
 
-LONGEST: Final = 3.0
+LONGEST_TURN: Final = 3.0
 """Distance within which it has to turn that much, m: a drift of the wheels over a long distance is no turn."""
 
 
@@ -73,7 +73,7 @@ class HeadingTurns:
         rows.append(_Row(self._turn, self._distance, self._heading, self._correction))
         # turn of the robot over which the headings are compared, rad: several times the error that iron nearby causes
         proof = 0.25
-        while self._distance - rows[0].distance > LONGEST or (
+        while self._distance - rows[0].distance > LONGEST_TURN or (
             len(rows) > 2 and abs(self._turn - rows[1].turn) >= proof
         ):
             rows.popleft()

@@ -1,7 +1,7 @@
 """What an inertial measurement unit gives the odometry: its yaw rate over level ground, and the body's tilt.
 
 The tilt is a complementary filter: the gyroscopes turn the vertical, the specific force draws it back (Mahony et al.
-2008, the direct form with one vector). The body's own acceleration averages out over ``SETTLE``.
+2008, the direct form with one vector). The body's own acceleration averages out over ``VERTICAL_TIME``.
 """
 
 import math
@@ -17,9 +17,9 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Imu, Vector3
 
-SETTLE: Final = 2.0
+VERTICAL_TIME: Final = 2.0
 """Time constant with which the vertical follows the specific force, s."""
-GAP: Final = 0.5
+LONGEST_SILENCE: Final = 0.5
 """Seconds without a measurement after which it starts again."""
 STEEPEST: Final = 0.7
 """Share of the vertical along the body's z axis below which it is no tilt of a robot that drives."""
@@ -43,18 +43,18 @@ class InertialTilt:
         felt = _scaled(force, 1.0 / strength) if abs(strength - GRAVITY) < 1.0 else None
         self._felt = self._felt if felt is None else stamp
         # 5.0: seconds without a plausible force after which the tilt is not known
-        if self._up is None or dt > GAP or stamp - self._felt > 5.0 * SECOND:
+        if self._up is None or dt > LONGEST_SILENCE or stamp - self._felt > 5.0 * SECOND:
             up = felt
         else:
             up = added(self._up, _scaled(_cross(self._up, rate), dt))
             if felt is not None:
-                up = added(_scaled(up, 1.0 - dt / SETTLE), _scaled(felt, dt / SETTLE))
+                up = added(_scaled(up, 1.0 - dt / VERTICAL_TIME), _scaled(felt, dt / VERTICAL_TIME))
         self._up = None if up is None else _scaled(up, 1.0 / math.hypot(*up))
         self._stamp = stamp
 
     def tilt(self, now: int) -> Tilt | None:
         """Of the body at ``now``, ns; None where it is not known."""
-        if self._up is None or self._up[2] < STEEPEST or now - self._stamp > GAP * SECOND:
+        if self._up is None or self._up[2] < STEEPEST or now - self._stamp > LONGEST_SILENCE * SECOND:
             return None
         x, y, z = self._up
         return Tilt(math.atan2(y, z), -math.asin(x))

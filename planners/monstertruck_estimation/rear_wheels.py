@@ -42,7 +42,7 @@ WAITING: Final = 32
 """Readings queued at most."""
 LATE: Final = SECOND // 5
 """Interval between two readings from which on one is missing, ns."""
-KEPT: Final = 256
+KEPT_READINGS: Final = 256
 """Readings, and poses, that are kept."""
 STANDS: Final = 0.2
 """Share of the expected distance below which a wheel stands still."""
@@ -170,7 +170,7 @@ class Encoders:
         self.config = config
         self.verdict = EncoderVerdict()
         self._chassis = chassis
-        self._rolled: deque[tuple[int, Pair]] = deque(maxlen=KEPT)
+        self._rolled: deque[tuple[int, Pair]] = deque(maxlen=KEPT_READINGS)
         """(ns, positions in m)."""
         self._compared: deque[Compared] = deque()
         self._since: int | None = None
@@ -280,9 +280,9 @@ class RearWheelReckoning(DeadReckoning):
         self.encoders = Encoders(config.encoders, chassis)
         self._tricycle = chassis
         self._front = 0.0
-        self._increments: deque[EncoderIncrement] = deque(maxlen=KEPT)
-        self._rolls: deque[WheelIncrement] = deque(maxlen=KEPT)
-        self._kept: deque[tuple[int, Pose2, PlanarCovariance]] = deque(maxlen=KEPT)
+        self._increments: deque[EncoderIncrement] = deque(maxlen=KEPT_READINGS)
+        self._rolls: deque[WheelIncrement] = deque(maxlen=KEPT_READINGS)
+        self._kept: deque[tuple[int, Pose2, PlanarCovariance]] = deque(maxlen=KEPT_READINGS)
         """(ns, pose, covariance) before each motion."""
         self._at: int | None = None
         """Instant of the pose, ns."""

@@ -18,7 +18,7 @@ from monstertruck_runtime.ports import Publisher
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
 from monstertruck_schemas.state import Odometry
 
-UNKNOWN: Final = math.pi / 2
+NO_TILT: Final = math.pi / 2
 """Tilt of a scan whose mount or body angles are unknown, so that it is not used."""
 
 Angles = tuple[float, float]
@@ -133,5 +133,5 @@ class TiltStamper:
     def put(self, message: LaserScan) -> None:
         """Publish a scan with the tilt its plane had in its middle."""
         angles = self._angles.at(message)
-        unknown = UNKNOWN if self._angles.jointed else None
+        unknown = NO_TILT if self._angles.jointed else None
         self._out.put(message.model_copy(update={"tilt": unknown if angles is None else plane_tilt(*angles)}))

@@ -455,10 +455,10 @@ def _ignore_second_interrupt() -> None:
     signal.signal(signal.SIGINT, interrupt)
 
 
-AHEAD: Final = 4 * MILLISECOND
+BEFORE_GATE: Final = 4 * MILLISECOND
 """So long before the gate's ticks the instants of the others lie: its newest input is fresh then, and the loop free."""
 
-ESTIMATES: Final = AHEAD + MILLISECOND
+ESTIMATES: Final = BEFORE_GATE + MILLISECOND
 """Lead of services whose estimates the others use, ns."""
 
 POLLING: Final = ESTIMATES + 3 * MILLISECOND
@@ -481,7 +481,7 @@ class Schedule:
         ahead: of the multiples of the period, ns; negative: behind them.
     """
 
-    def __init__(self, clock: Clock, rate: float, ahead: int = AHEAD) -> None:
+    def __init__(self, clock: Clock, rate: float, ahead: int = BEFORE_GATE) -> None:
         self._clock = clock
         self._period = round(SECOND / rate)
         self._ahead = ahead

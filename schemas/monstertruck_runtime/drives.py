@@ -35,7 +35,7 @@ from monstertruck_schemas.topics import EVENT, GOAL, PATH, TRACKER, Topic
 S = TypeVar("S", GoalState, ExplorationState, MissionState, BehaviourState)
 E = TypeVar("E")
 
-LOOK: Final = 0.5
+STAND_LOOK_PERIOD: Final = 0.5
 """Half the period of reports why the truck stands, s."""
 PLANNER_START: Final = 240.0
 """Seconds that a planner may take to start."""
@@ -192,7 +192,7 @@ async def _taken_on(
             if refused.refusal is not Reason.PLANNER_STARTING or waited > PLANNER_START:
                 raise
             report.waiting(str(refused), waited / PLANNER_START)
-        await clock.sleep(LOOK)
+        await clock.sleep(STAND_LOOK_PERIOD)
 
 
 @asynccontextmanager
@@ -372,7 +372,7 @@ async def _disarmed(clock: Clock, stand: StandstillMonitor) -> Arrival:
     """The end of a path that is over once the robot is disarmed."""
     begin = clock.now()
     while (state := stand.gate.latest) is None or state.mode.active:
-        await clock.sleep(LOOK)
+        await clock.sleep(STAND_LOOK_PERIOD)
     return Arrival(state.worst, f"disarmed on the way: {state.why}", 0.0, (clock.now() - begin) / SECOND)
 
 
@@ -465,7 +465,7 @@ async def reported(stand: StandstillMonitor, clock: Clock | None, report: DriveR
 async def _say_why_it_stands(stand: StandstillMonitor, clock: Clock, report: DriveReport) -> None:
     said: set[str] = set()  # what is stale comes and goes while it stands
     while True:
-        await clock.sleep(2 * LOOK)
+        await clock.sleep(2 * STAND_LOOK_PERIOD)
         why, state = stand.why(), stand.gate.latest
         if not why or state is None:
             said.clear()

@@ -10,7 +10,7 @@ from PIL import GifImagePlugin, Image, ImageChops
 
 from monstertruck_runtime.small_files import whole_file
 
-LONGEST: Final = 65_535
+LONGEST_FRAME: Final = 65_535
 """Hundredths of a second for which a picture can stand (GIF89a, 23: 16 bits)."""
 
 
@@ -62,7 +62,7 @@ class MovingPicture:
             box = ImageChops.difference(picture.convert("RGB"), self._newest.convert("RGB")).getbbox()
             assert self._waiting is not None
             before, where, duration = self._waiting
-            if box is None and duration + self._shown <= LONGEST:
+            if box is None and duration + self._shown <= LONGEST_FRAME:
                 self._waiting = before, where, duration + self._shown
                 return
             box = box or (0, 0, 1, 1)
@@ -79,7 +79,7 @@ class MovingPicture:
         with self._made:
             if self._waiting is not None:
                 part, place, duration = self._waiting
-                self._waiting = part, place, min(duration - self._shown + self._rest, LONGEST)
+                self._waiting = part, place, min(duration - self._shown + self._rest, LONGEST_FRAME)
                 self._write()
             if self._out is not None:
                 self._out.write(b";")

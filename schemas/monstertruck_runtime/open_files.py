@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 PROC: Final = Path("/proc")
-LONGEST: Final = 160
+SHOWN_COMMAND: Final = 160
 """Characters of a command line that are shown."""
 
 
@@ -40,4 +40,4 @@ def _command_line(folder: Path) -> str:
         words = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:
         return "ended"
-    return " ".join(words).strip()[:LONGEST]
+    return " ".join(words).strip()[:SHOWN_COMMAND]

@@ -31,7 +31,7 @@ MOST_PIXELS: Final = 25 * MEGABYTE
 """Pixels of a picture: 250 m x 250 m in cells of 5 cm."""
 FORMATS: Final = ("PNG", "PPM", "BMP", "JPEG", "TIFF", "GIF", "WEBP")
 """Formats of pictures that are read; Pillow decodes others by starting programs."""
-LONGEST: Final = 200
+QUOTED: Final = 200
 """Characters of a library's message that a refusal repeats."""
 
 
@@ -64,7 +64,7 @@ def cause_of(error: BaseException) -> str:
         return "it needs more memory than there is"
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
-    text = " ".join(str(error).split())[:LONGEST]
+    text = " ".join(str(error).split())[:QUOTED]
     if text and isinstance(error, ValueError | OSError):
         return text
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

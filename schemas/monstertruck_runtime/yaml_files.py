@@ -13,7 +13,7 @@ from ruamel.yaml.events import AliasEvent
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.outside import reading, text_of
 
-MOST_BYTES: Final = 1_000_000
+LARGEST_YAML: Final = 1_000_000
 """Size of one file at most: they are written by hand, or give the origin of a map."""
 DEEPEST: Final = 50
 """Nesting of lists and mappings, at most."""
@@ -68,7 +68,7 @@ def read_yaml(path: Path) -> Any:
     Raises:
         InputError: it cannot be read, is not YAML, or is too long or nested too deeply.
     """
-    text = text_of(path, _EXPECTED, MOST_BYTES)
+    text = text_of(path, _EXPECTED, LARGEST_YAML)
     with reading(path, _EXPECTED):
         try:
             return bounded_yaml().load(text)

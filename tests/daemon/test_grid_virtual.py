@@ -4,7 +4,15 @@ from collections import defaultdict
 
 import pytest
 
-from monstertruck_runtime.clock import AHEAD, ESTIMATES, IN_THREADS, MILLISECOND, POLLING, VirtualClock, run_virtual
+from monstertruck_runtime.clock import (
+    BEFORE_GATE,
+    ESTIMATES,
+    IN_THREADS,
+    MILLISECOND,
+    POLLING,
+    VirtualClock,
+    run_virtual,
+)
 from monstertruck_schemas import topics
 from monstertruckd.bus.outgoing import BEHIND
 from monstertruckd.config.load import load_config
@@ -16,8 +24,8 @@ pytestmark = [pytest.mark.virtual, pytest.mark.timeout(60)]
 
 PLACES = {
     topics.ODOMETRY: (50, ESTIMATES),
-    topics.TRACKER: (20, AHEAD),
-    topics.TRANSFORMS: (10, AHEAD),
+    topics.TRACKER: (20, BEFORE_GATE),
+    topics.TRANSFORMS: (10, BEFORE_GATE),
     topics.CMD_STEERING: (50, 0),
     topics.LINK: (2, IN_THREADS),
     topics.HOST: (1, IN_THREADS),

@@ -13,7 +13,7 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-PERIOD: Final = 0.05
+CONVERSION_PERIOD: Final = 0.05
 """Seconds between two conversions."""
 FOLDER: Final = "iio:device0"
 COUNTS: Final = "counts"
@@ -82,7 +82,7 @@ class IioEmulator:
         while True:
             if self.plugged:
                 self.convert()
-            await self._clock.sleep(PERIOD)
+            await self._clock.sleep(CONVERSION_PERIOD)
 
     def convert(self) -> None:
         """One conversion becomes readable, at once and whole."""

@@ -15,7 +15,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback
 
-WINDOW: Final = 5
+MEDIAN_WINDOW: Final = 5
 """Samples of the median: shorter spikes and connector bounces do not count."""
 GAP: Final = SECOND
 """Nanoseconds without a sample after which nothing counts as continuous any more."""
@@ -60,7 +60,7 @@ class BatteryJudge:
 
     def _reset(self) -> None:
         config = self._config
-        self._samples: deque[tuple[float, float]] = deque(maxlen=WINDOW)
+        self._samples: deque[tuple[float, float]] = deque(maxlen=MEDIAN_WINDOW)
         self._smooth: tuple[float, float] | None = None
         self._low = Dwell(config.low_after)
         self._critical = Dwell(config.critical_after)
@@ -85,7 +85,7 @@ class BatteryJudge:
         volts = -math.inf if math.isnan(voltage) else voltage
         sag = min(abs(current or 0.0) * self._config.resistance, self._config.max_compensation)
         self._samples.append((volts, volts + sag))
-        if len(self._samples) < WINDOW:
+        if len(self._samples) < MEDIAN_WINDOW:
             return BatteryVerdict(self._level)
         loaded, rest = (statistics.median(column) for column in zip(*self._samples, strict=True))
         if not self._config.plausible_min <= loaded <= self._config.plausible_max:

@@ -8,7 +8,7 @@ from monstertruck_drivers.host_health.readings import FIRMWARE_THROTTLED
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
-PERIOD: Final = 0.5
+WRITE_PERIOD: Final = 0.5
 """Seconds between two writes."""
 CORES: Final = 4
 
@@ -43,8 +43,8 @@ class HostEmulator:
     async def run(self) -> None:
         """Let time pass until cancelled."""
         while True:
-            await self._clock.sleep(PERIOD)
-            ticks = round(100 * CORES * PERIOD)  # processor ticks a second and core
+            await self._clock.sleep(WRITE_PERIOD)
+            ticks = round(100 * CORES * WRITE_PERIOD)  # processor ticks a second and core
             self._ticks += ticks
             self._busy_ticks += round(ticks * self._busy)
             self.write()

@@ -8,7 +8,7 @@ from monstertruck_drivers.emulation import EmulatorSetup, FileTree
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
-PERIOD: Final = 0.5
+SIGNAL_PERIOD: Final = 0.5
 """Seconds between two changes of the signal."""
 HEADER: Final = (
     "Inter-| sta-|   Quality        |   Discarded packets               | Missed | WE\n"
@@ -46,8 +46,8 @@ class NetworkEmulator:
     async def run(self) -> None:
         """Follow the signal until cancelled."""
         while True:
-            await self._clock.sleep(PERIOD)
-            self._bytes += round(ON_AIR * PERIOD)
+            await self._clock.sleep(SIGNAL_PERIOD)
+            self._bytes += round(ON_AIR * SIGNAL_PERIOD)
             self.write()
 
     def write(self) -> None:

@@ -16,7 +16,7 @@ from monstertruck_drivers.webcam.source import SET_FORMAT, CameraFrame, Mode, de
 from monstertruck_runtime.errors import DeviceError, DeviceLostError, DeviceMismatchError
 from monstertruck_runtime.threads import Offload, in_daemon_thread
 
-PATIENCE: Final = 2.0
+CAMERA_STOP_LIMIT: Final = 2.0
 """Longest wait for the camera to stop at the end of a session (s)."""
 
 
@@ -194,7 +194,7 @@ class V4l2Stream:
         self._loop.remove_reader(self._camera.fd)
         stopping = asyncio.ensure_future(self._offload(self._camera.stop))
         try:
-            await asyncio.wait([stopping], timeout=PATIENCE)
+            await asyncio.wait([stopping], timeout=CAMERA_STOP_LIMIT)
         finally:
             stopping.cancel()
 

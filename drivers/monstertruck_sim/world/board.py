@@ -12,7 +12,7 @@ from monstertruck_sim.world.camera import CameraPlace, FlatPanel, opencv
 from monstertruck_sim.world.config import HeldBoard
 from monstertruck_sim.world.noise import BOARD, generator
 
-CELL: int = 40
+SQUARE_PIXELS: int = 40
 """Pixels of a board's square in its texture."""
 ASIDE: float = 0.5
 """Greatest distance of the board's middle from the camera's axis, as a share of half the picture's width."""
@@ -89,7 +89,7 @@ def panel_ranges(panel: FlatPanel, origin: Array, directions: Array) -> Array:
 
 @cache
 def board_texture(columns: int, rows: int, square: float, marker: float) -> NDArray[np.uint8]:
-    """The print, ``CELL`` pixels a square.
+    """The print, ``SQUARE_PIXELS`` pixels a square.
 
     Raises:
         NotInstalledError: the extra ``vision`` is not there.
@@ -97,5 +97,5 @@ def board_texture(columns: int, rows: int, square: float, marker: float) -> NDAr
     cv2 = opencv("sim.world.board")
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     board = cv2.aruco.CharucoBoard((columns, rows), square, marker, family)
-    drawn = board.generateImage((columns * CELL, rows * CELL), marginSize=0)
+    drawn = board.generateImage((columns * SQUARE_PIXELS, rows * SQUARE_PIXELS), marginSize=0)
     return np.asarray(drawn, dtype=np.uint8)

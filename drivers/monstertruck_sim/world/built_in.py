@@ -17,7 +17,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap, save_map
 from monstertruck_sim.world.terrain import Profile, profile_path, save_profile
 
-RESOLUTION = 0.025
+DRAWN_RESOLUTION = 0.025
 """m per cell."""
 _WALL = 0.1
 
@@ -52,9 +52,9 @@ class _Canvas:
 
     def __init__(self, x: tuple[float, float], y: tuple[float, float]) -> None:
         self._origin = (x[0], y[0])
-        columns, rows = round((x[1] - x[0]) / RESOLUTION), round((y[1] - y[0]) / RESOLUTION)
-        self.xs = x[0] + (np.arange(columns) + 0.5) * RESOLUTION
-        self.ys = (y[0] + (np.arange(rows) + 0.5) * RESOLUTION)[:, None]
+        columns, rows = round((x[1] - x[0]) / DRAWN_RESOLUTION), round((y[1] - y[0]) / DRAWN_RESOLUTION)
+        self.xs = x[0] + (np.arange(columns) + 0.5) * DRAWN_RESOLUTION
+        self.ys = (y[0] + (np.arange(rows) + 0.5) * DRAWN_RESOLUTION)[:, None]
         self.free = np.zeros((rows, columns), dtype=np.bool_)
 
     def rectangle(self, x0: float, y0: float, x1: float, y1: float) -> NDArray[np.bool_]:
@@ -66,11 +66,11 @@ class _Canvas:
         return inside
 
     def map(self) -> WorldMap:
-        skin = _widened(self.free, round(_WALL / RESOLUTION)) & ~self.free
+        skin = _widened(self.free, round(_WALL / DRAWN_RESOLUTION)) & ~self.free
         cells = np.full(self.free.shape, UNKNOWN, dtype=np.int8)
         cells[self.free] = FREE
         cells[skin] = OCCUPIED
-        return WorldMap(cells, RESOLUTION, self._origin)
+        return WorldMap(cells, DRAWN_RESOLUTION, self._origin)
 
 
 def loop() -> BuiltIn:

@@ -9,7 +9,7 @@ LIDAR, CURRENT, COMPASS, COMPASS_FIXED, SLIP, ANALOG, SONAR, IMU, IMU_FIXED, SKI
 
 PEOPLE = 100
 """Stream of the people in a world."""
-GROUND = 101
+GROUND_STREAM = 101
 """Stream of its ground."""
 
 _BLOCK = 512

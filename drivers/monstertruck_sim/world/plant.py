@@ -16,7 +16,7 @@ from monstertruck_sim.world.actuators import RPM, Servo, Shaft
 from monstertruck_sim.world.battery import BatteryModel
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
 
-GRAVITY = 9.81
+PLANT_GRAVITY = 9.81
 
 Xyz = tuple[float, float, float]
 

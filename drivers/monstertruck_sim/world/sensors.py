@@ -40,21 +40,21 @@ from monstertruck_sim.world.noise import (
     WhiteNoise,
     generator,
 )
-from monstertruck_sim.world.plant import GRAVITY, Caster, Plant, Xyz
+from monstertruck_sim.world.plant import PLANT_GRAVITY, Caster, Plant, Xyz
 from monstertruck_sim.world.terrain import Terrain
 
 URG_SHEET = RangeSheet(0.02, 5.6, 0.01, 0.01)
 """URG-04LX: 10 mm to 1 m, 1 % beyond."""
-STEPS = 769
+SWEEP_STEPS = 769
 SWEEP_NS = 100_000_000
 NO_RETURN, TOO_NEAR, FAILED = 0, 6, 19
 """Error codes of the scanner: nothing there; other error (never "free"); step cannot be measured."""
-BEAM_ANGLES = (np.arange(STEPS) - 384) * (2 * pi / 1024)
-_BEAM_DELAYS = (np.arange(STEPS) * (SWEEP_NS // 1024)).astype(np.int64)
+BEAM_ANGLES = (np.arange(SWEEP_STEPS) - 384) * (2 * pi / 1024)
+_BEAM_DELAYS = (np.arange(SWEEP_STEPS) * (SWEEP_NS // 1024)).astype(np.int64)
 
 Beams = tuple[Array, Array, Array]
 """Directions: components x, y, z, each (n,)."""
-LEVEL_BEAMS: Beams = np.cos(BEAM_ANGLES), np.sin(BEAM_ANGLES), np.zeros(STEPS)
+LEVEL_BEAMS: Beams = np.cos(BEAM_ANGLES), np.sin(BEAM_ANGLES), np.zeros(SWEEP_STEPS)
 
 
 class Sweep(Protocol):
@@ -188,7 +188,7 @@ class SimulatedLidar:
         self.board_at: Callable[[int], FlatPanel | None] = lambda _: None
         """What somebody holds before the robot."""
         self._plant, self._sweep, self._config, self._seed = plant, sweep, config, seed
-        self._lost = (np.arange(STEPS) < config.first_step) | (np.arange(STEPS) > config.last_step)
+        self._lost = (np.arange(SWEEP_STEPS) < config.first_step) | (np.arange(SWEEP_STEPS) > config.last_step)
         """Steps that never measure."""
         self._mounted = _mounted(config, LEVEL_BEAMS)
 
@@ -250,8 +250,8 @@ class SimulatedLidar:
         lost = self._lost
         if self._seed is not None:
             noise = generator(self._seed, LIDAR, self._plant.slot(time_ns, SWEEP_NS // 2))
-            ranges = ranges + self._sigma(ranges, sheet) * noise.standard_normal(STEPS)
-            lost = self._lost | (noise.random(STEPS) < self._config.dropout)
+            ranges = ranges + self._sigma(ranges, sheet) * noise.standard_normal(SWEEP_STEPS)
+            lost = self._lost | (noise.random(SWEEP_STEPS) < self._config.dropout)
         seen = ranges <= sheet.greatest
         millimetres: NDArray[np.int32] = np.rint(np.where(seen, ranges, 0.0) * 1000).astype(np.int32)
         millimetres[seen & (ranges < sheet.least)] = TOO_NEAR
@@ -358,7 +358,7 @@ class SimulatedCompass:
         level = (config.horizontal_field * cos(heading), config.horizontal_field * sin(heading), config.vertical_field)
         field = self._distorted(_to_body(level, pitch, roll))
         forward, left, up = self._plant.acceleration
-        force = _to_body((forward / GRAVITY, left / GRAVITY, 1.0 + up / GRAVITY), pitch, roll)
+        force = _to_body((forward / PLANT_GRAVITY, left / PLANT_GRAVITY, 1.0 + up / PLANT_GRAVITY), pitch, roll)
         x, y, _ = turned(field, pitch, roll)
         pitch, roll = atan2(-force[0], hypot(force[1], force[2])), atan2(force[1], force[2])
         pitch, roll = pitch + self._bias[0] + noise[1], roll + self._bias[1] + noise[2]
@@ -403,7 +403,7 @@ class SimulatedImu:
         config, (pitch, roll), (forward, left, up) = self._config, self._plant.attitude, self._plant.acceleration
         x, y, z = _to_body(self._plant.rates, pitch, roll)
         rates = x, y, z * config.rate_scale
-        forces = _to_body((forward, left, GRAVITY + up), pitch, roll)
+        forces = _to_body((forward, left, PLANT_GRAVITY + up), pitch, roll)
         noise = [0.0] * 6
         if self._noise is not None:
             noise = self._noise.at(self._plant.slot(time_ns, 1_000_000))

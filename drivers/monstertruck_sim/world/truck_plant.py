@@ -17,7 +17,7 @@ from monstertruck_kinematics.truck import LinkedAxles
 from monstertruck_sim.world.actuators import RPM, Shaft
 from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
 from monstertruck_sim.world.noise import SLIP, SlowNoise
-from monstertruck_sim.world.plant import GRAVITY, Plant, Xyz
+from monstertruck_sim.world.plant import PLANT_GRAVITY, Plant, Xyz
 from monstertruck_sim.world.skid import SkidEffects
 
 STEP_NS = 5_000_000
@@ -58,7 +58,7 @@ class TruckPlant(Plant):
         count = len(self.shafts)
         self._mass = config.mass / count
         """Share of every driven shaft, kg."""
-        self._weight = self._mass * GRAVITY
+        self._weight = self._mass * PLANT_GRAVITY
         self._rolling = config.rolling_resistance * self._weight
         self._quiet = [0.0] * (2 + count)
         self._steering = _Steering(self._chassis)
@@ -134,7 +134,7 @@ class TruckPlant(Plant):
         lateral = 0.0
         if self._tyres is None:
             vx, _, wz = self._twist
-            lateral = (vx * wz + GRAVITY * sin(self._attitude[1])) * copysign(1.0, wheels[0])
+            lateral = (vx * wz + PLANT_GRAVITY * sin(self._attitude[1])) * copysign(1.0, wheels[0])
         front_slip = config.front_slip_angle * lateral - config.slip_angle_noise * front_noise
         rear_slip = config.rear_slip_angle * lateral - config.slip_angle_noise * rear_noise
         half = len(steering.angles) // 2

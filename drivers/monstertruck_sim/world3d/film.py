@@ -14,9 +14,9 @@ from monstertruck_sim.world.world import World
 from monstertruck_sim.world3d.picture import WorldRenderer, looking_at, standing
 from monstertruck_sim.world3d.plant import RigidPlant
 
-RATE: Final = 8
+FRAME_RATE: Final = 8
 """Frames a second."""
-SIZE: Final = (480, 320)
+FILM_SIZE: Final = (480, 320)
 """Pixels."""
 _BEHIND, _ASIDE, _ABOVE = 1.25, 0.7, 0.95
 """Place of the camera from the robot, m; it swings round behind a robot that turns."""
@@ -44,9 +44,9 @@ class Film:
         if not isinstance(world.plant, RigidPlant):
             raise InputError(f"{file}: only sim.world.engine mujoco can be filmed")
         self._world, self._clock, self._plant = world, clock, world.plant
-        self._renderer = WorldRenderer(world.plant.model, *SIZE)
+        self._renderer = WorldRenderer(world.plant.model, *FILM_SIZE)
         self._heading = world.plant.pose[2]
-        self._pictures = MovingPicture(file, 1 / RATE)
+        self._pictures = MovingPicture(file, 1 / FRAME_RATE)
 
     async def run(self) -> None:
         """Take frames until cancelled.
@@ -57,7 +57,7 @@ class Film:
         due = self._clock.now()
         while True:
             self.take()
-            due += SECOND // RATE
+            due += SECOND // FRAME_RATE
             await self._clock.sleep_until(due)
 
     def take(self) -> None:

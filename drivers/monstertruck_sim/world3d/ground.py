@@ -22,7 +22,7 @@ from monstertruck_sim.world.config import (
     UprightStep,
     WorldConfig,
 )
-from monstertruck_sim.world.noise import GROUND, generator
+from monstertruck_sim.world.noise import GROUND_STREAM, generator
 from monstertruck_sim.world.terrain import LEVEL, Profile, Terrain
 from monstertruck_sim.world3d.heights import HeightGrid
 from monstertruck_sim.world3d.model import Block
@@ -80,7 +80,7 @@ def _height(feature: GroundFeature, x: Array, y: Array, starts: Sequence[Pose2])
 
 def _hills(feature: Hills, x: Array, y: Array, starts: Sequence[Pose2]) -> Array:
     """White noise without waves shorter than ``wavelength``, level around the starts."""
-    noise = generator(feature.seed, GROUND).standard_normal(x.shape)
+    noise = generator(feature.seed, GROUND_STREAM).standard_normal(x.shape)
     spectrum = np.fft.rfft2(noise)
     fy, fx = np.fft.fftfreq(x.shape[0], HEIGHT_STEP), np.fft.rfftfreq(x.shape[1], HEIGHT_STEP)
     short = np.hypot(fy[:, None], fx) * feature.wavelength
@@ -107,7 +107,7 @@ def blocks(features: Sequence[GroundFeature], heights: HeightGrid | None) -> tup
                 _standing(heights, feature.x, feature.y, (feature.length, feature.width, feature.height), feature.yaw)
             )
         elif isinstance(feature, Rubble):
-            rng = generator(feature.seed, GROUND, 1)
+            rng = generator(feature.seed, GROUND_STREAM, 1)
             for _ in range(feature.count):
                 x = feature.x + float(rng.uniform(-0.5, 0.5)) * feature.length
                 y = feature.y + float(rng.uniform(-0.5, 0.5)) * feature.width

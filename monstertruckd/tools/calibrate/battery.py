@@ -23,7 +23,7 @@ from monstertruckd.tools.calibrate.wizard import WizardContext
 
 METER: Final = Number("meter", "Voltage of the pack at its plug by the multimeter, V", 5.0, 70.0)
 ANOTHER: Final = Confirm("another", "Take another reading now, with the pack at another voltage?", fact=True)
-GROUND: Final = 0.1
+EARTHING: Final = 0.1
 """Greatest offset, V: 10 mV along the ground wire, times the divider."""
 EVEN: Final = math.sqrt(3)
 """Greatest error over standard deviation where all errors up to the greatest are as likely."""
@@ -107,10 +107,10 @@ class BatteryWizard:
     def _result(self, readings: list[MeterReading], keys: tuple[str, str]) -> Result:
         volts = [reading.volts for reading in readings]
         gain, offset = self.scale(readings)
-        observed = offset.half < 0.9 * GROUND
+        observed = offset.half < 0.9 * EARTHING
         bounds = (
             f"pack volts; 95 % of the meter's {self.meter_share:.1%} and {self.meter_digits:g} V, the input's "
-            f"rounding, and at most {GROUND:g} V along the ground wire"
+            f"rounding, and at most {EARTHING:g} V along the ground wire"
         )
         estimates = tuple(
             estimated(name, found, unit, len(readings), f"{what} {bounds}", key)
@@ -146,7 +146,7 @@ class BatteryWizard:
         rows = np.vstack(
             (
                 np.column_stack((raw, np.ones_like(raw), volts)) / sigma[:, None],
-                (0.0, EVEN / GROUND, 0.0),
+                (0.0, EVEN / EARTHING, 0.0),
                 (0.0, 0.0, EVEN / share),
             )
         )
@@ -154,7 +154,7 @@ class BatteryWizard:
         gain, offset, _ = errors @ rows.T @ np.concatenate((volts / sigma, (0.0, 0.0)))
         halves = NORMAL * np.sqrt(np.diag(errors))
         # No offset is beyond the ground wire's; the gain follows it, so that both fit the readings.
-        low, high = np.clip((offset - halves[1], offset + halves[1]), -GROUND, GROUND).tolist()
+        low, high = np.clip((offset - halves[1], offset + halves[1]), -EARTHING, EARTHING).tolist()
         within = Interval((low + high) / 2, (high - low) / 2)
         gain += errors[0, 1] / errors[1, 1] * (within.value - offset)
         return Interval(float(gain), float(halves[0])), within
@@ -162,7 +162,7 @@ class BatteryWizard:
     def _check(self, raw: Array, volts: Array, noise: Array) -> None:
         """Raise where no gain and offset explain all readings: each leaves a range of gains for an offset."""
         bounds = self.meter_share * volts + self.meter_digits + noise
-        offsets = np.linspace(-GROUND, GROUND, 201)[:, None]
+        offsets = np.linspace(-EARTHING, EARTHING, 201)[:, None]
         low, high = (volts - bounds - offsets) / raw, (volts + bounds - offsets) / raw
         if not (low.max(axis=1) <= high.min(axis=1)).any():
             raise InputError(

@@ -230,7 +230,7 @@ def _sign(inverted: bool) -> Estimate:
 
 
 Part = Literal["start", "stop"]
-LEAST: Final = 8
+LEAST_POSITIONS: Final = 8
 """Positions of a motor from rest to half the distance, or from there to rest, that dead time and lag have to rest
 on."""
 
@@ -255,7 +255,7 @@ class HalfRun:
         positions = np.array([reading.position for reading in record.drive])
         first = np.abs(positions - positions[0]) <= np.abs(positions - positions[-1])
         kept = first if part == "start" else ~first
-        if int(kept.sum()) < LEAST:
+        if int(kept.sum()) < LEAST_POSITIONS:
             return None
         sent = np.array([(command.stamp / SECOND, command.motor_velocity) for command in record.drive_commands])
         return cls(Steps.of(sent[:, 0], sent[:, 1]), times[kept], positions[kept])
@@ -279,7 +279,7 @@ def drive_response(records: Iterable[MoveRecord], part: Part, cycle: float) -> R
     """
     seen = [half for record in records if (half := HalfRun.of(record, part)) is not None]
     if not seen:
-        raise InputError(f"{part}: no run with {LEAST} readings of the drive and the gate's commands")
+        raise InputError(f"{part}: no run with {LEAST_POSITIONS} readings of the drive and the gate's commands")
 
     def residuals(delay: float, squared: float) -> Array:
         return np.concatenate([half.residuals(delay, squared) for half in seen])

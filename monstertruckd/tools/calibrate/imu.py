@@ -21,7 +21,7 @@ from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = "2 m x 2 m, level"
-GRAVITY: Final = 9.80665
+ONE_G: Final = 9.80665
 """m/s^2."""
 TILT: Final = math.radians(0.2)
 """Standard deviation of the compass's own tilt, rad (its data sheet: 0.5 degrees at most), and with it of where gravity
@@ -133,9 +133,9 @@ def result_of(
     forces = np.array([(r.linear_acceleration.x, r.linear_acceleration.y) for r in resting])
     forces += np.array((before["force_x"], before["force_y"]))
     pitch, roll = (float(np.mean([getattr(a, name) for a in tilt])) for name in ("pitch", "roll"))
-    gravity = -GRAVITY * math.sin(pitch), GRAVITY * math.cos(pitch) * math.sin(roll)
+    gravity = -ONE_G * math.sin(pitch), ONE_G * math.cos(pitch) * math.sin(roll)
     biases = {f"rate_{axis}": _mean(rates[:, i]) for i, axis in enumerate("xyz")}
-    shifted = (_mean(forces[:, i] - down).joined(NORMAL * GRAVITY * TILT) for i, down in enumerate(gravity))
+    shifted = (_mean(forces[:, i] - down).joined(NORMAL * ONE_G * TILT) for i, down in enumerate(gravity))
     biases |= dict(zip(("force_x", "force_y"), shifted, strict=True))
     estimates = [
         estimated(

@@ -52,7 +52,7 @@ SCAN: Final = 0.002
 """Least standard deviation of a registered position, m: walls are not straight to less."""
 CRAB: Final = 0.005
 """Standard deviation of the direction of travel on one leg, by tyres, rad."""
-DRIFT: Final = 0.006
+LEG_DRIFT: Final = 0.006
 """Standard deviation of the distance of one leg, by slip, as a share."""
 CENTRE: Final = 0.002
 """m: how far the turning centre of all arcs may be ahead or behind by tyres that slip outward."""
@@ -290,7 +290,7 @@ def fit_mount(legs: Sequence[LidarLeg], mount: tuple[float, float, float], crab:
     """Least squares of the lidar's translations; parameters x, y (m), yaw (rad), scale of the distances, crab (rad)."""
     distances, seen = np.array([leg.distance for leg in legs]), np.array([leg.seen for leg in legs])
     travels = np.array([leg.travel for leg in legs])
-    sigmas = np.array([math.hypot(leg.sigma, DRIFT * leg.distance, CRAB * leg.distance) for leg in legs])
+    sigmas = np.array([math.hypot(leg.sigma, LEG_DRIFT * leg.distance, CRAB * leg.distance) for leg in legs])
     start = np.array((*mount, 1.0, 0.0))
     reach = np.array((0.5, 0.5, math.pi, 0.3, 0.3))
 
@@ -323,7 +323,7 @@ def _arc(distance: float, crab: float, turn: float) -> Array:
 
 
 def _unexplained(fit: FitResult, legs: Sequence[LidarLeg]) -> float:
-    sigmas = np.array([math.hypot(leg.sigma, DRIFT * leg.distance, CRAB * leg.distance) for leg in legs])
+    sigmas = np.array([math.hypot(leg.sigma, LEG_DRIFT * leg.distance, CRAB * leg.distance) for leg in legs])
     off = fit.residuals[: 2 * len(legs)].reshape(-1, 2) * sigmas[:, None]
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 

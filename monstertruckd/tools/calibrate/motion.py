@@ -19,7 +19,7 @@ from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedbac
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 
-PERIOD: Final = 0.05
+REQUEST_PERIOD: Final = 0.05
 """Seconds between two requests."""
 LEASE: Final = 0.5
 """Requested, s; the gate may grant less."""
@@ -27,11 +27,11 @@ ARMING: Final = 3.0
 """Seconds in which the truck must be armed."""
 STEERING: Final = 1.0
 """Seconds for turning the wheels while the truck stands."""
-STILL: Final = 0.1
+RESTING_TURN: Final = 0.1
 """Turn of the motor, rad, that counts as rest: an encoder may alternate between two counts."""
-AT_REST: Final = 0.5
+RESTING_TIME: Final = 0.5
 """Seconds of an unchanged drive position that count as rest."""
-SETTLE: Final = 5.0
+REST_LIMIT: Final = 5.0
 """Seconds in which it must come to rest."""
 LATE: Final = (
     "requests came too late: end what else keeps this computer or the link to the robot busy, or run the command on "
@@ -125,7 +125,7 @@ class Mover:
         stuck = 3.0  # seconds without progress after which a move is cancelled
         while True:
             side = move.side((self._clock.now() - began) / SECOND)
-            await run.hold(move.speed, side * move.front, side * move.rear, PERIOD)
+            await run.hold(move.speed, side * move.front, side * move.rear, REQUEST_PERIOD)
             new = abs(run.track.distance(self._drivetrain))
             report(new)
             if new >= move.metres or (move.done is not None and move.done(run.track)):
@@ -197,7 +197,7 @@ class _Run:
         while self.state is None:
             if self._clock.now() > end:
                 raise NoAnswerError(f"no state of the gate within {ARMING:g} s")
-            await self._clock.sleep(PERIOD)
+            await self._clock.sleep(REQUEST_PERIOD)
             self._take()
         if self.state.mode.active:
             holder = f", {self.state.holder} drives" if self.state.holder else ""
@@ -225,7 +225,7 @@ class _Run:
                 # 3: requests for standstill before the order to arm
                 elif arming is None and requests >= 3 and self.state and not self.state.mode.active:
                     arming = asyncio.create_task(self._try_to_arm())
-                await self._clock.sleep(PERIOD)
+                await self._clock.sleep(REQUEST_PERIOD)
                 self._take()
         finally:
             if arming is not None:
@@ -253,25 +253,25 @@ class _Run:
         end = self._clock.now() + round(seconds * SECOND)
         while self._clock.now() < end:
             await self._truck.drive(speed, front, rear, LEASE)
-            await self._clock.sleep(min(PERIOD, (end - self._clock.now()) / SECOND))
+            await self._clock.sleep(min(REQUEST_PERIOD, (end - self._clock.now()) / SECOND))
             self._take()
             self._check()
 
     async def rest(self, front: float, rear: float) -> None:
         """Stop and wait for rest."""
-        end = self._clock.now() + round(SETTLE * SECOND)
+        end = self._clock.now() + round(REST_LIMIT * SECOND)
         still = -1
         while self._clock.now() < end:
-            await self.hold(0.0, front, rear, PERIOD)
+            await self.hold(0.0, front, rear, REQUEST_PERIOD)
             if not self.track.drive:
                 continue
             newest = self.track.drive[-1]
-            moved = [r.stamp for r in self.track.drive if abs(r.position - newest.position) > STILL]
-            if newest.stamp - max(moved, default=newest.stamp) > AT_REST * SECOND:
+            moved = [r.stamp for r in self.track.drive if abs(r.position - newest.position) > RESTING_TURN]
+            if newest.stamp - max(moved, default=newest.stamp) > RESTING_TIME * SECOND:
                 still = newest.stamp
                 break
         if still < 0:
-            raise NoAnswerError(f"the drive does not come to rest within {SETTLE:g} s")
+            raise NoAnswerError(f"the drive does not come to rest within {REST_LIMIT:g} s")
         self.track.arrived = still
 
     async def coasted(self, drivetrain: DriveTrain) -> float | None:
@@ -280,15 +280,15 @@ class _Run:
         Returns:
             Metres that it has come; None: the one or the other does not happen.
         """
-        end = self._clock.now() + round(SETTLE * SECOND)
+        end = self._clock.now() + round(REST_LIMIT * SECOND)
         since: DriveFeedback | None = None
         while self._clock.now() < end:
-            await self._clock.sleep(PERIOD)
+            await self._clock.sleep(REQUEST_PERIOD)
             self._take()
             newest = self.track.drive[-1] if self.track.drive else None
-            if since is None or newest is None or abs(newest.position - since.position) > STILL:
+            if since is None or newest is None or abs(newest.position - since.position) > RESTING_TURN:
                 since = newest
-            elif newest.stamp - since.stamp > AT_REST * SECOND and not self._lasting():
+            elif newest.stamp - since.stamp > RESTING_TIME * SECOND and not self._lasting():
                 return abs(self.track.distance(drivetrain))
         return None
 

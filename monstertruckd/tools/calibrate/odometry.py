@@ -33,7 +33,7 @@ ANGLE: Final = 0.35
 """Angle of both axles in the corners, in opposite directions, rad."""
 PLACE: Final = 0.03
 """Standard deviation of the position back at the mark by what slips on 10 m, m."""
-FLOOR: Final = 0.003
+FLOOR_DIFFERENCE: Final = 0.003
 """Share by which the distance differs on another floor, half a 95 % interval."""
 LINKAGE: Final = 0.004
 """Share of a turn by which a linkage is off its polynomials, half a 95 % interval."""
@@ -126,7 +126,7 @@ class OdometryWizard:
         fit = model.fit(squares, self.tape_error, self.string_error)
         legs = sum(len(square.legs) for square in squares)
         distance, base, offset = intervals(fit, legs + 3 * len(squares))
-        distance = distance.joined(FLOOR)
+        distance = distance.joined(FLOOR_DIFFERENCE)
         base = base.joined(LINKAGE).joined(ON_THE_SPOT)
         ratio = geometry.drive_ratio / distance.value
         steering = context.known.get("steering")
@@ -138,7 +138,7 @@ class OdometryWizard:
                 high=geometry.drive_ratio / distance.low,
                 samples=len(squares),
                 meaning=f"motor turns per turn of wheels of {geometry.wheel_radius:g} m; 95 % of tape and slip, and "
-                f"{FLOOR:.1%} of other floors",
+                f"{FLOOR_DIFFERENCE:.1%} of other floors",
                 key="geometry.drive_ratio",
             ),
             estimated(

@@ -34,7 +34,7 @@ RADII: Final = (4.0, 2.0, 0.0)
 """Radii of the arcs, in tracks; 0 = straight."""
 SLIDING: Final = 0.004
 """Share of the distance by which a body that skids differs from its model, along and across; and of its turn."""
-FLOOR: Final = 0.0005
+POSITION_FLOOR: Final = 0.0005
 """Least standard deviation of a position at rest, m."""
 AIM: Final = 0.001
 """Least standard deviation of a heading at rest, rad."""
@@ -134,7 +134,7 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
     model = skid_model("icr and slip", radius, half_track, bounded=False, with_icr_x=True)
     seen = np.array([arc.motion for arc in arcs]).T
     distances = np.array([radius * max(abs(arc.left), abs(arc.right)) for arc in arcs])
-    place = np.hypot([max(arc.sigma[0], FLOOR) for arc in arcs], SLIDING * distances)
+    place = np.hypot([max(arc.sigma[0], POSITION_FLOOR) for arc in arcs], SLIDING * distances)
     heading = np.hypot([max(arc.sigma[1], AIM) for arc in arcs], SLIDING * np.abs(turns))
     left, right = np.array([(arc.left, arc.right) for arc in arcs]).T
     _check_sides(left, right, seen)

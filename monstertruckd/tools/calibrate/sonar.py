@@ -35,17 +35,17 @@ ROOM: Final = (
 )
 NOISE: Final = (0.005, 0.01)
 """Standard deviation of a range: m, and share of it, added in quadrature."""
-DRIFT: Final = (0.003, 0.003, 0.01)
+ARC_DRIFT: Final = (0.003, 0.003, 0.01)
 """Standard deviation of what odometry is off by on an arc: distance from the wall (m) and heading (rad) from where the
 arc before ended, and the share by which it turns more, as gyroscopes and slipping wheels let it."""
 BELIEVED: Final = 0.01, 0.003
 """Standard deviations before anything is measured, as shares: of the speed of sound (6 degrees Celsius), and of the
 distance by odometry: on another floor or under another load the wheels roll a little further or less far."""
-NEAR: Final = 0.2
+FIRST_RANGE_ERROR: Final = 0.2
 """Greatest error of a range that still may be the wall, m, before anything is fitted."""
 BEYOND: Final = 0.3
 """Past the cone's edge the wall is still heard, rad: grazing sound is reflected away."""
-LEAST: Final = 12
+LEAST_ECHOES: Final = 12
 """Echoes of a sonar that its place rests on, at least."""
 COMMON: Final = 5
 """Parameters before those of the arcs: distance and direction of the wall, half the cone, factors of the ranges and of
@@ -266,7 +266,7 @@ class SonarModel:
     def __init__(self, legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape_error: float) -> None:
         self.order = tuple(settings.sonars)
         legs = [leg for leg in legs if leg.poses]
-        self.first = COMMON + len(DRIFT) * len(legs) - 2
+        self.first = COMMON + len(ARC_DRIFT) * len(legs) - 2
         rows = np.concatenate(
             [
                 np.column_stack((np.full((len(at), 2), (i, k)), leg.ranges[name], at, swings(at)))
@@ -288,7 +288,7 @@ class SonarModel:
             ((wall, 0.0, settings.field_of_view / 2, 1.0, 1.0), np.zeros(self.first - COMMON), np.ravel(mounts))
         )
         self._limits = 1.2 * settings.range_min, 0.95 * settings.range_max
-        self.kept = self._chosen(self._start, NEAR, 0.0)
+        self.kept = self._chosen(self._start, FIRST_RANGE_ERROR, 0.0)
 
     def samples(self, name: str) -> int:
         """Echoes of a sonar that are the wall's."""
@@ -302,7 +302,7 @@ class SonarModel:
         """
         found = self._solve(self._start, edges=False)
         sigmas = 4.0 * _sigma(self._echoes.ranges)  # the greatest error afterwards, in standard deviations
-        for bounds in (NEAR / 2 + sigmas, sigmas):
+        for bounds in (FIRST_RANGE_ERROR / 2 + sigmas, sigmas):
             self.kept = self._chosen(found.parameters, bounds, BEYOND)
             found = self._solve(found.parameters)
         return found
@@ -310,8 +310,10 @@ class SonarModel:
     def _solve(self, start: Array, *, edges: bool = True) -> FitResult:
         """Axes and cone stay as they are where no edges tell them."""
         for name in self.order:
-            if (count := self.samples(name)) < LEAST:
-                raise InputError(f"sonar {name}: {count} echoes of the wall: expected {LEAST}; drive longer arcs")
+            if (count := self.samples(name)) < LEAST_ECHOES:
+                raise InputError(
+                    f"sonar {name}: {count} echoes of the wall: expected {LEAST_ECHOES}; drive longer arcs"
+                )
         reach = np.concatenate(((0.3, 0.3, 0.25, 0.1, 0.05), np.full(self.first - COMMON, 0.4)))
         reach = np.concatenate((reach, np.tile((0.15, 0.15, 0.4 if edges else 0.0), len(self.order))))
         reach[2] *= edges
@@ -328,10 +330,10 @@ class SonarModel:
 
     def _drift(self, parameters: Array) -> Array:
         """Of every arc what the robot is nearer (m), turned (rad), and by what share it turns more; (n, 3)."""
-        return np.concatenate((np.zeros(2), parameters[COMMON : self.first])).reshape(-1, len(DRIFT))
+        return np.concatenate((np.zeros(2), parameters[COMMON : self.first])).reshape(-1, len(ARC_DRIFT))
 
     def _drifted(self, drift: Array) -> Array:
-        """As ``DRIFT``: what of nearer and turned has come since the arc before ended, and the share; (n, 3)."""
+        """As ``ARC_DRIFT``: what of nearer and turned has come since the arc before ended, and the share; (n, 3)."""
         nearer, turned, swung = drift.T
         ends = self._ends + swung[:, None] * self._swings
         at_end = nearer + np.sin(turned) * ends[:, 0] + np.cos(turned) * ends[:, 1]
@@ -345,7 +347,7 @@ class SonarModel:
     def _residual(self, parameters: Array) -> Array:
         kept = self.kept
         off = (kept.ranges - self._predicted(parameters, kept)[0]) / _sigma(kept.ranges)
-        drift = self._drifted(self._drift(parameters)) / DRIFT
+        drift = self._drifted(self._drift(parameters)) / ARC_DRIFT
         taped, believed = (parameters[0] - self._wall) / self._tape_error, (parameters[3:COMMON] - 1.0) / BELIEVED
         return np.concatenate((off, drift.ravel(), believed, [taped]))
 
@@ -380,7 +382,7 @@ def _check_places(legs: Sequence[SonarLeg], places: Mapping[str, SonarPose], wal
     wrong, deaf = [], []
     for name in places:
         bearings, near = _bearings(legs, name, wall)
-        if near.sum() < LEAST:
+        if near.sum() < LEAST_ECHOES:
             deaf.append(name)
             continue
         off = {}

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 app = command_group("Calibrate this robot: guided, step by step; Ctrl-C gives up at any step.")
 
-TIMEOUT: Final = 10.0
+ANSWER_TIMEOUT: Final = 10.0
 """Seconds to wait for the link and for answers."""
 
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Answer yes wherever something is to be done.")]
@@ -212,7 +212,7 @@ def show(
         left = [] if file is None else unused(loaded, file.results.values())
         state: dict[str, Any] = {"folder": str(store.folder), "newest": newest, "content": file, "unused": left}
     else:
-        state = with_robot(lambda client, _: client.call(SHOW), robot, endpoint, TIMEOUT, named=False)
+        state = with_robot(lambda client, _: client.call(SHOW), robot, endpoint, ANSWER_TIMEOUT, named=False)
         file = _file(state)
     if json_output:
         print_json(state)
@@ -266,7 +266,7 @@ def _undo(name: str, call: _Call) -> None:
             lambda client, _: client.call(UNDO, {"wizard": name, "source": client.source}),
             call.robot,
             call.endpoint,
-            TIMEOUT,
+            ANSWER_TIMEOUT,
         )["file"]
     if call.json_output:
         print_json({"file": file})
@@ -276,7 +276,7 @@ def _undo(name: str, call: _Call) -> None:
 def _client(robot: str, endpoint: str, clock: "Clock") -> "TruckClient":
     from monstertruck_runtime.client import TruckClient
 
-    return TruckClient(robot, endpoint, clock=clock, timeout=TIMEOUT)
+    return TruckClient(robot, endpoint, clock=clock, timeout=ANSWER_TIMEOUT)
 
 
 def _store(config: Path) -> "tuple[TruckConfig, CalibrationStore]":

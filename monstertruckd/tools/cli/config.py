@@ -88,22 +88,22 @@ def migrate(
 
     Comments stay, and so does the previous file, next to the new one as NAME.vN.
     """
-    from monstertruckd.config.load import VERSION
+    from monstertruckd.config.load import FILE_VERSION
     from monstertruckd.config.migrate import carry_out, plan
 
     upgrades = plan(config)
     if not dry_run:
         carry_out(upgrades)
     if json_output:
-        print_json({"version": VERSION, "files": [_as_json(upgrade, written=not dry_run) for upgrade in upgrades]})
+        print_json({"version": FILE_VERSION, "files": [_as_json(upgrade, written=not dry_run) for upgrade in upgrades]})
         return
     for upgrade in upgrades:
         if dry_run:
             print(_difference(upgrade), end="")
         else:
-            print(f"{upgrade.path}: version {upgrade.version} to {VERSION}; the previous one is {upgrade.kept}")
+            print(f"{upgrade.path}: version {upgrade.version} to {FILE_VERSION}; the previous one is {upgrade.kept}")
     if not upgrades:
-        remark(f"{config}: up to date, version {VERSION}")
+        remark(f"{config}: up to date, version {FILE_VERSION}")
 
 
 def _as_json(upgrade: "Upgrade", *, written: bool) -> dict[str, Any]:

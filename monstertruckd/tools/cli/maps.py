@@ -284,13 +284,13 @@ def load_command(
     from monstertruck_runtime.errors import ConfigError, InputError
     from monstertruck_runtime.small_files import whole_file
     from monstertruck_runtime.yaml_files import read_yaml, yaml_text
-    from monstertruckd.config.load import VERSION, load_truck
+    from monstertruckd.config.load import FILE_VERSION, load_truck
 
     _load(place)
     robot, _ = load_truck(config)
     values = {
         "include": str(config.resolve()),
-        "version": VERSION,
+        "version": FILE_VERSION,
         "slam": {"mode": "localisation", "map": str(place.resolve())},
     }
     if robot.explorer is not None:

@@ -22,16 +22,16 @@ from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError
 from monstertruck_runtime.yaml_files import yaml_text
-from monstertruckd.config.load import VERSION, load_config, load_tree
+from monstertruckd.config.load import FILE_VERSION, load_config, load_tree
 from monstertruckd.tools.demo.summary import Summary, log_figures
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import Lap, LocalOperator, drive_lap
 from monstertruckd.tools.simulation.program import program
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from monstertruckd.tools.status.screen import draw
-from monstertruckd.tools.status.watch import PERIOD, Follower
+from monstertruckd.tools.status.watch import SCREEN_PERIOD, Follower
 
-TIMEOUT = 60.0
+START_LIMIT = 60.0
 """Seconds for the two processes to come up (the first run compiles the ray caster)."""
 
 
@@ -155,7 +155,7 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
         follower = Follower(client, clock)
         watching = asyncio.create_task(_show(follower, clock, screen=screen))
         try:
-            lap = await drive_lap(client, clock, timeout=TIMEOUT)
+            lap = await drive_lap(client, clock, timeout=START_LIMIT)
             await clock.sleep(1.0)
             if given.get("map"):
                 await _appear((folder / "map.png").exists, clock)
@@ -179,11 +179,11 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
 async def _ready(said: Callable[[], bytes], clock: Clock) -> AsyncIterator[None]:
     """Enter once the simulator has said that its devices are plugged in."""
     try:
-        async with clock.deadline(TIMEOUT):
+        async with clock.deadline(START_LIMIT):
             while b"ready" not in said():
                 await clock.sleep(0.05)
     except TimeoutError:
-        raise NoAnswerError(f"the simulator did not come up within {TIMEOUT:g} s: {said()!r}") from None
+        raise NoAnswerError(f"the simulator did not come up within {START_LIMIT:g} s: {said()!r}") from None
     yield
 
 
@@ -199,7 +199,7 @@ def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = 
     )
     overlay: dict[str, Any] = {
         "include": str(config.resolve()),
-        "version": VERSION,
+        "version": FILE_VERSION,
         "devices": {role: {"port": {"path": str(here / "dev" / role)}} for role in by_path},
         "machine": str(here / "machine"),
         "zenoh": {"listen": [endpoint]},
@@ -226,7 +226,7 @@ def free_endpoint() -> str:
 async def connect(clock: Clock, robot: str, endpoint: str) -> TruckClient:
     """A client, as soon as the daemon listens."""
     try:
-        async with clock.deadline(TIMEOUT):
+        async with clock.deadline(START_LIMIT):
             while True:
                 try:
                     async with TruckClient(robot, endpoint, clock=clock, timeout=0.5) as client:
@@ -235,7 +235,7 @@ async def connect(clock: Clock, robot: str, endpoint: str) -> TruckClient:
                 except NotFoundError:
                     await clock.sleep(0.2)
     except TimeoutError:
-        raise NoAnswerError(f"the daemon did not come up within {TIMEOUT:g} s at {endpoint}") from None
+        raise NoAnswerError(f"the daemon did not come up within {START_LIMIT:g} s at {endpoint}") from None
     return TruckClient(robot, endpoint, source=f"demo:{os.getpid()}", clock=clock)
 
 
@@ -255,7 +255,7 @@ async def _show(follower: Follower, clock: Clock, *, screen: bool) -> None:
         with Live(console=Console(), screen=True, auto_refresh=False) as live:
             while True:
                 live.update(draw(follower.state, live.console.width), refresh=True)
-                await clock.sleep(PERIOD)
+                await clock.sleep(SCREEN_PERIOD)
     finally:
         following.cancel()
         await asyncio.wait([following])

@@ -31,7 +31,7 @@ from monstertruckd.tools.drill.observer import Violation
 from monstertruckd.tools.drill.random_drill import (
     OBSTACLE,
     QUIET,
-    TIMEOUT,
+    RECOVERY_LIMIT,
     TRACKER_IN_WORKER,
     check_drivable,
     reasons_of,
@@ -239,7 +239,7 @@ class _Leg:
 
     async def _drive_on(self, truck: DrillTruck) -> None:
         """Trials of one truck."""
-        if not await truck.until(lambda: not truck.blockers(), TIMEOUT) or not await _arm(truck):
+        if not await truck.until(lambda: not truck.blockers(), RECOVERY_LIMIT) or not await _arm(truck):
             return
         usual = set(
             QUIET | OBSTACLE | {Reason.ESTOP_REQUESTED, Reason.ESTOPPED, Reason.LEASE_EXPIRED}
@@ -300,7 +300,7 @@ async def _arm(truck: DrillTruck) -> bool:
     """Arm; whether it sets off."""
     assert truck.judge is not None
     truck.judge.arm()
-    return await truck.until(lambda: abs(truck.speed) > MOVES, TIMEOUT, Order.ARM)
+    return await truck.until(lambda: abs(truck.speed) > MOVES, RECOVERY_LIMIT, Order.ARM)
 
 
 async def drives_again(truck: DrillTruck) -> bool:
@@ -399,7 +399,7 @@ async def recovers(truck: DrillTruck) -> bool:
 
     A pack that once was critical, if only by a false reading, has to be better for ``clear_after``.
     """
-    if await truck.until(lambda: not truck.blockers(), TIMEOUT, Order.RESET):
+    if await truck.until(lambda: not truck.blockers(), RECOVERY_LIMIT, Order.RESET):
         return True
     config, waits = truck.rig.config, Reason.BATTERY_CRITICAL in truck.blockers()
     clear_after = max((pack.clear_after for _, pack in packs(config.devices, config.monitors)), default=0.0)

@@ -8,7 +8,7 @@ from typing import Final
 
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_sim.world.world import World
-from monstertruckd.tools.drill.observer import AT_REST, Violation
+from monstertruckd.tools.drill.observer import STANDING_SPEED, Violation
 
 MAY_MOVE: Final = 1.0
 """Seconds for which a robot may still move once nothing permits motion."""
@@ -105,7 +105,7 @@ class WorldJudge:
         moved = 0.0 if self._place is None else math.dist(self._place, (truth.x, truth.y))
         self._place, self.speed = (truth.x, truth.y), truth.v
         twist = self._world.plant.twist
-        moves = math.hypot(*twist[:2]) > AT_REST or abs(twist[2]) > 10 * AT_REST
+        moves = math.hypot(*twist[:2]) > STANDING_SPEED or abs(twist[2]) > 10 * STANDING_SPEED
         self._still_since = None if moves else self._still_since or now
         if truth.stuck and not self._touches:
             self._touch(now, f"ran into something at ({truth.x:.2f}, {truth.y:.2f}) m")

@@ -33,8 +33,8 @@ from monstertruck_sim.world.world import World
 from monstertruckd.gate.config import GateConfig
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
-PERIOD: Final = SECOND // 100
-AT_REST: Final = 0.01
+TRUTH_PERIOD: Final = SECOND // 100
+STANDING_SPEED: Final = 0.01
 """True speed of a truck that stands, m/s."""
 STOPS_WITHIN: Final = 0.6
 """Seconds from any fault that must stop the truck, or from a disarm order, to standstill."""
@@ -372,7 +372,7 @@ class _Standstill:
     def __call__(self, seen: Observation) -> Broken:
         now, speed = seen.now, seen.truth.v
         self.top_speed = max(self.top_speed, abs(speed))
-        resting, here = abs(speed) <= AT_REST, (seen.truth.x, seen.truth.y)
+        resting, here = abs(speed) <= STANDING_SPEED, (seen.truth.x, seen.truth.y)
         if self.stood is None:
             self._path.append(here)
             if resting:
@@ -426,7 +426,7 @@ class _Speeds:
             vx, vy, _ = self._chassis.twist(self._chassis.input_speeds(seen.target))
             travelled = math.hypot(*seen.twist[:2])
             along = (vx * seen.twist[0] + vy * seen.twist[1]) / max(travelled, REVERSES_BELOW)
-            yield from self._reversal(travelled, [along + AT_REST])
+            yield from self._reversal(travelled, [along + STANDING_SPEED])
 
     @staticmethod
     def _reversal(speed: float, targets: Iterable[float]) -> Broken:
@@ -569,7 +569,7 @@ class _Turning:
 
     def __call__(self, seen: Observation) -> Broken:
         now = seen.now
-        turned = 0.0 if self._held(seen) else (seen.truth.wz - self._asked(seen)) * PERIOD / SECOND
+        turned = 0.0 if self._held(seen) else (seen.truth.wz - self._asked(seen)) * TRUTH_PERIOD / SECOND
         self._turn_errors.append((now, turned))
         while now - self._turn_errors[0][0] > TURN_WINDOW * SECOND:
             self._turn_errors.popleft()
@@ -608,7 +608,7 @@ class _Silence:
     def __call__(self, seen: Observation) -> Broken:
         for role, tap, longest in self._devices:
             silent = 0.0 if tap.heard is None else (seen.now - tap.heard) / SECOND
-            if silent > longest + STOPS_WITHIN and abs(seen.truth.v) > AT_REST:
+            if silent > longest + STOPS_WITHIN and abs(seen.truth.v) > STANDING_SPEED:
                 yield "silence", f"{seen.truth.v:.3f} m/s though {role} is silent for {silent:.2f} s"
 
 
@@ -638,7 +638,7 @@ class _Battery:
         if self._measured is None:
             return
         unknown = (seen.now - self._measured) / SECOND
-        if unknown > self._longest + STOPS_WITHIN and abs(seen.truth.v) > self._speed * SPEED_MARGIN + AT_REST:
+        if unknown > self._longest + STOPS_WITHIN and abs(seen.truth.v) > self._speed * SPEED_MARGIN + STANDING_SPEED:
             yield "battery", f"{seen.truth.v:.3f} m/s though the battery was not measured for {unknown:.1f} s"
 
 
@@ -664,7 +664,7 @@ class _Ahead:
         if self._count % 5 != 1:  # samples from one look ahead to the next: it casts rays
             return
         now, truth = seen.now, seen.truth
-        if truth.v <= 2 * AT_REST:
+        if truth.v <= 2 * STANDING_SPEED:
             self._fast.update(now, so=False)
             return
         ranges = np.minimum(self._world.view.ranges(now, FAN), 100.0)  # distance of what is not there, m
@@ -766,7 +766,7 @@ class Observer:
         due = self._clock.now()
         while True:
             self._observe()
-            due += PERIOD
+            due += TRUTH_PERIOD
             await self._clock.sleep_until(due)
 
     # Called by the drill

@@ -31,7 +31,7 @@ from monstertruckd.tools.drill.observer import EPOS, MAESTRO, STOPS_WITHIN, Viol
 from monstertruckd.tools.drill.truck import OPTIONAL, DrillTruck
 from monstertruckd.tools.simulation.config import DEADMAN_LINE, SimulatedTruckConfig, with_overlay
 
-TIMEOUT: Final = 15.0
+RECOVERY_LIMIT: Final = 15.0
 """Seconds after which a service that has not recovered is stuck."""
 QUIET: Final = frozenset(
     {
@@ -277,7 +277,7 @@ class _LegRun:
             before = len(self._outcomes)
             by_station = self._config.tracker is None
             async with DrillTruck.running(self._config, self._clock, by_station=by_station) as truck:
-                await truck.until(lambda: not truck.blockers(), TIMEOUT)  # called within this turn only
+                await truck.until(lambda: not truck.blockers(), RECOVERY_LIMIT)  # called within this turn only
                 for fault in left:
                     # 5: every so many faults are followed by an emergency stop, the others by a disarm order
                     order = Order.DISARM if (len(self._outcomes) + 1) % 5 else Order.ESTOP
@@ -349,7 +349,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: O
     ended = clock.now()
     await apply(fault.end, context)
     truck.listen()
-    await truck.until(lambda: not truck.blockers(), TIMEOUT, Order.RESET if order is Order.ESTOP else None)
+    await truck.until(lambda: not truck.blockers(), RECOVERY_LIMIT, Order.RESET if order is Order.ESTOP else None)
     observer.reset()
     recovered = (clock.now() - ended) / SECOND
     blockers = truck.blockers()
@@ -377,7 +377,7 @@ async def _react(truck: DrillTruck, fault: CatalogFault, cruise: float, order: O
 async def _drive(truck: DrillTruck) -> bool:
     """Arm and come to speed."""
     truck.observer.arm()
-    return await truck.until(truck.drives, TIMEOUT, Order.ARM)
+    return await truck.until(truck.drives, RECOVERY_LIMIT, Order.ARM)
 
 
 def reasons_of(report: Event | GateState | HealthTable) -> Iterator[Reason]:

@@ -18,7 +18,7 @@ from monstertruck_runtime.readable import when_readable
 from monstertruckd.tools.driving.gamepad import AXES, BUTTONS, EV_KEY, EVENT, Action, Pad, PadMapping
 
 FOLDER: Final = Path("/dev/input")
-LOOK: Final = 1.0
+GAMEPAD_LOOK_PERIOD: Final = 1.0
 """Seconds between two looks for a gamepad."""
 STOPPING: Final = frozenset({"stop", "estop"})
 """Actions that count however late they are read."""
@@ -57,7 +57,7 @@ class PadLink:
             while True:
                 if self._file is None:
                     self._open()
-                await self._clock.sleep(LOOK)
+                await self._clock.sleep(GAMEPAD_LOOK_PERIOD)
         finally:
             self._close()
 

@@ -29,14 +29,14 @@ from monstertruck_schemas.topics import GATE
 from monstertruckd.tools.driving.gamepad import Action, PadMapping, key_for
 from monstertruckd.tools.driving.gamepad_device import PadLink
 from monstertruckd.tools.driving.modes import SteeringMode
-from monstertruckd.tools.driving.teleop import MODE_KEYS, STEPS, Command, KeyReader, Teleop, TeleopRequest
+from monstertruckd.tools.driving.teleop import MODE_KEYS, STEERING_KEY_STEPS, Command, KeyReader, Teleop, TeleopRequest
 from monstertruckd.tools.status import screen
 from monstertruckd.tools.status.screen import ScreenState
-from monstertruckd.tools.status.watch import PERIOD, Follower
+from monstertruckd.tools.status.watch import SCREEN_PERIOD, Follower
 
-RATE: Final = 20.0
+REQUEST_RATE: Final = 20.0
 """Drive requests per second."""
-REST: Final = 6
+NEUTRAL_REQUESTS: Final = 6
 """Neutral requests after the gamepad was let go, so that the truck stops by its ramp."""
 QUIET: Final = frozenset({Reason.CLIPPED, Reason.SERVO_LIMIT})
 """Limits of the driver's own request: the hand knows."""
@@ -185,7 +185,7 @@ class DriveSession:
         """Deadman switch: send requests while keys are held, nothing otherwise."""
         before = self._clock.now()
         while True:
-            await self._clock.sleep(1.0 / RATE)
+            await self._clock.sleep(1.0 / REQUEST_RATE)
             now = self._clock.now()
             # 0.3: after a longer pause of this program, s, keys that are read late may have been released meanwhile
             if now - before > 0.3 * SECOND:
@@ -200,7 +200,7 @@ class DriveSession:
         pad = None if link is None else link.pad
         self._stream.pad = "" if link is None else link.hint or ("" if pad is None else pad.name)
         if pad is not None and pad.held:
-            self._resting = REST
+            self._resting = NEUTRAL_REQUESTS
         elif self._resting > 0:
             self._resting -= 1
         else:
@@ -217,7 +217,7 @@ class DriveSession:
         before: frozenset[Reason] = frozenset()
         mode: GateMode | None = None
         while True:
-            await self._clock.sleep(1.0 / RATE)
+            await self._clock.sleep(1.0 / REQUEST_RATE)
             gate = follower.state.gate
             if gate is None:
                 continue
@@ -268,7 +268,7 @@ class DriveSession:
         with suppress(OSError), Live(console=console, screen=True, auto_refresh=False) as live:
             while True:
                 live.update(draw(follower.state, self._teleop, self._stream, console.width), refresh=True)
-                await self._clock.sleep(PERIOD)
+                await self._clock.sleep(SCREEN_PERIOD)
 
     async def _stop(self, client: TruckClient) -> None:
         with suppress(TruckError, TimeoutError):
@@ -316,9 +316,9 @@ def _asked(stream: Stream) -> Text:
 
 
 def _wheels(teleop: Teleop) -> Text:
-    cells = ["─"] * (2 * STEPS + 1)
-    at = round(STEPS * (1.0 - teleop.steer / teleop.angle))
-    cells[STEPS], cells[at] = "┼", "●"
+    cells = ["─"] * (2 * STEERING_KEY_STEPS + 1)
+    at = round(STEERING_KEY_STEPS * (1.0 - teleop.steer / teleop.angle))
+    cells[STEERING_KEY_STEPS], cells[at] = "┼", "●"
     return Text(f"{''.join(cells)} {math.degrees(teleop.steer):+5.1f}°")
 
 

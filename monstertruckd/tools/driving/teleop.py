@@ -29,7 +29,7 @@ _FINALS: Final = {
 
 _NAMES: Final = {"\r": "enter", "\n": "enter", " ": "space", "\x1b": "escape", "\x04": "end"}
 
-STEPS: Final = 8
+STEERING_KEY_STEPS: Final = 8
 """Key presses from straight to full lock."""
 
 TURN_RADIUS: Final = 0.2
@@ -190,12 +190,12 @@ class Teleop:
     @property
     def steer(self) -> float:
         """Steering, rad, left positive."""
-        return self._steer / STEPS * self.angle
+        return self._steer / STEERING_KEY_STEPS * self.angle
 
     @property
     def drift(self) -> float:
         """Drift of the hybrid mode, rad, left positive."""
-        return self._drift / STEPS * self.angle
+        return self._drift / STEERING_KEY_STEPS * self.angle
 
     def press(self, key: str, now: int) -> Command | None:
         """Take a key; returns the command it gives, if any."""
@@ -267,4 +267,4 @@ class Teleop:
 
 
 def _stepped(steps: int, by: int) -> int:
-    return max(-STEPS, min(STEPS, steps + by))
+    return max(-STEERING_KEY_STEPS, min(STEERING_KEY_STEPS, steps + by))

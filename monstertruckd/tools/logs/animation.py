@@ -23,7 +23,7 @@ from monstertruckd.tools.logs.geometry import recorded_geometry
 from monstertruckd.tools.logs.messages import Progress
 from monstertruckd.tools.logs.report.scan_map import PlacedScans
 
-EDGE: Final = 0.25
+EMPTY_EDGE: Final = 0.25
 """Empty edge around what was seen, m."""
 MOST_FRAMES: Final = 1500
 COLOURS: Final = (
@@ -174,8 +174,8 @@ class _AnimationCanvas:
         self._body = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * (geometry.length / 2, geometry.width / 2)
         poses = np.array([scene.pose[:2] for scene in scenes])
         seen = np.vstack([poses, *(scene.points for scene in scenes)])
-        low = np.minimum(np.quantile(seen, 0.002, axis=0), poses.min(axis=0)) - EDGE
-        high = np.maximum(np.quantile(seen, 0.998, axis=0), poses.max(axis=0)) + EDGE
+        low = np.minimum(np.quantile(seen, 0.002, axis=0), poses.min(axis=0)) - EMPTY_EDGE
+        high = np.maximum(np.quantile(seen, 0.998, axis=0), poses.max(axis=0)) + EMPTY_EDGE
         self._low, self._scale = low, width / (high[0] - low[0])
         self._height = max(round((high[1] - low[1]) * self._scale), 16)
         self._ground = Image.new("RGB", (width, self._height), PAPER)

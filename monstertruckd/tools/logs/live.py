@@ -23,7 +23,7 @@ from monstertruck_schemas.topics import Topic
 from monstertruckd.tools.logs.report.signals import FIGURES
 from monstertruckd.tools.logs.rerun_view import APPLICATION, Scene, blueprint
 
-PERIOD: Final = 0.1
+LIVE_PERIOD: Final = 0.1
 """Seconds between two checks of what came."""
 WAITING: Final = 200
 """Messages of a topic that may wait for a look."""
@@ -55,7 +55,7 @@ async def follow(robot: str, endpoint: str, clock: Clock, stream: rr.RecordingSt
                         if scene.entities != laid_out:
                             laid_out = set(scene.entities)
                             stream.send_blueprint(blueprint(laid_out))
-                        await clock.sleep(PERIOD)
+                        await clock.sleep(LIVE_PERIOD)
         await clock.sleep(retry)
 
 

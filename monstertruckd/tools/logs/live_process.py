@@ -16,7 +16,7 @@ from monstertruck_runtime.clock import Clock
 
 VIEWER: Final = "rerun+http://127.0.0.1:9876/proxy"
 """Where a viewer on this machine listens: ``rerun --bind 127.0.0.1``."""
-LOOK: Final = 2.0
+LISTENER_LOOK_PERIOD: Final = 2.0
 """Seconds between two looks whether it listens."""
 PROGRAM: Final = (sys.executable, "-m", "monstertruckd.tools.logs.live")
 
@@ -35,26 +35,26 @@ async def show_live(
     """
     while True:
         while not await listens(viewer):
-            await clock.sleep(LOOK)
+            await clock.sleep(LISTENER_LOOK_PERIOD)
         # A session of its own: Ctrl-C is for the station, which ends it.
         drawing = await asyncio.create_subprocess_exec(
             *program, robot, endpoint, viewer, stdin=PIPE, stdout=DEVNULL, start_new_session=True
         )
         try:
             while drawing.returncode is None and await listens(viewer):
-                await clock.sleep(LOOK)
+                await clock.sleep(LISTENER_LOOK_PERIOD)
         finally:
             with suppress(ProcessLookupError):
                 drawing.kill()
             await drawing.wait()
-        await clock.sleep(LOOK)
+        await clock.sleep(LISTENER_LOOK_PERIOD)
 
 
 async def listens(viewer: str) -> bool:
     """Whether anybody answers at a viewer's address."""
     place = urlsplit(viewer)
     try:
-        async with asyncio.timeout(LOOK):
+        async with asyncio.timeout(LISTENER_LOOK_PERIOD):
             _, writer = await asyncio.open_connection(place.hostname, place.port)
     except (OSError, TimeoutError):
         return False

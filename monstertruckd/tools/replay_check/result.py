@@ -7,7 +7,7 @@ from typing import Any, Final
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.replay_check.comparison import FirstDifference, TopicComparison
 
-ROUNDING: Final = 1e-6
+ROUND_OFF: Final = 1e-6
 """SI units: what another processor's maths routines, which round otherwise, are off by is far less."""
 
 
@@ -69,14 +69,14 @@ class CheckedReplay:
 
     @property
     def rounded(self) -> bool:
-        """Whether it does not agree, but nothing is off by more than ``ROUNDING``."""
-        close = all(comparison.within(self.end, ROUNDING) for comparison in self.topics) and not self.unreadable
+        """Whether it does not agree, but nothing is off by more than ``ROUND_OFF``."""
+        close = all(comparison.within(self.end, ROUND_OFF) for comparison in self.topics) and not self.unreadable
         return close and not self.agrees
 
     @property
     def sufficient(self) -> float:
         """Tolerance, SI units, with which a check that is ``rounded`` agrees."""
-        return max([ROUNDING, *(comparison.tolerance for comparison in self.topics if comparison.judged)])
+        return max([ROUND_OFF, *(comparison.tolerance for comparison in self.topics if comparison.judged)])
 
     @property
     def reason(self) -> Reason:

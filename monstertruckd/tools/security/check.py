@@ -24,9 +24,9 @@ from monstertruck_schemas.topics import GATE
 from monstertruckd.tools.security.certificates import Certificate, issue, new_authority
 from monstertruckd.tools.security.folder import Folder
 
-TIMEOUT: Final = 1.5
+ABSENCE_TIMEOUT: Final = 1.5
 """Seconds to wait for what may not come."""
-LONG: Final = 600
+LONG_LIFE: Final = 600
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class _Attempt:
         """Raises NotFoundError where nothing listens."""
         place = host_of(self._endpoint), port_of(self._endpoint) or 0
         try:
-            (await in_thread(lambda: socket.create_connection(place, TIMEOUT))).close()
+            (await in_thread(lambda: socket.create_connection(place, ABSENCE_TIMEOUT))).close()
         except OSError as error:
             raise NotFoundError(f"nothing listens at {self._endpoint}: {error}") from None
 
@@ -93,9 +93,9 @@ class _Attempt:
             yield await self._case(f"{observers[0]}, an observer", "state, no orders", observers[0], self._may_see)
         yield await self._case(f"{pilot} under another name", "nothing arrives", pilot, self._not_as_another)
         authority, now = self._folder.authority(), self._now()
-        stranger = issue(authority, "stranger", now, LONG)
+        stranger = issue(authority, "stranger", now, LONG_LIFE)
         yield await self._refused("a stranger of this authority", stranger, "no link, or nothing to see")
-        rogue = issue(new_authority(authority.certificate.subject.rfc4514_string()[3:], now, 1), pilot, now, LONG)
+        rogue = issue(new_authority(authority.certificate.subject.rfc4514_string()[3:], now, 1), pilot, now, LONG_LIFE)
         yield await self._refused(f"{pilot} of another authority", rogue, "no link")
         yield await self._refused("no certificate", None, "no link")
         yield await self._plain()
@@ -104,7 +104,7 @@ class _Attempt:
     # Cases
 
     async def _case(self, who: str, expected: str, name: str, attempt: Callable[[TruckClient], Awaitable[str]]) -> Case:
-        tls = self._files(self._made(name, LONG), self._folder.issuer(name).pem)
+        tls = self._files(self._made(name, LONG_LIFE), self._folder.issuer(name).pem)
         try:
             async with self._client(tls) as client:
                 problem = await attempt(client)
@@ -131,7 +131,7 @@ class _Attempt:
     async def _plain(self) -> Case:
         plain = self._endpoint.replace("tls/", "tcp/", 1)
         try:
-            async with TruckClient(self._register.robot, plain, clock=self._clock, timeout=TIMEOUT):
+            async with TruckClient(self._register.robot, plain, clock=self._clock, timeout=ABSENCE_TIMEOUT):
                 return Case("without TLS", "no link", "the link opens", met=False)
         except NotFoundError:
             return Case("without TLS", "no link", "no link", met=True)
@@ -143,10 +143,10 @@ class _Attempt:
         try:
             async with self._client(tls) as client:
                 gate = client.subscribe(GATE, latest())
-                first = await gate.next_within(TIMEOUT)
+                first = await gate.next_within(ABSENCE_TIMEOUT)
                 await self._clock.sleep(short)
                 gate.drain()
-                later = await gate.next_within(TIMEOUT)
+                later = await gate.next_within(ABSENCE_TIMEOUT)
         except TruckError as error:
             return Case(who, expected, str(error), met=False)
         found = expected if first is not None and later is None else "no state" if first is None else "still state"
@@ -190,14 +190,14 @@ class _Attempt:
 
     @asynccontextmanager
     async def _client(self, tls: ClientTls) -> AsyncIterator[TruckClient]:
-        made = TruckClient(self._register.robot, self._endpoint, clock=self._clock, timeout=TIMEOUT, tls=tls)
+        made = TruckClient(self._register.robot, self._endpoint, clock=self._clock, timeout=ABSENCE_TIMEOUT, tls=tls)
         async with made as client:
             yield client
 
     def _handshake(self, tls: ClientTls | None) -> str:
         """Why a link is refused; "" if it is not."""
         try:
-            return link_refusal(self._endpoint, self._ca, tls, TIMEOUT)
+            return link_refusal(self._endpoint, self._ca, tls, ABSENCE_TIMEOUT)
         except OSError as error:
             return str(error)
 

@@ -30,7 +30,7 @@ from monstertruck_schemas.base import Name, Schema, first_mistake
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.roles import AccessRole
 from monstertruckd.bus.zenoh_config import OWNER_NAME, OwnerName, TlsConfig, ZenohConfig
-from monstertruckd.config.load import VERSION
+from monstertruckd.config.load import FILE_VERSION
 from monstertruckd.config.truck import ROBOT
 from monstertruckd.tools.security.certificates import (
     DAY,
@@ -331,7 +331,7 @@ class Folder:
         files = {
             "stations.pem": b"".join(everybody),
             "pilots.pem": b"".join(self._issuers(driving)),
-            "zenoh.yaml": (WRITTEN + yaml_text({"version": VERSION, "zenoh": _zenoh(register)})).encode(),
+            "zenoh.yaml": (WRITTEN + yaml_text({"version": FILE_VERSION, "zenoh": _zenoh(register)})).encode(),
         }
         changed = False
         for name, content in files.items():

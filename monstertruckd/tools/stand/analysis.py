@@ -17,7 +17,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.topics import ODOMETRY, POSE, STAND_POSE, TRACKER
 from monstertruckd.recorder.reader import LogReader
 
-LEAST: Final = 40
+LEAST_COMMON: Final = 40
 """Poses in common."""
 
 
@@ -49,12 +49,14 @@ def errors_of(log: LogReader) -> list[EstimateError]:
             message: Any = entry.decode()
             series[entry.topic].append((message.stamp, message.pose.x, message.pose.y, message.pose.yaw))
     seen = _array(series[STAND_POSE.name])
-    if len(seen) < LEAST:
-        raise InputError(f"{log.path}: {len(seen)} poses of a stand in it: expected {LEAST}, as with `stand: overhead`")
+    if len(seen) < LEAST_COMMON:
+        raise InputError(
+            f"{log.path}: {len(seen)} poses of a stand in it: expected {LEAST_COMMON}, as with `stand: overhead`"
+        )
     found = [
         error_of(topic.name, seen, rows)
         for topic in (ODOMETRY, POSE)
-        if len(rows := _array(series[topic.name])) >= LEAST
+        if len(rows := _array(series[topic.name])) >= LEAST_COMMON
     ]
     if not found:
         raise InputError(f"{log.path}: no odometry in it")
@@ -75,12 +77,12 @@ def error_of(what: str, seen: Array, estimate: Array) -> EstimateError:
     latency = latency_of(seen, estimate)
     at = seen[:, 0] - (latency or 0.0)
     inside = (at >= estimate[0, 0]) & (at <= estimate[-1, 0])
-    if inside.sum() < LEAST:
-        raise InputError(f"{what}: {int(inside.sum())} poses at times that the stand saw: expected {LEAST}")
+    if inside.sum() < LEAST_COMMON:
+        raise InputError(f"{what}: {int(inside.sum())} poses at times that the stand saw: expected {LEAST_COMMON}")
     truth, there = seen[inside, 1:], interpolate(estimate[:, 0], estimate[:, 1:], at[inside])
     aligned = _laid_over(truth, there, slice(None))
     off = np.hypot(*(aligned[:, :2] - truth[:, :2]).T)
-    first = _laid_over(truth, there, slice(0, max(LEAST // 2, len(truth) // 20)))
+    first = _laid_over(truth, there, slice(0, max(LEAST_COMMON // 2, len(truth) // 20)))
     turn = wrap(aligned[:, 2] - truth[:, 2])
     return EstimateError(
         what,
@@ -100,7 +102,7 @@ def latency_of(seen: Array, estimate: Array) -> float | None:
     times = seen[:, 0]
     reach = 0.5  # greatest latency, s
     inside = (times > estimate[0, 0] + reach) & (times < estimate[-1, 0] - reach)
-    if inside.sum() < LEAST:
+    if inside.sum() < LEAST_COMMON:
         return None
 
     def residual(parameters: Array) -> Array:

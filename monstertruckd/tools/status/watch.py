@@ -18,7 +18,7 @@ from monstertruckd.tools.status.screen import SHOWN, ScreenState, calibration_ba
 
 PICTURED = frozenset({topics.SCAN.name, topics.TRANSFORMS.name})
 """Shown by the picture alone, not in words."""
-PERIOD = 0.1
+SCREEN_PERIOD = 0.1
 
 
 class Follower:
@@ -51,7 +51,7 @@ class Follower:
                     self.state.take(message)
                     self.state.heard = now
             self.state.silence = (now - self.state.heard) / SECOND
-            await self._clock.sleep(PERIOD / 2)
+            await self._clock.sleep(SCREEN_PERIOD / 2)
 
     async def _collect(self) -> None:
         async for event in self._events:
@@ -66,7 +66,7 @@ async def watch(clock: Clock, robot: str, endpoint: str) -> None:
         with Live(console=Console(), screen=True, auto_refresh=False) as live:
             while not following.done():
                 live.update(draw(state, live.console.width), refresh=True)
-                await clock.sleep(PERIOD)
+                await clock.sleep(SCREEN_PERIOD)
         following.result()
     finally:
         following.cancel()
@@ -83,7 +83,7 @@ async def _follow(clock: Clock, robot: str, endpoint: str, state: ScreenState) -
         except NotFoundError as error:
             state.trouble = str(error)
             state.silence = (clock.now() - state.heard) / SECOND
-            await clock.sleep(PERIOD)
+            await clock.sleep(SCREEN_PERIOD)
 
 
 async def print_once(clock: Clock, robot: str, endpoint: str, *, json_output: bool) -> None:

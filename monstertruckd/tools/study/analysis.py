@@ -11,7 +11,7 @@ import numpy as np
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.errors import InputError
 
-LEAST: Final = 40
+LEAST_RUN_POSES: Final = 40
 """Poses of a run, at least."""
 
 
@@ -129,9 +129,9 @@ def line(times: Array, poses: Array, directions: Array) -> StraightPasses:
         for part in np.split(np.arange(times.size), cuts)
         if directions[part[0]] != 0.0
     ]
-    passes = [part for part in passes if part.size >= LEAST]
+    passes = [part for part in passes if part.size >= LEAST_RUN_POSES]
     if not passes:
-        raise InputError(f"no pass has {LEAST} poses after its first {settled:g} s")
+        raise InputError(f"no pass has {LEAST_RUN_POSES} poses after its first {settled:g} s")
     ends = [_fitted(times[part], poses[:, part]) for part in passes]
     lengths = np.array([np.hypot(*(end - begin)) for begin, _, end in ends])
     least_way = 0.01  # metres that a pass must cover: less has no direction
@@ -176,8 +176,8 @@ def _off_chord(begin: Array, middle: Array, end: Array) -> float:
 def _checked(times: Array, poses: Array) -> tuple[Array, Array]:
     if poses.shape != (3, times.size):
         raise InputError(f"poses {poses.shape}: expected (3, {times.size})")
-    if times.size < LEAST:
-        raise InputError(f"{times.size} poses of the stand: expected at least {LEAST}")
+    if times.size < LEAST_RUN_POSES:
+        raise InputError(f"{times.size} poses of the stand: expected at least {LEAST_RUN_POSES}")
     if not (np.isfinite(times).all() and np.isfinite(poses).all()):
         raise InputError("poses of the stand: expected finite numbers only")
     if (np.diff(times) <= 0).any():

@@ -13,9 +13,9 @@ from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
 from monstertruckd.config.truck import TruckConfig
 
-PERIOD: Final = 0.05
+RUN_REQUEST_PERIOD: Final = 0.05
 """Seconds between two requests."""
-PAUSE: Final = 0.6
+REVERSAL_PAUSE: Final = 0.6
 """Seconds of standstill at a reversal."""
 SETTLING: Final = 2.0
 """Seconds at the beginning of a run that the analysis leaves out; they are driven besides."""
@@ -65,7 +65,7 @@ def straight_plan(config: TruckConfig, length: float, passes: int, reference: fl
     plan: list[Stretch] = []
     for i in range(passes):
         sign = -1.0 if i % 2 else 1.0
-        plan += [Stretch(sign * reference, sign * reference, seconds), Stretch(0.0, 0.0, PAUSE)]
+        plan += [Stretch(sign * reference, sign * reference, seconds), Stretch(0.0, 0.0, REVERSAL_PAUSE)]
     return plan
 
 
@@ -111,7 +111,7 @@ async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequen
         NoAnswerError: it has been silent for ``GONE`` s.
         InputError: the body has no sides, or is too slow for what is asked.
     """
-    plan = (*plan, Stretch(0.0, 0.0, PAUSE))  # at rest before it is disarmed
+    plan = (*plan, Stretch(0.0, 0.0, REVERSAL_PAUSE))  # at rest before it is disarmed
     rates = [shaft_rates(config, stretch) for stretch in plan]
     fastest = max(max(map(abs, row)) for row in rates) * config.geometry.wheel_radius
     if fastest > config.gate.speed:
@@ -126,7 +126,7 @@ async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequen
                 end = due + round(stretch.seconds * SECOND)
                 while due < end:
                     await robot.drive_shafts(*row, lease=0.25)
-                    due += round(PERIOD * SECOND)
+                    due += round(RUN_REQUEST_PERIOD * SECOND)
                     await clock.sleep_until(min(due, end))
                     state = gate.latest
                     if state is not None and state is not seen:

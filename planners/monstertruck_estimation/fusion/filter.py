@@ -75,7 +75,7 @@ class HeadingMeasurement:
 Measurement = WheelMeasurement | ScanMeasurement | ScanClone | HeadingMeasurement
 
 
-SIZE: Final = 15
+STATE_SIZE: Final = 15
 POSE: Final = slice(0, 3)
 TWIST: Final = slice(3, 6)
 YAW, NORTH, TRIM = 2, 6, 7
@@ -84,13 +84,13 @@ WHEELS: Final = slice(11, 14)
 LOCAL: Final = 14
 LATER: Final = slice(15, 18)
 """Pose of the scan being applied."""
-IDENTITY: Final = np.eye(SIZE)
-LARGER: Final = np.eye(SIZE + 3)
+IDENTITY: Final = np.eye(STATE_SIZE)
+LARGER: Final = np.eye(STATE_SIZE + 3)
 MOVED_BY: Final = ("drive", "lidar")
 """Sensors that measure motion."""
 TURNED_BY: Final = ("imu", "lidar")
 """Sensors that measure turns, and slip with no wheel."""
-FRESH: Final = SECOND // 2
+TILT_VALID: Final = SECOND // 2
 """Tilt is used for this long, ns."""
 
 
@@ -134,10 +134,10 @@ class FilterState:
 
 def initial_state(stamp: int, config: FusionConfig) -> FilterState:
     """At the start the pose is known by definition and the truck stands."""
-    mean = np.zeros(SIZE)
+    mean = np.zeros(STATE_SIZE)
     mean[POSE] = config.start.x, config.start.y, config.start.yaw
     trim = config.wheels.trim if config.wheels is not None else 0.0
-    spread = np.zeros(SIZE)
+    spread = np.zeros(STATE_SIZE)
     # 0.05: standard deviation of the velocity at the start, m/s and rad/s
     spread[TWIST], spread[NORTH], spread[TRIM] = 0.05, math.pi, trim
     spread[LOCAL] = config.compass.local if config.compass is not None else 0.0
@@ -219,7 +219,7 @@ def _motion_residual(state: FilterState, clone: slice, delta: Array) -> tuple[Ar
     then, now = state.mean[clone], state.mean[POSE]
     residual = delta - between(then, now)
     residual[2] = wrap_angle(float(residual[2]))
-    by_state = np.zeros((3, SIZE))
+    by_state = np.zeros((3, STATE_SIZE))
     by_state[:, clone], by_state[:, POSE] = between_jacobians(then, now)
     return residual, by_state
 
@@ -256,7 +256,7 @@ def _wheels(state: FilterState, measured: WheelMeasurement, config: FusionConfig
 
 def _level(state: FilterState, felt: tuple[float, float] | None) -> tuple[float, float]:
     """Horizontal share of a motion along x and along y; by the compass before the tilt ``felt`` by an IMU."""
-    if state.tilt is not None and state.stamp - state.tilt[0] <= FRESH:
+    if state.tilt is not None and state.stamp - state.tilt[0] <= TILT_VALID:
         felt = state.tilt[1:]
     if felt is None:
         return 1.0, 1.0
@@ -268,7 +268,7 @@ def _scan(state: FilterState, measured: ScanMeasurement, config: FusionConfig) -
     """Augment with the later scan's pose, update with the motion since the earlier one, then replace that clone."""
     if state.scan != measured.since or config.scans is None:
         return _marked(state, measured.stamp, measured.covariance)
-    by_place = np.vstack((np.eye(SIZE), np.zeros((3, SIZE))))
+    by_place = np.vstack((np.eye(STATE_SIZE), np.zeros((3, STATE_SIZE))))
     by_place[LATER, POSE] = np.eye(3)
     mean = by_place @ state.mean
     covariance = by_place @ state.covariance @ by_place.T
@@ -276,12 +276,12 @@ def _scan(state: FilterState, measured: ScanMeasurement, config: FusionConfig) -
     earlier, later = mean[SCAN], mean[LATER]
     residual = measured.delta - between(earlier, later)
     residual[2] = wrap_angle(float(residual[2]))
-    by_state = np.zeros((3, SIZE + 3))
+    by_state = np.zeros((3, STATE_SIZE + 3))
     by_state[:, SCAN], by_state[:, LATER] = between_jacobians(earlier, later)
     place, turn = config.scans.drift
     noise = np.diag((place**2, place**2, turn**2))
     joint = kalman_update(state.estimated(mean, covariance), residual, by_state, noise)
-    kept = np.r_[0:SIZE]
+    kept = np.r_[0:STATE_SIZE]
     kept[SCAN] = np.r_[LATER]
     return replace(
         joint,
@@ -323,7 +323,7 @@ def _heading(state: FilterState, heading: HeadingMeasurement, config: FusionConf
     if config.compass is None:
         return state
     mean, covariance = state.mean, state.covariance
-    by_state = np.zeros((1, SIZE))
+    by_state = np.zeros((1, STATE_SIZE))
     by_state[0, YAW], by_state[0, NORTH], by_state[0, LOCAL] = 1.0, -1.0, 1.0
     residual = float(_residual(state, heading)[0])
     innovation = HeadingInnovation(
@@ -360,7 +360,7 @@ def _heading(state: FilterState, heading: HeadingMeasurement, config: FusionConf
 
 def _own_turn(state: FilterState, stamp: int, config: FusionConfig) -> float:
     """Greatest turn since the last heading used, rad, that wheels which slip may have missed; 0 where others saw it."""
-    if any(stamp - state.used[name] <= FRESH for name in TURNED_BY if name in state.used):
+    if any(stamp - state.used[name] <= TILT_VALID for name in TURNED_BY if name in state.used):
         return 0.0
     return config.max_turn * (stamp - state.used.get("compass", stamp)) / SECOND
 
@@ -371,7 +371,7 @@ def _residual(state: FilterState, heading: HeadingMeasurement) -> Array:
 
 def _anchored(state: FilterState, north: float, noise: float) -> FilterState:
     """Initialise north from yaw, heading and deviation: their errors add up in it."""
-    mean, by_state = state.mean.copy(), np.eye(SIZE)
+    mean, by_state = state.mean.copy(), np.eye(STATE_SIZE)
     mean[NORTH] = north
     by_state[NORTH, :] = 0.0
     by_state[NORTH, [YAW, LOCAL]] = 1.0

@@ -16,7 +16,7 @@ from monstertruck_schemas.state import GROUND_UNKNOWN, ROUGHNESS_STEP, TILT_STEP
 
 FILE: Final = "ground.npz"
 """Name of the file in the folder of a saved map."""
-RESOLUTION: Final = 0.1
+GROUND_RESOLUTION: Final = 0.1
 """m."""
 LARGEST: Final = 2000
 """Cells a side at most; what lies outside is left out."""
@@ -51,7 +51,7 @@ class GroundGrid:
             tilt: of the ground, rad; one value or n.
             roughness: standard deviation of its height, m; one value or n.
         """
-        cells = np.floor(points / RESOLUTION).astype(np.int64)
+        cells = np.floor(points / GROUND_RESOLUTION).astype(np.int64)
         _, first = np.unique(cells[:, 0] * KEY + cells[:, 1], return_index=True)
         cells = cells[first]
         if not len(cells) or not self._grow(cells.min(axis=0), cells.max(axis=0)):
@@ -66,13 +66,13 @@ class GroundGrid:
     def message(self, stamp: int, seq: int, frame: str) -> Ground:
         """The layers as published; of an empty grid there is none."""
         rows, columns = self._counts.shape
-        x, y = (self._corner * RESOLUTION).tolist()
+        x, y = (self._corner * GROUND_RESOLUTION).tolist()
         return Ground(
             stamp=stamp,
             received=stamp,
             seq=seq,
             frame=frame,
-            resolution=RESOLUTION,
+            resolution=GROUND_RESOLUTION,
             width=columns,
             height=rows,
             origin=Pose2D(x=x, y=y, yaw=0.0),

@@ -9,7 +9,7 @@ import numpy as np
 
 from monstertruck_estimation.body_tilt import BodyAcceleration, Tilt
 from monstertruck_estimation.ground.config import GroundConfig
-from monstertruck_estimation.ground.grid import RESOLUTION, GroundGrid, planes
+from monstertruck_estimation.ground.grid import GROUND_RESOLUTION, GroundGrid, planes
 from monstertruck_estimation.ground.terrain import TerrainEstimator
 from monstertruck_estimation.scan_tilt import ScanAngles, plane_slopes
 from monstertruck_estimation.transforms import wrap_angle
@@ -208,7 +208,7 @@ class GroundService:
 
 def _spread(length: float, width: float) -> Array:
     """Points over a rectangle round the origin, at least one in each cell, (n, 2)."""
-    xs, ys = (np.linspace(-v / 2, v / 2, math.ceil(2 * v / RESOLUTION) + 1) for v in (length, width))
+    xs, ys = (np.linspace(-v / 2, v / 2, math.ceil(2 * v / GROUND_RESOLUTION) + 1) for v in (length, width))
     grid: Any = np.meshgrid(xs, ys)
     return np.asarray(np.stack(grid, axis=-1).reshape(-1, 2))
 

@@ -15,7 +15,7 @@ from monstertruck_schemas.plan import MAX_COORDINATE
 from monstertruck_schemas.points import PointOfInterest
 
 FILE: Final = "points.json"
-MOST_BYTES: Final = 5_000_000
+LARGEST_POINTS_FILE: Final = 5_000_000
 VARIANCES: Final = (1e-12, 1e12)
 """The least and the greatest one of any direction that is taken from a file, m^2 or rad^2."""
 _POINTS: Final = TypeAdapter(list[PointOfInterest])
@@ -59,7 +59,7 @@ def load(folder: Path) -> list[tuple[PointOfInterest, bytes]]:
 def _read(file: Path) -> list[PointOfInterest]:
     expected = "points of interest"
     with reading(file, expected):
-        points = _POINTS.validate_json(contents(file, expected, MOST_BYTES))
+        points = _POINTS.validate_json(contents(file, expected, LARGEST_POINTS_FILE))
     names = [point.name for point in points]
     for point in points:
         if names.count(point.name) > 1:
@@ -82,7 +82,7 @@ def _is_covariance(matrix: Array) -> bool:
 
 def _picture(file: Path) -> bytes:
     try:
-        require_file(file, MOST_BYTES)
+        require_file(file, LARGEST_POINTS_FILE)
         return file.read_bytes()
     except OSError:
         return b""

@@ -36,13 +36,13 @@ from monstertruck_schemas.state import GateState, Odometry
 from monstertruck_schemas.topics import POSE
 
 TARGET: Final = "monstertruck_estimation.points.reader:ReadingStep"
-START_TIMEOUT: Final = 60.0
+READER_START_TIMEOUT: Final = 60.0
 """Real seconds the worker may take to start."""
 OLDEST: Final = SECOND
 """Older pictures are not read, ns."""
 PERIOD: Final = SECOND
 """Time between two messages, ns."""
-PAUSE: Final = 0.02
+OTHERS_PAUSE: Final = 0.02
 """Seconds that others run then."""
 
 
@@ -191,7 +191,7 @@ class PointService:
         limit = self._clock.now() + (SECOND // 10)  # a picture waits for a pose that is as new for so long, ns
         self._gather()
         while (not self._history or self._history[-1].stamp < stamp) and self._clock.now() < limit:
-            await self._clock.sleep(PAUSE)
+            await self._clock.sleep(OTHERS_PAUSE)
             self._gather()
         if self._is_lost():
             return None
@@ -279,7 +279,7 @@ class PointService:
         dirty, self._dirty = list(self._dirty), {}
         for i, name in enumerate(dirty):
             if i and i % 4 == 0:  # points that are computed without letting others run
-                await self._clock.sleep(PAUSE)
+                await self._clock.sleep(OTHERS_PAUSE)
             self._map.refresh(name, self._bases)
         if dirty:
             self._published, self._unsaved = False, True

@@ -20,7 +20,7 @@ from monstertruck_kinematics.se2 import Pose2, between, compose
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.points import PointKind, PointOfInterest
 
-KEPT: Final = 24
+KEPT_SIGHTINGS: Final = 24
 """Sightings of a point at most."""
 
 
@@ -296,7 +296,7 @@ def _added(sightings: tuple[PointSighting, ...], new: PointSighting) -> tuple[Po
             better = new if new.spread[0] + new.spread[4] < old.spread[0] + old.spread[4] else old
             return (*sightings[:i], better, *sightings[i + 1 :])
     kept = (*sightings, new)
-    return kept if len(kept) <= KEPT else (kept[0], *kept[2:])
+    return kept if len(kept) <= KEPT_SIGHTINGS else (kept[0], *kept[2:])
 
 
 def _into_base(base: Pose2) -> Array:

@@ -113,7 +113,7 @@ class TagReader:
         ]
 
 
-EDGE: Final = (0.12, 0.88)
+SHARP_PART: Final = (0.12, 0.88)
 """Part of an edge that is looked at: its ends are rounded by blur."""
 ACROSS: Final = np.linspace(-2.5, 2.5, 21)
 """Pixels from an edge, over which its step is looked for."""
@@ -129,7 +129,7 @@ def along_edges(picture: Picture, corners: Array) -> Array:
         length = float(np.hypot(*(end - start)))
         along = (end - start) / length
         across = np.array((along[1], -along[0]))
-        points = start + np.linspace(*EDGE, max(8, int(length)))[:, None] * length * along
+        points = start + np.linspace(*SHARP_PART, max(8, int(length)))[:, None] * length * along
         samples = (points[:, None] + ACROSS[:, None] * across).astype(np.float32)
         values = np.asarray(cv2.remap(picture, samples, None, cv2.INTER_LINEAR), dtype=np.float64)
         steps = np.abs(np.diff(values, axis=1))

@@ -21,7 +21,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Peer
 from monstertruck_schemas.topics import PEERS, POSE, Topic
 
-SPACING: Final = 0.05
+TRAIL_SPACING: Final = 0.05
 """Distance between the points of the trail, m."""
 
 Metres = Annotated[float, Field(gt=0, le=20)]
@@ -120,7 +120,7 @@ def extended(trail: LeaderTrail, me: Pose2D, leader: Pose2D) -> LeaderTrail:
     # 0.5: a leader that moves further than this from one step to the next was put down elsewhere, m
     if not points or math.dist(points[-1], at) > 0.5:
         points = (at,)  # straight towards it
-    elif len(points) > 1 and math.dist(points[-2], at) < SPACING:
+    elif len(points) > 1 and math.dist(points[-2], at) < TRAIL_SPACING:
         points = (*points[:-1], at)
     else:
         points = (*points, at)
@@ -133,7 +133,7 @@ def extended(trail: LeaderTrail, me: Pose2D, leader: Pose2D) -> LeaderTrail:
 def _passed(here: Point, first: Point, second: Point) -> bool:
     """Whether the follower has passed ``first`` towards ``second``."""
     dx, dy = second.x - first.x, second.y - first.y
-    return (here.x - first.x) * dx + (here.y - first.y) * dy > 0.0 or math.dist(here, first) < SPACING
+    return (here.x - first.x) * dx + (here.y - first.y) * dy > 0.0 or math.dist(here, first) < TRAIL_SPACING
 
 
 def length(points: tuple[Point, ...]) -> float:
@@ -160,7 +160,7 @@ def curvature(me: Pose2D, points: tuple[Point, ...], ahead: float) -> float:
         here, left = point, left - step
     dx, dy = target.x - me.x, target.y - me.y
     forward, aside = to_body(me.yaw, dx, dy)
-    apart = max(math.hypot(dx, dy), SPACING)
+    apart = max(math.hypot(dx, dy), TRAIL_SPACING)
     if forward < 0.0:
         return math.copysign(2.0 / ahead, aside)
     return min(max(2.0 * aside / apart**2, -2.0 / ahead), 2.0 / ahead)

@@ -31,7 +31,7 @@ from typing import Annotated, Final, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from monstertruck_estimation.body_tilt import KEPT, BodyAcceleration, Tilt
+from monstertruck_estimation.body_tilt import KEPT_ODOMETRY, BodyAcceleration, Tilt
 from monstertruck_kinematics.elementary import Array, clip
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
@@ -236,5 +236,5 @@ class StabiliserService:
 def build_stabiliser(config: StabiliserConfig, clock: Clock, bus: BusPort) -> StabiliserService:
     """The service with its topics, for the catalog."""
     out = bus.publisher(PLAN_STABILISER, Writer.PLANNER)
-    compass, odometry = bus.subscribe(COMPASS, latest()), bus.subscribe(ODOMETRY, fifo(KEPT))
+    compass, odometry = bus.subscribe(COMPASS, latest()), bus.subscribe(ODOMETRY, fifo(KEPT_ODOMETRY))
     return StabiliserService(config, clock, compass, odometry, out)

@@ -32,7 +32,7 @@ from monstertruck_planners.route.heuristic import (
 
 AROUND: Final = 3.0
 """Distance of a viewpoint from its frontier at most, m."""
-LEAST: Final = 0.06
+LEAST_NEW_AREA: Final = 0.06
 """New area that makes a place worth going to, m^2."""
 BEHIND: Final = 4
 """Coarse cells over which the direction of a path is measured."""
@@ -305,7 +305,7 @@ class ExplorationView:
         good = good[_spread(len(good), 32)]  # the best of these that are compared by the new area seen
         gains = self.gains(np.column_stack((places[good], headings[good])))
         # 0.6: places that show less than this share of what the best one shows are passed over
-        worth = gains >= max(0.6 * float(gains.max()), LEAST)
+        worth = gains >= max(0.6 * float(gains.max()), LEAST_NEW_AREA)
         good = good[worth]
         return Viewpoints(change, reached, places[good], bearings[good], headings[good], gains[worth])
 

@@ -17,7 +17,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import ExplorationPhase
 from monstertruck_schemas.reasons import Reason
 
-SETTLE: Final = 1.5
+MAPPING_TIME: Final = 1.5
 """Seconds after a goal until the map contains what is seen there."""
 CONFIRM: Final = 2
 """Evaluations in a row without a frontier after which the exploration ends."""
@@ -367,7 +367,7 @@ def _looking(run: Exploration, seen: Observed) -> Step:
             return _finish(run, answer.failure or Reason.NO_MAP, answer.text or "no map to explore")
         return replace(run, not_before=run.now + 1.0), ()
     if run.nothing + 1 < CONFIRM:
-        return replace(run, nothing=run.nothing + 1, not_before=run.now + SETTLE), ()
+        return replace(run, nothing=run.nothing + 1, not_before=run.now + MAPPING_TIME), ()
     attempts, unreached = run.attempts.released(run.now), run.unreached.released(run.now)
     if attempts is not None or unreached is not None:
         text = "nothing else is left: places that were left alone are tried again"
@@ -393,7 +393,7 @@ def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         reached = seen.ended is Reason.GOAL_REACHED
         if run.backing:
             looking = _enter(run, ExplorationPhase.LOOKING)
-            return replace(looking, target=None, backing=False, not_before=run.now + SETTLE), ()
+            return replace(looking, target=None, backing=False, not_before=run.now + MAPPING_TIME), ()
         target, run = run.target, _counted(run, seen, reached=reached)
         if run.stuck >= STUCK and (back := _back(run)) is not None:
             return back
@@ -401,7 +401,7 @@ def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         if not reached:
             unreached = unreached.failed(target.pose[:2], run.now)
         run = replace(run, target=None, attempts=attempts, unreached=unreached, failures=run.failures + (not reached))
-        run = replace(_enter(run, ExplorationPhase.LOOKING), not_before=run.now + SETTLE, nothing=0)
+        run = replace(_enter(run, ExplorationPhase.LOOKING), not_before=run.now + MAPPING_TIME, nothing=0)
         if reached:
             return run, ()
         text = f"not reached ({seen.ended.text}): left alone for {config.blacklist:g} s"
@@ -410,7 +410,7 @@ def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
     if answer is not None and not answer.kept and not run.backing:
         if answer.target is None:
             looking = replace(
-                _enter(run, ExplorationPhase.LOOKING), target=None, nothing=0, not_before=run.now + SETTLE
+                _enter(run, ExplorationPhase.LOOKING), target=None, nothing=0, not_before=run.now + MAPPING_TIME
             )
             return looking, (Cancel(),)
         return _go(run, answer.target)
@@ -463,7 +463,7 @@ def _ask(run: Exploration) -> Step:
 def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
     if seen.pose is not None:
         phase = ExplorationPhase.LOOKING if run.final is Reason.DRIVING else ExplorationPhase.RETURNING
-        found = replace(_enter(run, phase), waiting=False, target=None, not_before=run.now + SETTLE, nothing=0)
+        found = replace(_enter(run, phase), waiting=False, target=None, not_before=run.now + MAPPING_TIME, nothing=0)
         stop = () if run.target is None else (Cancel(),)
         return found, (*stop, Notice(Reason.POSE_FOUND, Severity.INFO, "goes on"))
     if run.now - run.since > config.lost:

@@ -5,7 +5,14 @@ import math
 import numpy as np
 
 from monstertruck_planners.collision import Footprint
-from monstertruck_planners.explore.api import LEAST, ExplorationView, Explorer, Option, Remembered, make_explorer
+from monstertruck_planners.explore.api import (
+    LEAST_NEW_AREA,
+    ExplorationView,
+    Explorer,
+    Option,
+    Remembered,
+    make_explorer,
+)
 from monstertruck_planners.explore.config import TourConfig
 from monstertruck_planners.explore.exchange import CameraView, ExploreAnswer, ExploreSetup, ExploreTask, Viewpoint
 from monstertruck_planners.explore.frontier import FrontierMap
@@ -70,7 +77,7 @@ class ExploringStep:
     @staticmethod
     def _still(view: ExplorationView, current: Viewpoint | None) -> Option | None:
         """The option that the pursued target is by now; None if little new would be seen there."""
-        if current is None or float(view.gains(np.array([current.pose]))[0]) < max(LEAST, current.gain / 4):
+        if current is None or float(view.gains(np.array([current.pose]))[0]) < max(LEAST_NEW_AREA, current.gain / 4):
             return None
         # 1.0: a frontier this near to the one that is pursued is what became of it, m
         near = [option for option in view.options if math.dist(option.frontier.middle, current.frontier) < 1.0]

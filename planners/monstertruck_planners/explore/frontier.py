@@ -17,7 +17,7 @@ from monstertruck_schemas.state import Grid
 
 Cells = NDArray[np.int8]
 
-UNKNOWN: Final = -1
+UNKNOWN_CELL: Final = -1
 BLOCK: Final = 64
 """The area grows by whole blocks of this many cells."""
 
@@ -33,7 +33,7 @@ class FrontierMap:
         self.resolution = grid.resolution
         self.corner = np.zeros(2, np.int64)
         """Column and row of the first cell."""
-        self.cells: Cells = np.full((0, 0), UNKNOWN, np.int8)
+        self.cells: Cells = np.full((0, 0), UNKNOWN_CELL, np.int8)
         """Shape (rows, columns): -1 unknown, 0 free to 100 occupied."""
         self.frontier: NDArray[np.bool_] = np.zeros((0, 0), np.bool_)
         self.free = 0
@@ -67,7 +67,7 @@ class FrontierMap:
         self.changes += 1
         self._cover(low, low + np.array((grid.width, grid.height)))
         if whole:
-            there = np.full_like(self.cells, UNKNOWN)
+            there = np.full_like(self.cells, UNKNOWN_CELL)
             column, row = low - self.corner
             there[row : row + grid.height, column : column + grid.width] = new
             return self._replace(there, (0, 0))
@@ -101,7 +101,7 @@ class FrontierMap:
         bottom, right = min(box[2] + 1, rows), min(box[3] + 1, columns)
         around = self.cells[max(top - 1, 0) : bottom + 1, max(left - 1, 0) : right + 1]
         pads = [(int(top == 0), int(bottom == rows)), (int(left == 0), int(right == columns))]
-        unknown = np.pad(around == UNKNOWN, pads)
+        unknown = np.pad(around == UNKNOWN_CELL, pads)
         beside = unknown[:-2, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :-2] | unknown[1:-1, 2:]
         inner = self.cells[top:bottom, left:right]
         self.frontier[top:bottom, left:right] = beside & (inner >= 0) & (inner < OCCUPIED)
@@ -122,7 +122,7 @@ class FrontierMap:
             wider = np.zeros(2, np.int64), np.zeros(2, np.int64)
         corner = (low // BLOCK - wider[0]) * BLOCK
         shape = ((-(-high // BLOCK) + wider[1]) * BLOCK - corner)[::-1]
-        cells, frontier = np.full(shape, UNKNOWN, np.int8), np.zeros(shape, np.bool_)
+        cells, frontier = np.full(shape, UNKNOWN_CELL, np.int8), np.zeros(shape, np.bool_)
         changed = np.zeros(np.array(shape) // BLOCK, np.int64)
         if size.all():
             column, row = self.corner - corner

@@ -29,7 +29,7 @@ from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY
 
-RETRY: Final = 10.0
+DEFORM_RETRY: Final = 10.0
 """Seconds after which a deforming step that did not start is started again."""
 
 
@@ -105,7 +105,7 @@ class RouteDeformation:
                 await actor.start()
             except WorkerError as error:
                 self._events(error.reason, Severity.ERROR, self.name, f"routes are not deformed: {error}")
-                await self._clock.sleep(RETRY)
+                await self._clock.sleep(DEFORM_RETRY)
             else:
                 return
 

@@ -16,7 +16,7 @@ from monstertruck_planners.collision import Footprint, first_contact, swept_pose
 from monstertruck_planners.goals.config import EscapeConfig
 from monstertruck_schemas.plan import Steering
 
-STEP = 0.02
+ESCAPE_POSE_STEP = 0.02
 """Metres between two poses of the path."""
 
 
@@ -97,7 +97,7 @@ def _motion(
     front = direction * away
     behind = front if crab else (-front if rear else 0.0)
     steering: Steering = "crab" if crab else ("counter" if rear else "front")
-    distances = direction * np.arange(0.0, config.distance + STEP / 2, STEP)
+    distances = direction * np.arange(0.0, config.distance + ESCAPE_POSE_STEP / 2, ESCAPE_POSE_STEP)
     poses = swept_poses(geometry.body_twist(1.0, front, behind), distances)
     contact = first_contact(footprint, poses, points, config.margin)
     return _before(Escape(poses, direction, steering), contact)
@@ -107,4 +107,4 @@ def _before(motion: Escape, contact: int | None) -> Escape | None:
     """A motion up to the pose before a contact; None if that is too short."""
     poses = motion.poses[:contact]
     # 0.04: least length of an escape motion, m
-    return replace(motion, poses=poses) if (len(poses) - 1) * STEP >= 0.04 else None
+    return replace(motion, poses=poses) if (len(poses) - 1) * ESCAPE_POSE_STEP >= 0.04 else None

@@ -295,7 +295,7 @@ def _relax(
     return count, True
 
 
-SPACING = 0.2
+BUBBLE_SPACING = 0.2
 """Largest distance of bubbles, m."""
 
 
@@ -338,7 +338,7 @@ def band_parameters(config: BandConfig, cover: CoveringDiscs) -> BandParameters:
     return BandParameters(
         config.overlap, config.internal_gain, config.external_gain, config.iterations, config.depth,
         config.overshoot, config.significant, config.tiny, config.largest,
-        1.0, 0.5 * cover.reach, SPACING, False,
+        1.0, 0.5 * cover.reach, BUBBLE_SPACING, False,
     )  # fmt: skip
 
 

@@ -71,7 +71,7 @@ SOURCE: Final = ServiceName.MISSIONS.value
 """Source of the goals, behaviours and explorations of a mission."""
 OWN: Final = frozenset({SOURCE, ServiceName.EXPLORER.value})
 """Sources of the goals that are pursued for a mission, or for an exploration."""
-RATE: Final = 5.0
+MISSION_CHECK_RATE: Final = 5.0
 """Checks per second."""
 CHANGES: Final = ("number", "running", "step", "attempt", "outcome", "resumable")
 """Fields of the report whose change is reported at once."""
@@ -184,7 +184,7 @@ class MissionService:
         async with asyncio.TaskGroup() as self._group:
             self.tasks.report()
             ready()
-            schedule = Schedule(self._clock, RATE)
+            schedule = Schedule(self._clock, MISSION_CHECK_RATE)
             try:
                 while True:
                     await schedule.next()
@@ -393,7 +393,7 @@ class MissionService:
             gate = self._in.gate.latest
             if gate is None or not gate.mode.active:
                 raise does_not_drive(gate)
-            await self._clock.sleep(min(left / SECOND, 1.0 / RATE))
+            await self._clock.sleep(min(left / SECOND, 1.0 / MISSION_CHECK_RATE))
         return StepEnd(Reason.OK)
 
     def _before(self, step: PointStep) -> Pose2:
@@ -486,7 +486,7 @@ class MissionService:
             TruckError: it was refused.
         """
         number = await self._taken(lambda: server.take(start()))
-        schedule, newest, silent = Schedule(self._clock, RATE), reports.latest, 0
+        schedule, newest, silent = Schedule(self._clock, MISSION_CHECK_RATE), reports.latest, 0
         ended: StepEnd | None = None
         try:
             while (ended := _end_of(reports.latest, number, server.noun)) is None:
@@ -497,7 +497,7 @@ class MissionService:
                 self._wait_for_resume()
                 silent = silent + 1 if state is newest else 0
                 newest = state
-                if silent > SILENT * RATE:
+                if silent > SILENT * MISSION_CHECK_RATE:
                     return StepEnd(Reason.SERVICE_FAILED, f"nothing was reported on it for {SILENT:g} s")
                 await schedule.next()
         finally:
@@ -535,7 +535,7 @@ class MissionService:
         if goal is None or goal.phase is not GoalPhase.PAUSED or limit is None or limit.expired():
             return
         if (when := limit.when()) is not None:
-            limit.reschedule(when + 1.0 / RATE)
+            limit.reschedule(when + 1.0 / MISSION_CHECK_RATE)
 
     def _header(self) -> dict[str, Any]:
         self._seq += 1

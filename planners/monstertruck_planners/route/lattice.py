@@ -64,7 +64,7 @@ VECTORS = (
 )  # fmt: skip
 ANGLES = np.array([math.atan2(y, x) for x, y in VECTORS])
 HEADINGS = len(VECTORS)
-LONG = 8
+LONG_PRIMITIVE = 8
 """Cells of the long straight primitive, about."""
 MAX_PRIMITIVE_SEGMENTS = 3
 
@@ -114,7 +114,7 @@ def _primitives_from(
     turn_factor, back_factor, back_turn_factor = factors
     x, y = VECTORS[h]
     primitives: list[_Primitive] = []
-    for steps in (1, max(round(LONG / math.hypot(x, y)), 2)):
+    for steps in (1, max(round(LONG_PRIMITIVE / math.hypot(x, y)), 2)):
         length = steps * math.hypot(x, y) * cell
         primitives.append(([(length, 0.0, 0.0)], (steps * x, steps * y, 0), length))
         if steps == 1:
@@ -166,8 +166,8 @@ def _turn(h: int, turn: int, radius: float, cell: float) -> tuple[list[_Segment]
 def _translations(h: int, side: int, crab: float) -> list[tuple[int, int, float]]:
     """The steepest translation to one side within LONG cells: columns, rows, angle."""
     found = []
-    for dx in range(-LONG, LONG + 1):
-        for dy in range(-LONG, LONG + 1):
+    for dx in range(-LONG_PRIMITIVE, LONG_PRIMITIVE + 1):
+        for dy in range(-LONG_PRIMITIVE, LONG_PRIMITIVE + 1):
             angle = math.remainder(math.atan2(dy, dx) - ANGLES[h], math.tau)
             if (dx or dy) and 1e-9 < side * angle <= crab + 1e-12:
                 found.append((-round(abs(angle), 9), math.hypot(dx, dy), dx, dy, angle))

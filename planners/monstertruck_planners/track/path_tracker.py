@@ -184,7 +184,7 @@ class Command:
     """DRIVING, GOAL_REACHED, GOAL_MISSED, CUSP_MISSED, PATH_LOST, NOT_FINITE, or of the service STUCK."""
 
 
-LEAST: Final = 1e-6
+LEAST_CURVATURE: Final = 1e-6
 """Curvatures (1/m) and turns (rad) are taken to be no smaller."""
 
 
@@ -198,8 +198,8 @@ class SpeedProfile:
 
     def __init__(self, config: TrackerConfig, reference: Reference) -> None:
         s = reference.places
-        allowed = config.lateral_acceleration / np.maximum(np.abs(reference.at(s).curvature), LEAST)
-        change = np.maximum(reference.axle_change(config.steering_distance), LEAST)
+        allowed = config.lateral_acceleration / np.maximum(np.abs(reference.at(s).curvature), LEAST_CURVATURE)
+        change = np.maximum(reference.axle_change(config.steering_distance), LEAST_CURVATURE)
         turning = config.steering_distance * config.steering_rate / change
         gained = 2 * config.deceleration * s
         least = np.minimum.accumulate((np.minimum(allowed, turning**2) + gained)[::-1])[::-1]

@@ -8,7 +8,7 @@ import numpy as np
 from monstertruck_planners.track.segments import check_path
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
-from monstertruck_runtime.outside import LONGEST
+from monstertruck_runtime.outside import QUOTED
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import Sequences, does_not_drive, examine, parse_request
 from monstertruck_runtime.tables import read_table
@@ -34,7 +34,7 @@ def load_path(file: FilePath, *, closed: bool, frame: str = "odom") -> Path:
     rows = read_table(file, f"a table {','.join(HEADER)}", 10_000_000)
     if not rows or rows[0][1] != HEADER:
         line, met = rows[0] if rows else (1, [])
-        found = f"found {','.join(met)[:LONGEST]}" if rows else "the file is empty"
+        found = f"found {','.join(met)[:QUOTED]}" if rows else "the file is empty"
         raise InputError(f"{file}:{line}: expected the header {','.join(HEADER)}, {found}")
     values = np.array([_numbers(file, line, row) for line, row in rows[1:]])
     if len(values) < 2:
@@ -60,9 +60,9 @@ def _numbers(file: FilePath, line: int, row: list[str]) -> list[float]:
     try:
         numbers = [float(cell) for cell in row]
     except ValueError as error:
-        raise InputError(f"{file}:{line}: expected four numbers, found {','.join(row)[:LONGEST]}") from error
+        raise InputError(f"{file}:{line}: expected four numbers, found {','.join(row)[:QUOTED]}") from error
     if len(numbers) != len(HEADER) or not np.isfinite(numbers).all() or numbers[3] not in (1.0, -1.0):
-        raise InputError(f"{file}:{line}: expected x,y,yaw and a direction of 1 or -1, found {','.join(row)[:LONGEST]}")
+        raise InputError(f"{file}:{line}: expected x,y,yaw and a direction of 1 or -1, found {','.join(row)[:QUOTED]}")
     return numbers
 
 

@@ -16,13 +16,13 @@ from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 
-CELL: Final = 0.01
+LAG_CELL: Final = 0.01
 """Spacing of the history and of the candidates' dead times, s."""
 DEAD_TIMES: Final = 31
 """Candidates: 0 to 0.3 s."""
 LAGS: Final = np.array((0.0, 0.05, 0.1, 0.15, 0.2))
 """Candidates, s."""
-KEPT: Final = 100
+KEPT_CELLS: Final = 100
 """Cells of history that are needed before the newest: the longest dead time and the longest pause between poses."""
 EARLY: Final = 1e-6
 """Cells by which rounding may make an instant early."""
@@ -68,12 +68,12 @@ class ResponseEstimator:
     def __init__(self, geometry: FourWheelSteering, rate: float) -> None:
         self._geometry = geometry
         self._rate = rate
-        dead_times, by_lag = (a.ravel() for a in np.broadcast_arrays(CELL * np.arange(DEAD_TIMES), LAGS[:, None]))
+        dead_times, by_lag = (a.ravel() for a in np.broadcast_arrays(LAG_CELL * np.arange(DEAD_TIMES), LAGS[:, None]))
         totals = dead_times + by_lag
         # mean and standard deviation of dead time and lag together of a truck that was not measured, s
         expected = (0.05, 0.08)
         self._prior = 0.5 * ((totals - expected[0]) / expected[1]) ** 2
-        self._keep = [math.exp(-CELL / lag) if lag else 0.0 for lag in LAGS.tolist()]
+        self._keep = [math.exp(-LAG_CELL / lag) if lag else 0.0 for lag in LAGS.tolist()]
         self._powers = np.stack((np.ones(len(totals)), dead_times, by_lag, dead_times**2, totals**2))
         """Powers of the candidates; their weighted sums are the moments of the estimate."""
         self._by_x: Array = np.zeros((3, len(totals)))
@@ -95,7 +95,7 @@ class ResponseEstimator:
         """Greatest change within one cell, rad/m."""
         self._curvatures = [0.0] * len(self._keep)
         self._turns = [0.0] * len(self._keep)
-        self._history = np.zeros((len(self._keep), 4 * KEPT))
+        self._history = np.zeros((len(self._keep), 4 * KEPT_CELLS))
         """Turn per metre, summed up over time, at the end of each cell, rad s/m."""
         self._end = 1
         """Cells written."""
@@ -107,12 +107,12 @@ class ResponseEstimator:
     def request(self, t: float, angles: tuple[float, float]) -> None:
         """Note axle angles, rad, requested at ``t``."""
         if math.isnan(self._begin):
-            self._begin = t - (self._end - 1) * CELL
+            self._begin = t - (self._end - 1) * LAG_CELL
         self._fill(t)
         change = max(abs(new - old) for new, old in zip(angles, self._request, strict=True))
         bend = self._geometry.body_twist(1.0, *angles)[2]
         if change > 0.0:
-            self._most = self._rate * CELL * abs(bend - self._bend) / change
+            self._most = self._rate * LAG_CELL * abs(bend - self._bend) / change
         self._request, self._bend = angles, bend
 
     def observe(self, t: float, yaw: float, speed: float, *, measured: bool = False) -> bool:
@@ -141,25 +141,25 @@ class ResponseEstimator:
 
     def _fill(self, t: float) -> None:
         """Write the cells that end up to ``t``."""
-        count = math.floor((t - self._begin) / CELL + EARLY) + 1 - self._end
-        if count > 2 * KEPT:
+        count = math.floor((t - self._begin) / LAG_CELL + EARLY) + 1 - self._end
+        if count > 2 * KEPT_CELLS:
             self.forget_requests()
             return
         for _ in range(count):
             if self._end == len(self._history[0]):
-                self._history[:, : 2 * KEPT] = self._history[:, 2 * KEPT :]
-                self._end -= 2 * KEPT
-                self._begin += 2 * KEPT * CELL
+                self._history[:, : 2 * KEPT_CELLS] = self._history[:, 2 * KEPT_CELLS :]
+                self._end -= 2 * KEPT_CELLS
+                self._begin += 2 * KEPT_CELLS * LAG_CELL
             for i, keep in enumerate(self._keep):
                 change = (1.0 - keep) * (self._bend - self._curvatures[i])
                 self._curvatures[i] += min(max(change, -self._most), self._most)
-                self._turns[i] += CELL * self._curvatures[i]
+                self._turns[i] += LAG_CELL * self._curvatures[i]
             self._history[:, self._end] = self._turns
             self._end += 1
 
     def _at(self, t: float) -> Array | None:
         """The sums at ``t`` less each dead time, by candidate; None if that is before the history."""
-        cells = (t - self._begin) / CELL + EARLY
+        cells = (t - self._begin) / LAG_CELL + EARLY
         i = math.floor(cells)
         if i < DEAD_TIMES or i >= self._end:
             return None
@@ -200,14 +200,14 @@ class ResponseEstimator:
         return ResponseEstimate(response, total_deviation, dead_time_deviation, self._samples)
 
 
-STEP: Final = 0.05
+LAG_STEP: Final = 0.05
 """Estimated lags are rounded to multiples of this, s: every lag needs gains of its own."""
 
 
 def rounded(estimate: ResponseEstimate) -> Response:
-    """The estimated delay: dead time alone until it shows how it is divided; the lag is a multiple of ``STEP``."""
+    """The estimated delay: dead time alone until it shows how it is divided; the lag is a multiple of ``LAG_STEP``."""
     found = estimate.response
-    lag = STEP * round(found.lag / STEP) if estimate.shape_deviation < STEP / 2 else 0.0
+    lag = LAG_STEP * round(found.lag / LAG_STEP) if estimate.shape_deviation < LAG_STEP / 2 else 0.0
     return Response(max(found.total - lag, 0.0), lag)
 
 

@@ -342,7 +342,7 @@ def _reach(points: Array, beyond: float) -> int:
     return int(np.searchsorted(travelled, beyond)) + 1
 
 
-STEP: Final = 0.025
+PATH_GRID: Final = 0.025
 """Spacing of the reference and half the chord a heading is taken from, m."""
 QUANTILES: Final = -np.log1p(-(np.arange(16) + 0.5) / 16)
 """Quantiles of the exponential distribution: a mean over them is a first-order lag."""
@@ -385,7 +385,9 @@ class Reference:
     def __init__(self, segment: Segment, geometry: FourWheelSteering, steering: Steering) -> None:
         self._segment = segment
         self._default: Steering = steering
-        count = min(max(math.ceil(segment.end / STEP), 4), 5000) + 1  # greatest number of reference points of a segment
+        count = (
+            min(max(math.ceil(segment.end / PATH_GRID), 4), 5000) + 1
+        )  # greatest number of reference points of a segment
         self._s = np.linspace(0.0, segment.end, count)
         tangent, curvature = _tangents(segment, self._s)
         heading = tangent if segment.direction > 0 else tangent + math.pi
@@ -491,7 +493,7 @@ def _slip_free(mode: Steering, geometry: FourWheelSteering) -> float:
 
 def _tangents(segment: Segment, s: Array) -> tuple[Array, Array]:
     """Tangent (continuous) and curvature from chords."""
-    half = min(STEP, segment.end / 4)
+    half = min(PATH_GRID, segment.end / 4)
     at = np.clip(s, half, segment.end - half)
     tangent = np.unwrap(_chord(segment, at - half, at + half))
     middle = np.clip(s, 2 * half, segment.end - 2 * half)

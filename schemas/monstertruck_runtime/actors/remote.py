@@ -33,7 +33,7 @@ POLL: Final = 2.0
 """Seconds a caller waits for work."""
 PART: Final = 8192
 """Characters of outputs in one call."""
-RETRY: Final = 1.0
+REMOTE_RETRY: Final = 1.0
 """Seconds between two tries to reach a robot."""
 _DTYPES: Final = ("float64", "int8", "uint8", "int64")
 
@@ -329,7 +329,7 @@ async def serve(
                     tasks.create_task(work(client, clock, name, target, codec, f"{client.source[:40]}.{clock.now():x}"))
         except* TruckError as group:
             log.warning("%s; tries again", group.exceptions[0])
-        await clock.sleep(RETRY)
+        await clock.sleep(REMOTE_RETRY)
 
 
 async def work(caller: Operator, clock: Clock, name: str, target: str, codec: StepCodec, server: str) -> None:
@@ -348,7 +348,7 @@ async def work(caller: Operator, clock: Clock, name: str, target: str, codec: St
         except NotFoundError as error:
             if "not placed" not in str(error) and "no rpc" not in str(error):
                 raise
-            await clock.sleep(RETRY)
+            await clock.sleep(REMOTE_RETRY)
             continue
         if "inputs" not in reply:
             continue

@@ -20,7 +20,7 @@ from monstertruck_schemas.topics import Topic
 
 M = TypeVar("M", bound=Message)
 
-VERSION: Final = 1
+WIRE_VERSION: Final = 1
 """Version of every schema; counts changes that are not plain growth."""
 
 _BYTE: Final = re.compile("[\udc80-\udcff]")
@@ -91,7 +91,7 @@ def decode(topic: Topic[M], data: bytes) -> M:
 def encoding(topic: Topic[Any]) -> str:
     """Zenoh encoding: media type, schema name and version."""
     media = "application/json" if topic.foxglove is None else "application/protobuf"
-    return f"{media};{topic.schema_name};v={VERSION}"
+    return f"{media};{topic.schema_name};v={WIRE_VERSION}"
 
 
 @cache

@@ -21,12 +21,12 @@ from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import ESTOP_WAY, EVENT, REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH, Topic
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, Sender
 from monstertruckd.bus.intake import (
-    DEPTH,
     LIMITS,
     MAX_OWNERS,
     MAX_REPEATS,
     ORDER_RATE,
     REPEAT,
+    REQUEST_QUEUE,
     STOP_RATE,
     Intake,
     Refusals,
@@ -108,7 +108,7 @@ class Entrance:
         self.intakes[ESTOP_WAY].take(ANN, len(data), lambda: data)
 
     async def settle(self) -> None:
-        for _ in range(3 * DEPTH):
+        for _ in range(3 * REQUEST_QUEUE):
             await asyncio.sleep(0)
 
 
@@ -128,10 +128,10 @@ async def test_an_emergency_stop_reaches_the_gate_through_any_flood(urgent: Orde
         gate.control(request, 1)
 
     entrance.bus.listen(REQ_CONTROL, take)
-    bogus = [(REQ_CONTROL, order(Order.ARM, seq, nonce="bogus")) for seq in range(4 * DEPTH)]
+    bogus = [(REQ_CONTROL, order(Order.ARM, seq, nonce="bogus")) for seq in range(4 * REQUEST_QUEUE)]
     position = {"first": 0, "last": len(bogus), "middle": len(bogus) // 2}[place]
     bogus.insert(position, (REQ_CONTROL, order(urgent)))
-    entrance.send(*[(REQ_DRIVE, drive(seq)) for seq in range(4 * DEPTH)], *bogus, (REQ_PATH, path(2000)))
+    entrance.send(*[(REQ_DRIVE, drive(seq)) for seq in range(4 * REQUEST_QUEUE)], *bogus, (REQ_PATH, path(2000)))
     await entrance.settle()
     assert urgent in taken
     assert len(taken) == ORDER_RATE + 1
@@ -143,12 +143,12 @@ async def test_an_emergency_stop_overtakes_the_orders_that_wait():
     entrance = Entrance()
     taken: list[Order] = []
     entrance.bus.listen(REQ_CONTROL, lambda request: taken.append(request.order))
-    stops = [(REQ_CONTROL, order(Order.STOP))] * (2 * DEPTH)
+    stops = [(REQ_CONTROL, order(Order.STOP))] * (2 * REQUEST_QUEUE)
     for name in ("eve", "bob"):
         entrance.send(*stops, sender=Sender(name, EVERYTHING))
     entrance.send((REQ_CONTROL, order(Order.ESTOP)))
     await entrance.settle()
-    assert len(taken) == DEPTH + 1
+    assert len(taken) == REQUEST_QUEUE + 1
     assert taken.index(Order.ESTOP) <= 1
 
 
@@ -253,10 +253,10 @@ async def test_a_flood_of_stops_does_not_push_out_an_emergency_stop():
     entrance = Entrance()
     taken: list[Order] = []
     entrance.bus.listen(REQ_CONTROL, lambda request: taken.append(request.order))
-    entrance.send((REQ_CONTROL, order(Order.ESTOP)), *[(REQ_CONTROL, order(Order.STOP))] * (2 * DEPTH))
+    entrance.send((REQ_CONTROL, order(Order.ESTOP)), *[(REQ_CONTROL, order(Order.STOP))] * (2 * REQUEST_QUEUE))
     await entrance.settle()
     assert Order.ESTOP in taken[:2]
-    entrance.send(*[(REQ_CONTROL, order(Order.ESTOP))] * (2 * DEPTH))
+    entrance.send(*[(REQ_CONTROL, order(Order.ESTOP))] * (2 * REQUEST_QUEUE))
     await entrance.settle()
     assert taken[-1] is Order.ESTOP
 
@@ -267,17 +267,17 @@ async def test_a_batch_is_taken_one_request_a_turn():
     seen: list[int] = []
 
     async def read() -> None:
-        while len(seen) < DEPTH:
+        while len(seen) < REQUEST_QUEUE:
             seen.append((await box.next()).seq)
 
     reading = asyncio.create_task(read())
     await asyncio.sleep(0)
-    entrance.send(*[(REQ_DRIVE, drive(seq)) for seq in range(DEPTH)])
+    entrance.send(*[(REQ_DRIVE, drive(seq)) for seq in range(REQUEST_QUEUE)])
     await asyncio.sleep(0)
     assert len(seen) <= 1
     await entrance.settle()
     await reading
-    assert seen == list(range(DEPTH))
+    assert seen == list(range(REQUEST_QUEUE))
 
 
 async def test_a_path_of_two_thousand_poses_fits():

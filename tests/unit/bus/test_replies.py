@@ -80,7 +80,7 @@ def test_an_owner_has_one_reply_under_way_and_holds_up_no_other():
 
 
 def test_where_too_many_wait_no_more_are_taken_until_one_has_left(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(replies_module, "DEPTH", 20)
+    monkeypatch.setattr(replies_module, "REPLY_QUEUE", 20)
     replies, taken = Replies(), threading.Event()
     for _ in range(19):
         replies.end(Question(taken))

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from monstertruck_estimation.heading_turns import LONGEST, HeadingTurns
+from monstertruck_estimation.heading_turns import LONGEST_TURN, HeadingTurns
 
 
 def contradicted(share, turn=1.0, distance=1.0, start=3.0, steps=40):
@@ -25,7 +25,7 @@ def test_headings_that_turn_the_other_way_are_contrary(turn):
 
 
 def test_a_slow_drift_is_no_turn_and_a_spot_turn_is_one():
-    assert not contradicted(-1.0, turn=0.5, distance=3 * LONGEST)
+    assert not contradicted(-1.0, turn=0.5, distance=3 * LONGEST_TURN)
     assert contradicted(-1.0, turn=0.5, distance=0.0)
     assert not contradicted(-1.0, turn=0.2)
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_estimation.scan_tilt import UNKNOWN, AngleHistory, ScanAngles, TiltStamper, plane_tilt
+from monstertruck_estimation.scan_tilt import NO_TILT, AngleHistory, ScanAngles, TiltStamper, plane_tilt
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.mailbox import Delivery, Mailbox
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback, StabiliserJoint, TorqueState
@@ -120,4 +120,4 @@ def test_a_mount_that_tells_nothing_makes_the_worst_of_the_scan(reading: Stabili
     if reading is not None:
         feedback.put(reading)
     TiltStamper(out, ScanAngles(compass, feedback)).put(scan(0))
-    assert out.scans[0].tilt == UNKNOWN
+    assert out.scans[0].tilt == NO_TILT

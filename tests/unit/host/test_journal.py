@@ -12,8 +12,8 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.event import LogLevel
 from monstertruck_schemas.topics import Writer
 from monstertruckd.bus.local import Bus
-from monstertruckd.host.journal import DEPTH, Journal, published
-from monstertruckd.host.logging_queue import LONGEST
+from monstertruckd.host.journal import JOURNAL_QUEUE, Journal, published
+from monstertruckd.host.logging_queue import LONGEST_RECORD
 
 log = logging.getLogger("monstertruckd.test")
 
@@ -129,11 +129,11 @@ def test_a_burst_is_bounded_loses_the_least_and_counts_it():
     async def scenario(bench):
         with bench.journal():
             log.error("first")
-            for number in range(DEPTH + 50):
+            for number in range(JOURNAL_QUEUE + 50):
                 log.info("%d", number)
             await bench.clock.sleep(1.0)
         records = bench.inbox.drain()
-        assert len(records) == DEPTH
+        assert len(records) == JOURNAL_QUEUE
         assert records[0].text == "first", "the lowest level goes first"
         assert bench.bus.drops == 51
 
@@ -143,10 +143,10 @@ def test_a_burst_is_bounded_loses_the_least_and_counts_it():
 def test_long_records_are_cut():
     async def scenario(bench):
         with bench.journal():
-            log.info("x" * (LONGEST + 7))
+            log.info("x" * (LONGEST_RECORD + 7))
             await bench.clock.sleep(0.1)
         (record,) = bench.inbox.drain()
-        assert len(record.text) < LONGEST + 40
+        assert len(record.text) < LONGEST_RECORD + 40
         assert record.text.endswith(" ... 7 characters more")
 
     on_bench(scenario)

@@ -11,8 +11,8 @@ import pytest
 
 from monstertruckd.host import logging_queue
 from monstertruckd.host.logging_queue import (
-    DEPTH,
-    LONGEST,
+    LOG_QUEUE,
+    LONGEST_RECORD,
     LossyQueueHandler,
     PlainFormatter,
     read_by_journal,
@@ -48,7 +48,7 @@ def clean_root():
 def test_a_stuck_reader_costs_records_not_time(clean_root: logging.Logger):
     stream = StuckStream()
     listener = start_logging(verbose=False, stream=stream)
-    for number in range(DEPTH + 500):
+    for number in range(LOG_QUEUE + 500):
         logging.getLogger("x").warning("%d", number)
     (handler,) = (h for h in clean_root.handlers if isinstance(h, LossyQueueHandler))
     assert handler.lost >= 490
@@ -57,7 +57,7 @@ def test_a_stuck_reader_costs_records_not_time(clean_root: logging.Logger):
     stream.released.set()
     listener.stop()
     assert "WARNING x: 0\n" in stream.getvalue()
-    assert f": {DEPTH + 499}\n" not in stream.getvalue()
+    assert f": {LOG_QUEUE + 499}\n" not in stream.getvalue()
     assert f"{handler.lost} records lost: this output was stuck\n" in stream.getvalue()
 
 
@@ -145,14 +145,14 @@ def test_what_is_long_is_cut_before_it_is_searched(monkeypatch: pytest.MonkeyPat
     searched = []
     monkeypatch.setattr(logging_queue, "redacted", lambda text: searched.append(len(text)) or text)
     text = shown("x" * 10_000_000)
-    assert searched[0] < 2 * LONGEST
-    assert text == f"{'x' * LONGEST} ... {10_000_000 - LONGEST} characters more"
+    assert searched[0] < 2 * LONGEST_RECORD
+    assert text == f"{'x' * LONGEST_RECORD} ... {10_000_000 - LONGEST_RECORD} characters more"
     record = logging.LogRecord("x", logging.ERROR, "f", 1, "x" * 10_000_000, None, None)
-    assert len(PlainFormatter(journal=False).format(record)) < 2 * LONGEST
+    assert len(PlainFormatter(journal=False).format(record)) < 2 * LONGEST_RECORD
 
 
 def test_a_cut_leaves_no_half_of_a_secret():
-    text = "x" * (LONGEST - 20) + " http://user:hunter2hunter2hunter2@host"
+    text = "x" * (LONGEST_RECORD - 20) + " http://user:hunter2hunter2hunter2@host"
     assert "hunter" not in shown(text)
 
 

@@ -113,7 +113,7 @@ def test_a_folder_that_cannot_be_written_costs_the_file_only(tmp_path: Path, cap
 
 
 def test_old_dumps_go(tmp_path: Path):
-    for number in range(1, stall.KEPT + 6):
+    for number in range(1, stall.KEPT_DUMPS + 6):
         (tmp_path / f"stall-{number:06d}.txt").touch()
     (tmp_path / "notes.txt").touch()
 
@@ -122,6 +122,6 @@ def test_old_dumps_go(tmp_path: Path):
 
     asyncio.run(watched(tmp_path, scenario))
     files = dumps(tmp_path)
-    assert len(files) == stall.KEPT
-    assert files[-1].name == f"stall-{stall.KEPT + 6:06d}.txt"
+    assert len(files) == stall.KEPT_DUMPS
+    assert files[-1].name == f"stall-{stall.KEPT_DUMPS + 6:06d}.txt"
     assert (tmp_path / "notes.txt").exists()

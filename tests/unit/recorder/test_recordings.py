@@ -12,7 +12,7 @@ from monstertruck_runtime.errors import BusyError, InputError, NotFoundError
 from monstertruck_runtime.recordings import fetch_recording
 from monstertruck_runtime.threads import inline
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.recorder.recordings import CHUNK, RATE, TURN, Recordings
+from monstertruckd.recorder.recordings import CHUNK, DOWNLOAD_RATE, TURN, Recordings
 from monstertruckd.recorder.repair import in_use
 
 
@@ -69,7 +69,7 @@ def test_a_download_comes_in_chunks_at_a_limited_rate_and_goes_on_where_it_was_b
 
     (data, seconds), _ = asked(folder, scenario)
     assert data == (folder / "run-000001-000.mcap").read_bytes()
-    assert seconds > (len(data) - CHUNK) / RATE * 0.99
+    assert seconds > (len(data) - CHUNK) / DOWNLOAD_RATE * 0.99
 
 
 def test_one_source_downloads_at_a_time(folder: Path):

@@ -12,7 +12,7 @@ from tests.bus_kit import free_endpoint
 
 
 async def test_why_a_router_shows_no_robots_is_said_once(caplog: pytest.LogCaptureFixture, monkeypatch):
-    monkeypatch.setattr(discovery, "RETRY", 0.05)
+    monkeypatch.setattr(discovery, "ROUTER_RETRY", 0.05)
     endpoint = free_endpoint()
     watching = asyncio.create_task(Discovery(endpoint, WallClock(), lambda _: None).run())
     await asyncio.sleep(0.6)

@@ -43,7 +43,7 @@ async def until(viewer: Viewer, condition) -> dict[str, dict[str, Any]]:
 
 
 async def test_every_robot_has_a_row_and_one_that_is_gone_keeps_its_last_place(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(fleet, "PERIOD", 0.05)
+    monkeypatch.setattr(fleet, "FLEET_PERIOD", 0.05)
     monkeypatch.setattr("monstertruckd.station.feed.PING", 0.1)
     clock = WallClock()
     async with running_robot(robot="ann") as robot:

@@ -30,7 +30,7 @@ def basic(name: str, password: str) -> str:
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(users, "PAUSE", 0.01)
+    monkeypatch.setattr(users, "WRONG_PASSWORD_PAUSE", 0.01)
     monkeypatch.setattr(users, "COST", users.COST | {"n": 2**8})
     made = tmp_path / "users.yaml"
     add_user(made, "ann", AccessRole.PILOT, "correct horse")
@@ -62,7 +62,7 @@ async def test_who_logs_in_and_who_does_not(file: Path):
 
 
 async def test_whoever_guesses_holds_up_nobody_at_another_address(file: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(users, "PAUSE", 60.0)
+    monkeypatch.setattr(users, "WRONG_PASSWORD_PAUSE", 60.0)
     known = StationUsers(file)
     guesses = [asyncio.create_task(known.who(basic("ann", str(number)), "10.0.0.9")) for number in range(20)]
     await asyncio.sleep(0.05)
@@ -75,13 +75,13 @@ async def test_whoever_guesses_holds_up_nobody_at_another_address(file: Path, mo
 
 
 async def test_guesses_of_one_network_wait_in_one_queue_which_has_an_end(file: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(users, "PAUSE", 60.0)
+    monkeypatch.setattr(users, "WRONG_PASSWORD_PAUSE", 60.0)
     known = StationUsers(file)
-    addresses = [f"2001:db8::{number:x}" for number in range(2 * users.MOST_WAITING)]
+    addresses = [f"2001:db8::{number:x}" for number in range(2 * users.MOST_ATTEMPTS)]
     guesses = [asyncio.create_task(known.who(basic("ann", address), address)) for address in addresses]
     await asyncio.sleep(0.05)
     assert list(known._turns) == ["2001:db8::/64"]
-    assert [guess.done() for guess in guesses].count(True) == users.MOST_WAITING
+    assert [guess.done() for guess in guesses].count(True) == users.MOST_ATTEMPTS
     for guess in guesses:
         guess.cancel()
     await asyncio.gather(*guesses, return_exceptions=True)
@@ -161,7 +161,7 @@ def test_users_are_replaced_as_a_whole(file: Path, tmp_path: Path):
 
 
 async def test_a_revoked_user_whose_browser_reads_nothing_is_cut_off(file: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(server_module, "LOOK", 0.05)
+    monkeypatch.setattr(server_module, "CHECK_PERIOD", 0.05)
     monkeypatch.setattr(server_module, "END", 0.2)
     place = Place(port=free_port(), users=StationUsers(file))
     station = Station([RobotAddress("truck", "tcp/127.0.0.1:1")], WallClock(), place)
@@ -196,7 +196,7 @@ async def test_a_revoked_user_whose_browser_reads_nothing_is_cut_off(file: Path,
 async def test_an_observer_sees_and_may_stop_and_nothing_else_over_tls(
     file: Path, tmp_path: Path, caplog, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(server_module, "LOOK", 0.05)
+    monkeypatch.setattr(server_module, "CHECK_PERIOD", 0.05)
     server, client = self_signed(tmp_path)
     robot = RobotAddress("truck", "tcp/127.0.0.1:1")
     station = Station([robot], WallClock(), Place(port=free_port(), tls=server, users=StationUsers(file)))
@@ -250,7 +250,7 @@ async def test_an_observer_sees_and_may_stop_and_nothing_else_over_tls(
 async def test_handshakes_that_never_end_are_few_and_short_and_who_comes_later_is_served(
     file: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(listener, "LONGEST", 0.5)
+    monkeypatch.setattr(listener, "HANDSHAKE_LIMIT", 0.5)
     monkeypatch.setattr(listener, "MOST_OF_NETWORK", 4)
     server, client = self_signed(tmp_path)
     place = Place(port=free_port(), tls=server, users=StationUsers(file))

@@ -141,7 +141,7 @@ async def test_an_oversized_message_ends_the_connection(caplog: pytest.LogCaptur
         async with connected(station, session) as socket:
             await socket.receive_json()
             await socket.receive_json()
-            await socket.send_str(json.dumps({"do": "x" * commands.MOST_BYTES}))
+            await socket.send_str(json.dumps({"do": "x" * commands.LONGEST_MESSAGE}))
             ended = await socket.receive()
             assert ended.type is aiohttp.WSMsgType.CLOSE
             assert ended.data == 1009
@@ -214,7 +214,7 @@ async def test_rubbish_of_a_browser_costs_a_few_lines_and_how_many_more_there_we
 async def test_lines_are_counted_for_each_address_and_anew_after_a_while(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(remarks, "WINDOW", 0.05)
+    monkeypatch.setattr(remarks, "COUNTING_WINDOW", 0.05)
     made = remarks.Remarks(logging.getLogger("station"))
     for number in range(3 * remarks.MOST_PEERS):
         made.add(f"10.0.0.{number}", f"line of {number}")
@@ -225,7 +225,7 @@ async def test_lines_are_counted_for_each_address_and_anew_after_a_while(
     made.add("10.0.0.95", "again\x1b]0;title\x07\nfaked")
     assert caplog.messages[-1] == r"again\x1b]0;title\x07\nfaked"
     made.add("10.0.0.95", "x" * 10_000)
-    assert len(caplog.messages[-1]) < 2 * remarks.LONGEST
+    assert len(caplog.messages[-1]) < 2 * remarks.LONGEST_LINE
     made.tell()
 
 
@@ -275,7 +275,7 @@ async def test_connections_of_one_address_have_an_end_and_those_that_were_there_
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     monkeypatch.setattr(server, "MOST_CONNECTIONS", 5)
-    monkeypatch.setattr(server, "LOOK", 0.05)
+    monkeypatch.setattr(server, "CHECK_PERIOD", 0.05)
     async with serving() as (station, session), connected(station, session) as socket:
         crowd = [await asyncio.open_connection("127.0.0.1", station.place.port) for _ in range(20)]
         async with asyncio.timeout(5):

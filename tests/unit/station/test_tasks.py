@@ -24,7 +24,7 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import Grid, Odometry
 from monstertruckd.station import commands, downloads, server
 from monstertruckd.station.address import RobotAddress
-from monstertruckd.station.pilot import LONGEST, SHORTEST, Pilot, drawn_path, read_mission
+from monstertruckd.station.pilot import LONGEST_DRAWN_PATH, SHORTEST, Pilot, drawn_path, read_mission
 from monstertruckd.station.replay import ReplayFeed
 from monstertruckd.station.server import Place, Station
 from monstertruckd.station.viewer import Viewer
@@ -62,7 +62,7 @@ def test_a_drawn_line_becomes_an_even_smooth_path_with_its_own_ends():
     assert poses[5, 2] == pytest.approx(0.0, abs=0.1)
     with pytest.raises(InputError, match=f"at least {SHORTEST}"):
         drawn_path([(0.0, 0.0), (0.1, 0.0)])
-    with pytest.raises(InputError, match=f"at most {LONGEST:g}"):
+    with pytest.raises(InputError, match=f"at most {LONGEST_DRAWN_PATH:g}"):
         drawn_path([(0.0, 0.0), (1e12, 0.0)])
 
 
@@ -216,7 +216,7 @@ async def test_a_recording_is_fetched_at_its_places_and_a_huge_one_is_not(
         await downloads.fetch(address, "run-000001-000.mcap", "", WallClock(), file, shares.append)
 
     with monkeypatch.context() as patch:
-        patch.setattr(downloads, "MOST_BYTES", 1000)
+        patch.setattr(downloads, "LARGEST_RECORDING", 1000)
         with pytest.raises(InputError, match="at most"):
             await fetch()
     assert not file.exists()

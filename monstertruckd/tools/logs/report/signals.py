@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.scan_tilt import UNKNOWN
+from monstertruck_estimation.scan_tilt import NO_TILT
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics as t
@@ -208,7 +208,7 @@ FIGURES: Final = (
         4,
         (
             Curve(
-                "off the level", t.SCAN, lambda m: None if m.tilt is None or m.tilt >= UNKNOWN else math.degrees(m.tilt)
+                "off the level", t.SCAN, lambda m: None if m.tilt is None or m.tilt >= NO_TILT else math.degrees(m.tilt)
             ),
         ),
         zero=True,

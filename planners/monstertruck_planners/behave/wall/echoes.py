@@ -18,7 +18,7 @@ TIGHT: Final = 3.0
 """Residual, in standard deviations, up to which a line explains an echo."""
 GUESSES: Final = 24, 5
 """Start directions of a line fit without an earlier estimate, and the best of these that are fitted to the end."""
-STEPS: Final = 4, 4, 6
+NEWTON_STEPS: Final = 4, 4, 6
 """Gauss-Newton steps: from an estimate, from all guesses, and further from the best ones."""
 FREE: Final = (math.inf, math.inf)
 """Inertia without an estimate before."""
@@ -121,7 +121,7 @@ def refine(echoes: Array, before: WallEstimate, at: tuple[float, float], cone: C
     """
     # (0.05, 0.03): standard deviations of the estimate before: rad, m
     normals, distances, cost, information = _fitted(
-        echoes, np.array([before.normal]), np.array([before.distance(*at)]), at, cone, (0.05, 0.03), STEPS[0]
+        echoes, np.array([before.normal]), np.array([before.distance(*at)]), at, cone, (0.05, 0.03), NEWTON_STEPS[0]
     )
     return _best(echoes, normals, distances, cost, information, at, cone)
 
@@ -141,12 +141,12 @@ def search(echoes: Array, at: tuple[float, float], cone: Cone, before: WallEstim
     along = offsets[:, 0] * np.cos(normals)[:, None] + offsets[:, 1] * np.sin(normals)[:, None]
     share, _, _ = cone.shares(sample[:, 2], normals[:, None])
     distances = np.median(sample[:, 3] / share + along, axis=1)
-    normals, distances, cost, _ = _fitted(sample, normals, distances, at, cone, FREE, STEPS[1])
+    normals, distances, cost, _ = _fitted(sample, normals, distances, at, cone, FREE, NEWTON_STEPS[1])
     best = _distinct(normals, distances, np.where(distances > 0.0, cost, np.inf))
     normals, distances = normals[best], distances[best]
     if before is not None:
         normals, distances = np.append(normals, before.normal), np.append(distances, before.distance(*at))
-    return _best(echoes, *_fitted(echoes, normals, distances, at, cone, FREE, STEPS[2]), at, cone)
+    return _best(echoes, *_fitted(echoes, normals, distances, at, cone, FREE, NEWTON_STEPS[2]), at, cone)
 
 
 def _distinct(normals: Array, distances: Array, cost: Array) -> list[int]:

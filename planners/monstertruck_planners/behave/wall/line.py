@@ -39,16 +39,16 @@ from monstertruck_schemas.topics import IMU, ODOMETRY, SONAR, TRANSFORMS, Topic
 
 SIDE, DIAGONAL, FRONT, FAR = range(4)
 """Sonars by number, as in ``NAMES``."""
-KEPT: Final = 1.0
+KEPT_POSE_TIME: Final = 1.0
 """Seconds for which poses are kept: an echo is placed where the robot was then."""
-NEAR: Final = 1.2
+FRONT_RANGE: Final = 1.2
 """Front range from which on a wall ahead is estimated, m."""
-AHEAD: Final = 1.5, 0.8
+AHEAD_DISTANCES: Final = 1.5, 0.8
 """Distance over which echoes count for the wall ahead, m: on free ground, and along a wall, behind which the foot of
 the perpendicular on the next one may lie."""
 NEARER: Final = 5.0
 """Standard deviations by which an echo of the diagonal sonar is nearer than the wall beside: of something ahead."""
-LEAST: Final = 6
+LEAST_WALL_ECHOES: Final = 6
 """Echoes that make a wall."""
 TOUCHING: Final = 0.16
 """A range from which on the robot stops at once, m."""
@@ -172,7 +172,7 @@ class WallLine:
             text = f"{state.laps} lap{'s' if state.laps > 1 else ''}, {state.travelled:.1f} m"
             return BehaviourStep(None, state, state.phase, Reason.BEHAVIOUR_DONE, text)
         v, w = state.v.at(due), state.w.at(due)
-        state = state._replace(sent=(*(entry for entry in state.sent if entry[0] > t - KEPT), (due, v, w)))
+        state = state._replace(sent=(*(entry for entry in state.sent if entry[0] > t - KEPT_POSE_TIME), (due, v, w)))
         catch_up = 1.5  # speed by which a lag is made up for, of the lag, 1/s
         v, w = v + catch_up * state.lag[0], w + catch_up * state.lag[1]
         motion = RequestedMotion(min(max(v, 0.0), 0.3), w * self._mirror)  # m/s
@@ -206,7 +206,7 @@ class WallLine:
         bias, count = state.bias
         if state.phase == "settle":
             bias, count = (bias * count + rate) / (count + 1), count + 1
-        oldest = odometry.stamp - round(KEPT * SECOND)
+        oldest = odometry.stamp - round(KEPT_POSE_TIME * SECOND)
         poses = tuple(entry for entry in state.poses if oldest <= entry[0] < odometry.stamp)
         poses = (*poses, (odometry.stamp, pose, odometry.twist.vx))
         pose, speed = _at(poses, odometry.stamp, self._config.play)
@@ -314,13 +314,13 @@ class WallLine:
         own = (echoes[:, 4] >= group[0]) & (echoes[:, 4] <= group[1])
         rows = echoes[(echoes[:, 5] > state.travelled - _reach(state)) & own]
         fresh = _fresh(rows, state)
-        if len(rows) < LEAST or not len(fresh) or fresh[:, 3].min() > NEAR:
+        if len(rows) < LEAST_WALL_ECHOES or not len(fresh) or fresh[:, 3].min() > FRONT_RANGE:
             return None
         fit = search(rows, pose[:2], cone)
         # 1.1: greatest angle between the direction of travel and the normal of a wall that is ahead, rad
         facing = abs(math.remainder(fit.line.normal - pose[2], math.tau)) < 1.1
         present = np.count_nonzero(np.abs(residuals(fresh, fit.line, cone)) < TIGHT) > 0.5 * len(fresh)
-        return fit.line if facing and present and fit.explained >= max(LEAST, 0.5 * len(rows)) else None
+        return fit.line if facing and present and fit.explained >= max(LEAST_WALL_ECHOES, 0.5 * len(rows)) else None
 
     def _turned_to(self, state: LineState, cone: Cone) -> EstimateFit | None:
         """The wall that the robot turns to: of all echoes since it is near, but those of the wall it leaves."""
@@ -330,10 +330,10 @@ class WallLine:
         rows = echoes[(late & ~sides) | ((late if state.wall is None else turning) & sides)]
         if state.wall is not None and len(rows):
             rows = rows[np.abs(residuals(rows, state.wall, cone)) > TIGHT]
-        if len(rows) < LEAST:
+        if len(rows) < LEAST_WALL_ECHOES:
             return None
         fit = search(rows, at, cone, state.ahead)
-        return fit if fit.explained >= max(LEAST, 0.3 * len(rows)) else None
+        return fit if fit.explained >= max(LEAST_WALL_ECHOES, 0.3 * len(rows)) else None
 
     def _distance_left(self, state: LineState, cone: Cone) -> float:
         """Distance until the robot stands before the wall ahead at the distance at which it follows walls, m."""
@@ -446,9 +446,9 @@ class WallLine:
         # corner
         if self._left(state, cone, t) <= 0.1:
             return False
-        lately = state.echoes[state.echoes[:, 5] > state.travelled - AHEAD[1]]
+        lately = state.echoes[state.echoes[:, 5] > state.travelled - AHEAD_DISTANCES[1]]
         diagonal, front = lately[:, 4] == DIAGONAL, lately[:, 4] == FRONT
-        ahead = (diagonal & (residuals(lately, wall, cone) < -NEARER)) | (front & (lately[:, 3] < NEAR))
+        ahead = (diagonal & (residuals(lately, wall, cone) < -NEARER)) | (front & (lately[:, 3] < FRONT_RANGE))
         return bool(np.count_nonzero(ahead) < 2)
 
     def _drive(self, state: LineState, cone: Cone, t: float) -> LineState:
@@ -601,7 +601,7 @@ def _asked(state: LineState, t: float) -> tuple[float, float]:
 
 def _reach(state: LineState) -> float:
     """Distance over which echoes count for the wall ahead, m."""
-    return AHEAD[0] if state.wall is None else AHEAD[1]
+    return AHEAD_DISTANCES[0] if state.wall is None else AHEAD_DISTANCES[1]
 
 
 def _fresh(echoes: Array, state: LineState) -> Array:

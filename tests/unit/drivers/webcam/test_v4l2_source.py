@@ -219,7 +219,7 @@ async def test_cancelled_in_the_instant_in_which_it_has_started_the_camera_is_le
 
 
 async def test_a_camera_that_does_not_stop_is_not_waited_for(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(v4l2_source, "PATIENCE", 0.05)
+    monkeypatch.setattr(v4l2_source, "CAMERA_STOP_LIMIT", 0.05)
     go = threading.Event()
 
     class Stuck(FakeKernel):

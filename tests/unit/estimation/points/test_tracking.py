@@ -11,7 +11,7 @@ import pytest
 from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.points.exchange import TagReading
 from monstertruck_estimation.points.files import load, save
-from monstertruck_estimation.points.tracking import KEPT, PointMap
+from monstertruck_estimation.points.tracking import KEPT_SIGHTINGS, PointMap
 from monstertruck_estimation.vision.mount import camera_axes
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_folders import SAVES, opened
@@ -114,7 +114,7 @@ def test_a_robot_that_stands_keeps_one_sighting_and_a_long_drive_not_too_many():
     seen_from(
         points := PointMap(PointsConfig(), MOUNT), [(1.0 + 0.1 * (i % 9), 0.1 * (i // 9), 0.0) for i in range(60)]
     )
-    assert len(points.points["tag-7"].sightings) == KEPT
+    assert len(points.points["tag-7"].sightings) == KEPT_SIGHTINGS
 
 
 def test_a_mark_moves_with_the_map_near_it_and_what_is_saved_comes_back(tmp_path):

@@ -165,7 +165,7 @@ def test_without_the_worker_that_deforms_routes_goals_go_on_and_it_is_tried_agai
             events=lambda *e, **_: reported.append(e[0]),
         )
         task = asyncio.create_task(service.run(lambda *_: None))
-        await clock.sleep(3 * deformation.RETRY)
+        await clock.sleep(3 * deformation.DEFORM_RETRY)
         assert (actor.starts, task.done()) == (3, False)
         task.cancel()
 

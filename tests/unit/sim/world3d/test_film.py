@@ -11,7 +11,7 @@ from monstertruck_runtime.errors import InputError, NoAnswerError, NotInstalledE
 from monstertruck_schemas.base import Pose2D
 from monstertruck_sim.world.config import WorldConfig
 from monstertruck_sim.world.world import World, make_scene
-from monstertruck_sim.world3d.film import RATE, SIZE, Film
+from monstertruck_sim.world3d.film import FILM_SIZE, FRAME_RATE, Film
 from monstertruck_sim.world3d.model import Group
 from monstertruck_sim.world3d.picture import WorldRenderer, looking_at
 
@@ -54,11 +54,11 @@ def test_a_film_has_a_frame_an_eighth_of_a_second(world, renderer, tmp_path):
         with Film(world, clock, tmp_path / "a.gif") as film:
             for _ in range(3):
                 film.take()
-                await clock.sleep(1 / RATE)
+                await clock.sleep(1 / FRAME_RATE)
 
     run_virtual(main)
     with Image.open(tmp_path / "a.gif") as image:
-        assert image.size == SIZE
+        assert image.size == FILM_SIZE
         assert 1 <= image.n_frames <= 3
 
 
@@ -73,7 +73,7 @@ def test_a_film_of_a_run_that_failed_is_kept_and_one_that_is_broken_off_is_not(
             for _ in range(2):
                 film.take()
                 world.truth(clock.now())
-                await clock.sleep(1 / RATE)
+                await clock.sleep(1 / FRAME_RATE)
             raise error
 
     with pytest.raises(type(error)):

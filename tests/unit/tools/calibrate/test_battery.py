@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.errors import InputError
-from monstertruckd.tools.calibrate.battery import GROUND, BatteryWizard, MeterReading
+from monstertruckd.tools.calibrate.battery import EARTHING, BatteryWizard, MeterReading
 
 WIZARD = BatteryWizard(meter_share=0.005, meter_digits=0.02)
 
@@ -14,9 +14,9 @@ WIZARD = BatteryWizard(meter_share=0.005, meter_digits=0.02)
 def test_one_reading_tells_the_scale_but_not_the_offset():
     gain, offset = WIZARD.scale([MeterReading(24.0, 24.6, 0.0)])
     assert gain.value == pytest.approx(24.6 / 24.0)
-    assert gain.half == pytest.approx(1.96 / math.sqrt(3) * math.hypot(0.005 * 24.6, 0.02, GROUND) / 24.0, rel=1e-3)
+    assert gain.half == pytest.approx(1.96 / math.sqrt(3) * math.hypot(0.005 * 24.6, 0.02, EARTHING) / 24.0, rel=1e-3)
     assert offset.value == pytest.approx(0.0, abs=1e-6)
-    assert offset.half == GROUND
+    assert offset.half == EARTHING
 
 
 def test_readings_far_apart_with_a_good_meter_tell_the_offset():
@@ -30,7 +30,7 @@ def test_readings_far_apart_with_a_good_meter_tell_the_offset():
 def test_the_truth_is_inside_as_often_as_stated_whatever_the_meter_does_within_its_bounds():
     rng, inside = np.random.default_rng(3), []
     for _ in range(300):
-        true_gain, true_offset = rng.uniform(0.9, 1.1), rng.uniform(-GROUND, GROUND)
+        true_gain, true_offset = rng.uniform(0.9, 1.1), rng.uniform(-EARTHING, EARTHING)
         raws = rng.uniform(19, 25, int(rng.integers(1, 4)))
         volts = true_gain * raws + true_offset
         shown = volts * (1 + rng.uniform(-0.0049, 0.0049)) + rng.uniform(-0.02, 0.02, raws.size)

@@ -75,7 +75,7 @@ def test_a_run_that_is_held_ends_by_what_holds_it(held: tuple[Reason, ...], kind
         record = SimpleNamespace(left=0, distance=lambda _: 0.0)
 
         async def hold(*_: float) -> None:
-            await clock.sleep(motion.PERIOD)
+            await clock.sleep(motion.REQUEST_PERIOD)
 
         run = SimpleNamespace(track=record, state=gate_state(held, GateMode.DRIVING), hold=hold, robot_time=0)
         await mover._drive(run, STEP, lambda _: None)

@@ -113,7 +113,7 @@ def test_ranges_that_come_out_short_mean_a_faster_sound():
 
 
 def test_a_heading_that_drifts_on_its_arcs_moves_no_sonar(monkeypatch):
-    monkeypatch.setattr(sonar, "DRIFT", (0.0, 0.0, 0.03))
+    monkeypatch.setattr(sonar, "ARC_DRIFT", (0.0, 0.0, 0.03))
     drifting = sonar_legs(PLACES, (WALL, 0.02), 0.43, 1.0, np.random.default_rng(3))
     monkeypatch.undo()
     result = result_of(drifting, SETTINGS, WALL, 0.002)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import SECOND
-from monstertruckd.tools.drill.observer import PERIOD, _Standstill
+from monstertruckd.tools.drill.observer import TRUTH_PERIOD, _Standstill
 
 
 def found(speeds):
@@ -14,14 +14,14 @@ def found(speeds):
     rule, broken, x = _Standstill(), set(), 0.0
     rule.begin(0, must_stop=True, disarms=True)
     for step, speed in enumerate(speeds):
-        x += float(speed) * PERIOD / SECOND
-        seen = SimpleNamespace(now=step * PERIOD, truth=SimpleNamespace(x=x, y=0.0, v=float(speed)), targets=())
+        x += float(speed) * TRUTH_PERIOD / SECOND
+        seen = SimpleNamespace(now=step * TRUTH_PERIOD, truth=SimpleNamespace(x=x, y=0.0, v=float(speed)), targets=())
         broken |= {name for name, _ in rule(seen)}
     return broken
 
 
 BRAKED = np.linspace(0.18, 0.0, 30)
-T = np.arange(120) * PERIOD / SECOND
+T = np.arange(120) * TRUTH_PERIOD / SECOND
 
 
 def test_a_truck_that_rocks_where_it_stopped_stands():

@@ -15,7 +15,7 @@ from monstertruckd.tools.driving import gamepad_device
 from monstertruckd.tools.driving.gamepad import AXES, BUTTONS, EVENT, Pad, PadMapping, key_for, read_mapping
 from monstertruckd.tools.driving.gamepad_device import EFFECT, PadLink
 from monstertruckd.tools.driving.modes import SteeringMode
-from monstertruckd.tools.driving.session import REST, DriveSession
+from monstertruckd.tools.driving.session import NEUTRAL_REQUESTS, DriveSession
 from monstertruckd.tools.driving.teleop import Teleop
 
 RANGES = {0: (-32768, 32767), 1: (-32768, 32767), 3: (-32768, 32767), 5: (0, 255), 16: (-1, 1), 17: (-1, 1)}
@@ -152,14 +152,14 @@ def test_a_held_gamepad_goes_before_the_keys_and_what_follows_is_standstill():
     assert role is Role.GAMEPAD
     assert request.speed > 0
     session._gamepad.pad = None  # unplugged in full travel
-    for _ in range(REST):
+    for _ in range(NEUTRAL_REQUESTS):
         request, role = session._input(10 * SECOND)
         assert (request.speed, role) == (0.0, Role.GAMEPAD)
     assert session._input(10 * SECOND)[1] is Role.KEYBOARD
 
 
 async def test_a_gamepad_is_found_read_and_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(gamepad_device, "LOOK", 0.02)
+    monkeypatch.setattr(gamepad_device, "GAMEPAD_LOOK_PERIOD", 0.02)
     monkeypatch.setattr(gamepad_device, "described", lambda file, mapping: Pad("Test Pad", mapping, RANGES))
     actions = []
     link = PadLink(PadMapping(), WallClock(), actions.append, tmp_path)

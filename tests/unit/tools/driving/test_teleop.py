@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.req import Order
 from monstertruckd.tools.driving.modes import SPEEDS, SteeringMode
-from monstertruckd.tools.driving.teleop import MODE_KEYS, STEPS, KeyReader, Teleop, TeleopRequest, axles
+from monstertruckd.tools.driving.teleop import MODE_KEYS, STEERING_KEY_STEPS, KeyReader, Teleop, TeleopRequest, axles
 
 START = 5 * SECOND
 
@@ -74,10 +74,10 @@ def test_repetition_keeps_it_alive_and_its_end_is_noticed_sooner():
 def test_a_steering_key_keeps_the_truck_going_but_never_sets_it_in_motion():
     teleop = Teleop(angle=0.4)
     teleop.press("a", START)
-    assert teleop.request(START) == TeleopRequest(0.0, 0.4 / STEPS, 0.0)
+    assert teleop.request(START) == TeleopRequest(0.0, 0.4 / STEERING_KEY_STEPS, 0.0)
     teleop.press("up", after(0.1))
     teleop.press("left", after(0.2))
-    assert teleop.request(after(0.75)) == TeleopRequest(0.1, 2 * 0.4 / STEPS, 0.0)
+    assert teleop.request(after(0.75)) == TeleopRequest(0.1, 2 * 0.4 / STEERING_KEY_STEPS, 0.0)
     teleop.request(after(2.0))
     teleop.press("left", after(3.0))
     request = teleop.request(after(3.0))
@@ -87,7 +87,7 @@ def test_a_steering_key_keeps_the_truck_going_but_never_sets_it_in_motion():
 
 def test_steering_ends_at_full_lock_and_centres():
     teleop = Teleop(angle=0.4)
-    for _ in range(3 * STEPS):
+    for _ in range(3 * STEERING_KEY_STEPS):
         teleop.press("d", START)
     assert teleop.request(START) == TeleopRequest(0.0, -0.4, 0.0)
     teleop.press("x", START)
@@ -135,7 +135,7 @@ def test_another_mode_forgets_the_twist():
 
 def test_no_mode_asks_for_more_than_full_lock():
     teleop = Teleop(angle=0.4, mode=SteeringMode.HYBRID)
-    for key in "dz" * STEPS:
+    for key in "dz" * STEERING_KEY_STEPS:
         teleop.press(key, START)
     assert teleop.request(START) == TeleopRequest(0.0, -0.4, 0.4)
 

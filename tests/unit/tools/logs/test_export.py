@@ -299,7 +299,7 @@ def columns_of(values: list[Any], folder: Path) -> dict[str, Any]:
     ],
 )
 def test_a_column_has_the_type_of_all_its_values_however_late_they_come(values, dtype, tmp_path, monkeypatch):
-    monkeypatch.setattr(columns, "KEPT", 10 * columns.PLAIN)
+    monkeypatch.setattr(columns, "KEPT_BYTES", 10 * columns.PLAIN)
     found = columns_of(values, tmp_path)["file"]
     assert found.dtype == dtype
     if dtype.startswith("<U"):
@@ -314,7 +314,7 @@ def test_numbers_that_no_array_holds_are_refused(tmp_path):
 
 
 def test_arrays_of_equal_and_of_different_lengths(tmp_path, monkeypatch):
-    monkeypatch.setattr(columns, "KEPT", 1000)
+    monkeypatch.setattr(columns, "KEPT_BYTES", 1000)
     same = [np.full((3, 2), i, np.uint8 if i else np.int16) for i in range(30)]
     found = columns_of(same, tmp_path)
     assert found.keys() == {"file"}
@@ -327,7 +327,7 @@ def test_arrays_of_equal_and_of_different_lengths(tmp_path, monkeypatch):
 
 
 def test_a_table_of_any_length_takes_little_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(columns, "KEPT", 400_000)
+    monkeypatch.setattr(columns, "KEPT_BYTES", 400_000)
     tracemalloc.start()
     try:
         with tempfile.TemporaryFile() as file, zipfile.ZipFile(tmp_path / "table.npz", "w") as archive:

@@ -12,7 +12,7 @@ DRAWS = "import sys, time; open(sys.argv[1], 'a').write(' '.join(sys.argv[2:]) +
 
 
 async def test_it_runs_while_a_viewer_listens_and_the_station_waits_for_neither(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(live_process, "LOOK", 0.05)
+    monkeypatch.setattr(live_process, "LISTENER_LOOK_PERIOD", 0.05)
     drawn = tmp_path / "drawn"
 
     def starts() -> int:

@@ -13,12 +13,12 @@ from monstertruck_schemas.topics import BY_NAME
 from monstertruckd.recorder.log_file import LogEntry, LogFile
 from monstertruckd.recorder.reader import MAGIC, LogMessage, open_log
 from monstertruckd.tools.replay_check import check_log
-from monstertruckd.tools.replay_check.result import ROUNDING
+from monstertruckd.tools.replay_check.result import ROUND_OFF
 
 REPLAY = Path(__file__).resolve().parents[3] / "data" / "replay"
 LEVEL, SLAM, FUSION, GOALS = (REPLAY / f"{name}.mcap" for name in ("level", "slam", "fusion", "goals"))
 
-computed_again = partial(check_log, tolerance=ROUNDING)
+computed_again = partial(check_log, tolerance=ROUND_OFF)
 """The stored logs were recorded on a processor whose maths routines may round otherwise than this one's."""
 
 Change = Callable[[LogMessage], LogMessage | None]

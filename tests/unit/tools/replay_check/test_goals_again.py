@@ -20,7 +20,7 @@ from monstertruckd.tools.replay_check.chain import Chain
 from monstertruckd.tools.replay_check.comparison import Kind
 from monstertruckd.tools.replay_check.pace import Pace, PacedClock
 from monstertruckd.tools.replay_check.recorded import RunLog, recorded_config, survey
-from monstertruckd.tools.replay_check.result import ROUNDING
+from monstertruckd.tools.replay_check.result import ROUND_OFF
 from tests.unit.tools.replay_check.log_surgery import (
     BY_NAME,
     GOALS,
@@ -190,7 +190,7 @@ def test_a_run_of_the_wall_clock_has_several_stamps_in_a_tick(tmp_path):
         row = rows[topic]
         assert row.compared > 0
         assert row.missing == row.surplus(check.end) == 0
-    assert all(one.value <= ROUNDING for one in rows[topics.PATH].greatest.values())  # stamps alone
+    assert all(one.value <= ROUND_OFF for one in rows[topics.PATH].greatest.values())  # stamps alone
 
 
 @pytest.mark.long
