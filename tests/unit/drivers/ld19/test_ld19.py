@@ -1,19 +1,16 @@
 """Codec, driver and emulator of the LD06, LD19 and STL-19P."""
 
 import asyncio
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.ld19.config import Ld19Config
 from monstertruck_drivers.ld19.driver import Ld19Driver
 from monstertruck_drivers.ld19.emulator import Ld19Emulator
 from monstertruck_drivers.ld19.probe import probe
-from monstertruck_drivers.ld19.protocol import FULL_TURN, HEADER, MODELS, POINTS, Ld19Packet, Ld19Parser, build, crc8
+from monstertruck_drivers.ld19.protocol import FULL_TURN, MODELS, POINTS
 from monstertruck_drivers.scanning.turns import MISSING
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import (
@@ -28,10 +25,7 @@ from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 from tests.unit.drivers.kit import DriverRig, Kept
 from tests.unit.drivers.scanning.kit import Room, ahead
 
-MANUAL = bytes.fromhex("542C6808AB7EE000E4DC00E2D900E5D500E3D300E4D000E9CD00E4CA00E2C700E9C500E5C200E5C000E5BE823A1A50")
 """The example of the development manual."""
-words = st.integers(0, 0xFFFF)
-packets = st.builds(Ld19Packet, words, words, st.binary(min_size=36, max_size=36), words, words)
 
 
 class Rig(DriverRig):
@@ -51,41 +45,6 @@ def on_bench(test, config=None, room=None):
             await test(rig)
 
     run_virtual(main)
-
-
-def test_bytes_of_the_manual():
-    (packet,) = Ld19Parser().feed(MANUAL)
-    assert packet[:2] == (2152, 32427)
-    assert packet[3:] == (33470, 6714)
-    assert packet.decoded()["distance"].tolist()[:3] == [224, 220, 217]
-    assert packet.decoded()["intensity"].tolist()[:3] == [228, 226, 229]
-    assert packet.span == 1043
-    assert build(packet) == MANUAL
-
-
-@given(st.lists(packets, max_size=4), st.lists(st.integers(0, 190), max_size=6))
-def test_what_is_written_is_read_again_however_it_is_cut(sent, cuts):
-    data, parser = b"".join(map(build, sent)), Ld19Parser()
-    edges = sorted({0, len(data), *(cut for cut in cuts if cut < len(data))})
-    assert [p for a, b in pairwise(edges) for p in parser.feed(data[a:b])] == sent
-    assert parser.refused == 0
-
-
-@given(st.binary(max_size=300) | st.builds(lambda a, b: a + HEADER + b, st.binary(max_size=60), st.binary(max_size=90)))
-def test_any_bytes_end_in_packets_or_nothing(data):
-    parser = Ld19Parser()
-    for packet in parser.feed(data):
-        assert build(packet) in data
-    again = parser.feed(bytes(94) + MANUAL)
-    assert again[-1:] == Ld19Parser().feed(MANUAL)
-
-
-@given(st.integers(0, 47 * 8 - 1))
-def test_one_wrong_bit_is_noticed(bit):
-    wrong = bytearray(MANUAL)
-    wrong[bit // 8] ^= 1 << bit % 8
-    assert Ld19Parser().feed(bytes(wrong)) == []
-    assert crc8(MANUAL[:-1]) == MANUAL[-1]
 
 
 @pytest.mark.parametrize(("model", "rate"), [("ld06", 0.0), ("ld19", 1.0), ("stl19p", -1.0)])
