@@ -147,7 +147,7 @@ def _sensor() -> Trial:
             Insertion(f"{SCHEMAS}/topics.py", "    SonarRanges,\n", "    SonarRange,\n"),
             Insertion(f"{SCHEMAS}/topics.py", "IMU: Final = Topic(", topic),
             Insertion(f"{DRIVERS}/catalog.py", "OUR_ROLES: Final = (", role),
-            Insertion(f"{DRIVERS}/catalog.py", "    ENCODERS,\n    BATTERY,", "    RANGER,\n"),
+            Insertion(f"{DRIVERS}/catalog.py", "    HAND,\n    BATTERY,", "    RANGER,\n"),
             Insertion(f"{DRIVERS}/catalog.py", '    DeviceKind(\n        name="wt61"', f"    {kind}"),
         ),
         page["robot.yaml"] + "\nchecks:\n  ahead: { kind: fresh, topic: sensor/ranger }\n",

@@ -162,7 +162,7 @@ def _json(_: str, data: bytes) -> Any:
 
 def _ros(encoding: str) -> Callable[[str, bytes], Any]:
     def parse(schema: str, data: bytes) -> Any:
-        from monstertruckd.tools.logs.ros_bags import parsed  # noqa: PLC0415 - comes with an extra
+        from monstertruckd.tools.logs.ros_types import parsed  # noqa: PLC0415 - comes with an extra
 
         return parsed(encoding, schema, data)
 

@@ -8,17 +8,12 @@ from typing import Any, Final
 import lz4.frame
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.outside import MEGABYTE, MOST_UNPACKED, reading
 from monstertruck_runtime.yaml_files import read_yaml
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.tools.logs.bags import METADATA, READERS, RawMessage, mcap_messages
-
-_ROS1: Final = get_typestore(Stores.ROS1_NOETIC)
-_ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-_ROS2: Final = get_typestore(Stores.ROS2_JAZZY)
 
 
 def _bounded(decompressor: Any) -> Callable[[bytes], bytes]:
@@ -86,18 +81,3 @@ def _mcap_parts(folder: Path) -> list[Path] | None:
     if about["storage_identifier"] != "mcap":
         return None
     return [folder / Path(name).name for name in about["relative_file_paths"]]
-
-
-def parsed(encoding: str, schema: str, data: bytes) -> Any:
-    """Decode a message.
-
-    The layouts of what is read are the same in all versions of ROS, so the definitions in a bag are not needed.
-
-    Args:
-        encoding: ``ros1`` or ``cdr``.
-        schema: name of its type.
-        data: of the message.
-    """
-    if encoding == "ros1":
-        return _ROS1.deserialize_ros1(data, "tf2_msgs/msg/TFMessage" if schema == "tf/msg/tfMessage" else schema)
-    return _ROS2.deserialize_cdr(data, schema)

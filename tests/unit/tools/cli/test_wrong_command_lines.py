@@ -157,7 +157,7 @@ WRONG = (
     ("probe host -p /dev/null", 3, "host: is the computer's own and hangs on no port; leave out --port"),
     ("find-port", 2, "Error: Missing argument 'role'."),
     ("find-port nope", 3, "no role 'nope'; known"),
-    ("find-port lidar --write /nonexistent.yaml", 3, "/nonexistent.yaml: No such file or directory"),
+    ("find-port lidar --write /nonexistent.yaml", 3, "/nonexistent.yaml: cannot be read: No such file or directory"),
     ("find-port lidar --write README.md", 3, "README.md:10: not valid YAML: could not find expected ':'"),
     ("doctor x", 2, "Error: Got unexpected extra argument(s) (x)"),
     ("config nope", 2, "Error: No such command 'nope'."),
@@ -210,7 +210,7 @@ WRONG = (
     (
         "map build docs/pictures/lap.png",
         3,
-        "docs/pictures/lap.png:1: expected a log with scans (MCAP, npz or text): not UTF-8 text",
+        "docs/pictures/lap.png:1: expected a log with scans (MCAP, bag, npz or text): not UTF-8",
     ),
     ("plan docs 0,0,0 1,1,0", 3, "docs/map.yaml: cannot be read: No such file or directory"),
     ("log animate README.md", 2, "Error: Missing argument 'output'."),
