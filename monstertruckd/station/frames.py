@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
+from monstertruck_runtime.plain import plain
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.sensor import CompressedImage, LaserScan
@@ -23,7 +24,15 @@ Frame = str | bytes
 
 def text(kind: str, **fields: Any) -> str:
     """A text frame."""
-    return json.dumps({"kind": kind, **fields}, separators=(",", ":"), allow_nan=False)
+    return _json({"kind": kind, **fields})
+
+
+def _json(fields: dict[str, Any]) -> str:
+    """Return ``fields`` as JSON; a value that is not finite, as a damaged log may hold, becomes null."""
+    try:
+        return json.dumps(fields, separators=(",", ":"), allow_nan=False)
+    except ValueError:
+        return json.dumps(plain(fields), separators=(",", ":"), allow_nan=False)
 
 
 def message(kind: str, of: Message) -> str:
@@ -33,7 +42,7 @@ def message(kind: str, of: Message) -> str:
 
 def binary(kind: str, payload: bytes, **fields: Any) -> bytes:
     """A binary frame."""
-    head = json.dumps({"kind": kind, **fields}, separators=(",", ":"), allow_nan=False).encode()
+    head = _json({"kind": kind, **fields}).encode()
     return struct.pack("<I", len(head)) + head + payload
 
 

@@ -16,8 +16,6 @@ import sys
 import textwrap
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from enum import Enum
-from pathlib import PurePath
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol, TextIO, cast
 
@@ -67,27 +65,9 @@ def print_json(value: Any, *, indent: int | None = 2) -> None:
         value: built of mappings, sequences, models, scalars.
         indent: None = on one line, for streams of values.
     """
-    print(json.dumps(_plain(value), indent=indent, allow_nan=False), flush=indent is None)
+    from monstertruck_runtime.plain import plain
 
-
-def _plain(value: Any) -> Any:
-    from pydantic import BaseModel
-
-    match value:
-        case BaseModel():
-            return _plain(value.model_dump(mode="json"))
-        case Enum():
-            return value.value
-        case PurePath():
-            return str(value)
-        case float():
-            return value if math.isfinite(value) else None
-        case Mapping():
-            return {str(key): _plain(inner) for key, inner in value.items()}
-        case list() | tuple() | set() | frozenset():
-            return [_plain(inner) for inner in value]
-        case _:
-            return value
+    print(json.dumps(plain(value), indent=indent, allow_nan=False), flush=indent is None)
 
 
 def console(*, error: bool = False) -> "Console":

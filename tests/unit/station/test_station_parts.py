@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 import re
 import ssl
 import struct
@@ -57,6 +58,12 @@ def test_a_robot_is_named_with_or_without_its_endpoint():
 def test_a_wrong_robot_is_refused_with_what_was_expected(text: str):
     with pytest.raises(InputError, match="expected"):
         RobotAddress.parse(text)
+
+
+def test_what_is_not_finite_is_null_on_the_page():
+    """JSON has no word for it, and a damaged log may hold it."""
+    assert json.loads(frames.text("pose", pose=[1.0, math.inf, math.nan]))["pose"] == [1.0, None, None]
+    assert head_and_payload(frames.binary("scan", b"", tilt=-math.inf))[0]["tilt"] is None
 
 
 def test_a_scan_travels_as_millimetres_and_beams_without_a_range_as_zero():
