@@ -349,7 +349,7 @@ def test_a_robot_with_a_planner_is_driven_by_hand_in_most_legs_and_to_goals_in_e
 
 
 def test_a_pack_that_seemed_critical_keeps_a_robot_waiting_and_is_not_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("monstertruckd.tools.drill.campaign.TIMEOUT", 5.0)
+    monkeypatch.setattr("monstertruckd.tools.drill.campaign.RECOVERY_LIMIT", 5.0)
     config = load_config(CONFIGS / "full.yaml", SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
 
     async def main(clock: VirtualClock) -> None:
