@@ -130,11 +130,17 @@ def _frames(name: Path, capture: cv2.VideoCapture, closed: Exception, *, colour:
 
 
 def _read(path: Path, *, colour: bool) -> Picture:
-    with picture(path):  # refuses one that is too large
-        found = cv2.imread(str(path), FLAGS[colour])
-        if found is None:
-            raise InputError(f"{path}: cannot be read as a picture")
-        return np.asarray(found, dtype=np.uint8)
+    """Read a picture, with the library that has checked its size: OpenCV's reader trusts the lengths in the file."""
+    with picture(path) as image:
+        deep = image.mode.startswith("I")  # 16 bits in 32
+        shades = np.asarray(image.convert("I" if deep else "RGB" if colour else "L"))
+        grey = (np.clip(shades, 0, 65535) // 257).astype(np.uint8) if deep else shades
+        return np.ascontiguousarray(_coloured(grey) if colour else grey)
+
+
+def _coloured(shades: np.ndarray) -> np.ndarray:
+    """Blue, green and red of a grey picture, or of one in red, green and blue."""
+    return np.repeat(shades[..., None], 3, axis=2) if shades.ndim == 2 else shades[..., ::-1]
 
 
 def _grey(frame: np.ndarray) -> Picture:
