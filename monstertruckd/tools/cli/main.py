@@ -25,6 +25,7 @@ from monstertruckd.tools.cli import (
     points,
     replay,
     robot,
+    ros2,
     security,
     service,
     settings,
@@ -91,6 +92,7 @@ app.command("probe")(devices.probe)
 app.command("usb")(usb.usb)
 app.command("find-port")(usb.find_port)
 app.command("station")(station.station)
+app.command("ros2")(ros2.ros2)
 app.command("doctor")(doctor.doctor)
 app.command("install-service")(service.install_service)
 app.command("uninstall-service")(service.uninstall_service)

@@ -86,6 +86,7 @@ INSTEAD = {
         None, "serves until it is stopped"
     ),
     "monstertruckd station --foxglove": Instead(None, "serves until it is stopped; test_foxglove.py connects to it"),
+    "monstertruckd ros2": Instead(None, "serves until it is stopped; tests/unit/ros2/test_face.py runs it"),
     "monstertruckd station --rerun": Instead(None, "serves until it is stopped; test_live.py draws without a viewer"),
     "monstertruckd station --router tcp/192.168.1.2:7447": Instead(
         None, "serves until it is stopped; tests/unit/station/test_server.py has a router"
@@ -183,6 +184,7 @@ FOREIGN = {
     "python3 -m monstertruckd.bootstrap sync": "sets up .venv; tests/unit/test_bootstrap.py checks what it runs",
     "python docs/site/build.py": "test_site.py builds it into another folder",
     "python -m benchmarks.thesis --only 5.1 5.5": "drives for minutes; slowness and scores have their tests",
+    "pip install 'monstertruckd[ros2]'": "needs a package index; the extra is looked up",
     "pip install 'monstertruckd[view]'": "needs a package index; the extra is looked up",
     "systemctl status monstertruckd": "needs an installed service; the unit's name is looked up",
     "journalctl -u monstertruckd -f": "needs an installed service; the unit's name is looked up",

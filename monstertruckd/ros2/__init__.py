@@ -1,0 +1,1 @@
+"""The robot as a ROS 2 node: a process of its own, with a client of the robot on one side and ROS 2 on the other."""

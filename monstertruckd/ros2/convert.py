@@ -1,0 +1,409 @@
+"""Messages of the robot as messages of ROS 2, in ROS's conventions (REP 103, 105, 117 and 145).
+
+Values are dictionaries by field, as ``cdr.encode`` takes them. Stamps and names of frames are given by ``RosNames``.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_estimation.transforms import Quaternion, quaternion_from_rpy, quaternion_from_yaw
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import Message, Pose2D
+from monstertruck_schemas.body import LensConfig
+from monstertruck_schemas.event import Event, LogLevel, LogRecord, Severity
+from monstertruck_schemas.health import HealthTable, ServiceState
+from monstertruck_schemas.plan import Path
+from monstertruck_schemas.points import PointsOfInterest
+from monstertruck_schemas.sensor import (
+    NO_ECHO,
+    VALID_BEAM,
+    Attitude,
+    Battery,
+    CompressedImage,
+    Imu,
+    LaserScan,
+    SonarEcho,
+    SonarRanges,
+)
+from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry, Transform
+
+RosValues = dict[str, Any]
+
+FRAMES: Final = {"base": "base_link", "lidar": "laser"}
+"""Frames that ROS calls otherwise."""
+
+
+def _own_name(frame: str) -> str:
+    return frame
+
+
+@dataclass(frozen=True, slots=True)
+class RosNames:
+    """How stamps and frames are written."""
+
+    offset: int = 0
+    """Real time minus the robot's, ns."""
+    frame: Callable[[str], str] = _own_name
+    """Name of a frame of the robot."""
+
+    def time(self, stamp: int) -> RosValues:
+        """``builtin_interfaces/msg/Time`` of the robot's time."""
+        seconds, nanoseconds = divmod(max(0, stamp + self.offset), SECOND)
+        return {"sec": seconds, "nanosec": nanoseconds}
+
+    def header(self, message: Message) -> RosValues:
+        """``std_msgs/msg/Header`` of a message of the robot."""
+        return self.header_of(message.stamp, message.frame)
+
+    def header_of(self, stamp: int, frame: str) -> RosValues:
+        """``std_msgs/msg/Header``."""
+        return {"stamp": self.time(stamp), "frame_id": self.frame(frame)}
+
+
+def prefixed(prefix: str) -> Callable[[str], str]:
+    """Names of ROS 2 for the robot's frames, behind a prefix such as ``truck1/``."""
+    return lambda frame: f"{prefix}{FRAMES.get(frame, frame)}"
+
+
+def vector(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> RosValues:
+    """``geometry_msgs/msg/Vector3`` or ``Point``."""
+    return {"x": x, "y": y, "z": z}
+
+
+def rotation(quaternion: Quaternion) -> RosValues:
+    """``geometry_msgs/msg/Quaternion``."""
+    return dict(zip("xyzw", quaternion, strict=True))
+
+
+def pose_of(pose: Pose2D, z: float = 0.0) -> RosValues:
+    """``geometry_msgs/msg/Pose``."""
+    return {"position": vector(pose.x, pose.y, z), "orientation": rotation(quaternion_from_yaw(pose.yaw))}
+
+
+def full_covariance(planar: Array) -> Array:
+    """Shape (36,) from the (9,) of x, y, yaw; what the plane does not know is 0."""
+    full = np.zeros((6, 6))
+    plane = (0, 1, 5)  # rows of (x, y, yaw) in ROS's covariances over (x, y, z, roll, pitch, yaw)
+    full[np.ix_(plane, plane)] = planar.reshape(3, 3)
+    return full.ravel()
+
+
+def scan(message: LaserScan, names: RosNames) -> RosValues:
+    """``sensor_msgs/msg/LaserScan``: +inf where a beam met nothing, NaN where the sensor does not know (REP 117)."""
+    ranges = message.ranges.astype(np.float32)
+    ranges[(message.codes > NO_ECHO) & (message.codes != VALID_BEAM)] = np.nan
+    return {
+        "header": names.header(message),
+        "angle_min": message.start_angle,
+        "angle_max": message.end_angle,
+        "angle_increment": message.angle_increment,
+        "time_increment": message.time_increment,
+        "scan_time": message.scan_time,
+        "range_min": message.range_min,
+        "range_max": message.range_max,
+        "ranges": ranges,
+        "intensities": () if message.intensities is None else message.intensities,
+    }
+
+
+def odometry(message: Odometry, names: RosNames) -> RosValues:
+    """``nav_msgs/msg/Odometry``."""
+    twist = message.twist
+    return {
+        "header": names.header(message),
+        "child_frame_id": names.frame(message.child),
+        "pose": {"pose": pose_of(message.pose), "covariance": full_covariance(message.pose_covariance)},
+        "twist": {
+            "twist": {"linear": vector(twist.vx, twist.vy), "angular": vector(z=twist.wz)},
+            "covariance": full_covariance(message.twist_covariance),
+        },
+    }
+
+
+def pose(message: Odometry, names: RosNames) -> RosValues:
+    """``geometry_msgs/msg/PoseWithCovarianceStamped``."""
+    covariance = full_covariance(message.pose_covariance)
+    return {"header": names.header(message), "pose": {"pose": pose_of(message.pose), "covariance": covariance}}
+
+
+def transforms(rows: Iterable[Transform], names: RosNames) -> RosValues:
+    """``tf2_msgs/msg/TFMessage``."""
+    return {
+        "transforms": [
+            {
+                "header": names.header_of(row.stamp, row.parent),
+                "child_frame_id": names.frame(row.child),
+                "transform": {"translation": vector(*row.translation), "rotation": rotation(row.rotation)},
+            }
+            for row in rows
+        ]
+    }
+
+
+def image(message: CompressedImage, names: RosNames) -> RosValues:
+    """``sensor_msgs/msg/CompressedImage``."""
+    return {"header": names.header(message), "format": message.format, "data": message.data}
+
+
+def camera_info(message: CompressedImage, lens: LensConfig, names: RosNames) -> RosValues:
+    """``sensor_msgs/msg/CameraInfo``: a pinhole with the distortion of Brown, as the lens is calibrated."""
+    fx, fy, cx, cy = lens.focal_x, lens.focal_y, lens.centre_x, lens.centre_y
+    return {
+        "header": names.header(message),
+        "height": lens.height,
+        "width": lens.width,
+        "distortion_model": "plumb_bob",
+        "d": (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3),
+        "k": (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0),
+        "r": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+        "p": (fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0),
+    }
+
+
+def grid(message: Grid, names: RosNames) -> RosValues:
+    """``nav_msgs/msg/OccupancyGrid``."""
+    info = {
+        "map_load_time": names.time(message.stamp),
+        "resolution": message.resolution,
+        "width": message.width,
+        "height": message.height,
+        "origin": pose_of(message.origin),
+    }
+    return {"header": names.header(message), "info": info, "data": message.cells}
+
+
+def grid_update(tile: Grid, whole: Grid, names: RosNames) -> RosValues | None:
+    """``map_msgs/msg/OccupancyGridUpdate``: what of ``tile`` lies on the ``whole`` grid; None if nothing does."""
+    column = round((tile.origin.x - whole.origin.x) / whole.resolution)
+    row = round((tile.origin.y - whole.origin.y) / whole.resolution)
+    left, bottom = max(column, 0), max(row, 0)
+    right, top = min(column + tile.width, whole.width), min(row + tile.height, whole.height)
+    if left >= right or bottom >= top:
+        return None
+    cells = tile.cells.reshape(tile.height, tile.width)[bottom - row : top - row, left - column : right - column]
+    size = {"x": left, "y": bottom, "width": right - left, "height": top - bottom}
+    return {"header": names.header(tile), **size, "data": cells.ravel()}
+
+
+def path(message: Path, names: RosNames) -> RosValues:
+    """``nav_msgs/msg/Path``; directions and steering have no place in it."""
+    header = names.header(message)
+    rows = message.poses.reshape(-1, 3).tolist()
+    return {
+        "header": header,
+        "poses": [{"header": header, "pose": pose_of(Pose2D(x=x, y=y, yaw=yaw))} for x, y, yaw in rows],
+    }
+
+
+def _known(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def battery(message: Battery, names: RosNames) -> RosValues:
+    """``sensor_msgs/msg/BatteryState``; what is not known is NaN."""
+    capacity, share = _known(message.capacity_ah), _known(message.charge)
+    return {
+        "header": names.header(message),
+        "voltage": _known(message.voltage),
+        "temperature": math.nan,
+        "current": math.nan,
+        "charge": capacity * share,
+        "capacity": math.nan,
+        "design_capacity": capacity,
+        "percentage": share,
+        "power_supply_status": 2,  # discharging
+        "present": True,
+    }
+
+
+UNKNOWN: Final = (-1.0, *(0.0,) * 8)
+"""Covariance in a ``sensor_msgs/msg/Imu`` that says that the quantity is not measured."""
+
+
+def imu(message: Imu, names: RosNames) -> RosValues:
+    """``sensor_msgs/msg/Imu`` without an orientation; covariances of 0 mean unknown."""
+    return {
+        "header": names.header(message),
+        "orientation": rotation((0.0, 0.0, 0.0, 1.0)),
+        "orientation_covariance": UNKNOWN,
+        "angular_velocity": message.angular_velocity.model_dump(),
+        "linear_acceleration": message.linear_acceleration.model_dump(),
+    }
+
+
+def compass(message: Attitude, names: RosNames) -> RosValues:
+    """``sensor_msgs/msg/Imu`` with an orientation from magnetic east, as REP 145 asks, and no angular velocity."""
+    yaw = math.remainder(math.pi / 2.0 - message.heading, math.tau)
+    acceleration = message.acceleration
+    return {
+        "header": names.header(message),
+        "orientation": rotation(quaternion_from_rpy(message.roll, message.pitch, yaw)),
+        "orientation_covariance": UNKNOWN if message.heading_disturbed else (0.0,) * 9,
+        "angular_velocity_covariance": UNKNOWN,
+        "linear_acceleration": {} if acceleration is None else acceleration.model_dump(),
+        "linear_acceleration_covariance": UNKNOWN if acceleration is None else (0.0,) * 9,
+    }
+
+
+def sonar(echo: SonarEcho, message: SonarRanges, names: RosNames) -> RosValues:
+    """``sensor_msgs/msg/Range``: +inf without an echo, NaN for a sonar that does not answer."""
+    distance = math.nan if not echo.answered else math.inf if echo.range is None else echo.range
+    return {
+        "header": names.header_of(echo.stamp, f"sonar_{echo.name}"),
+        "radiation_type": 0,  # ultrasound
+        "field_of_view": message.field_of_view,
+        "min_range": message.range_min,
+        "max_range": message.range_max,
+        "range": distance,
+    }
+
+
+def joint_states(stamp: int, angles: Mapping[str, float], names: RosNames) -> RosValues:
+    """``sensor_msgs/msg/JointState`` of angles, rad, by joint of the robot's description."""
+    header = {"stamp": names.time(stamp), "frame_id": ""}
+    return {"header": header, "name": list(angles), "position": list(angles.values())}
+
+
+LOG_LEVELS: Final = {
+    LogLevel.DEBUG: 10,
+    LogLevel.INFO: 20,
+    LogLevel.WARNING: 30,
+    LogLevel.ERROR: 40,
+    LogLevel.FATAL: 50,
+}
+"""Levels of ``rcl_interfaces/msg/Log``."""
+SEVERITIES: Final = {Severity.INFO: 20, Severity.WARNING: 30, Severity.ERROR: 40}
+
+
+def event(message: Event, names: RosNames) -> RosValues:
+    """``rcl_interfaces/msg/Log`` of an event: its reason, its text and the values behind it."""
+    values = "".join(f", {name} {value}" for name, value in message.values.items())
+    return {
+        "stamp": names.time(message.stamp),
+        "level": SEVERITIES[message.severity],
+        "name": message.source,
+        "msg": f"{message.reason.value}: {message.text or message.reason.text}{values}",
+    }
+
+
+def log_record(message: LogRecord, names: RosNames) -> RosValues:
+    """``rcl_interfaces/msg/Log`` of a line of the daemon's journal."""
+    return {
+        "stamp": names.time(message.stamp),
+        "level": LOG_LEVELS[message.level],
+        "name": message.name,
+        "msg": message.text,
+        "file": message.file,
+        "line": message.line,
+    }
+
+
+OK, WARN, ERROR, STALE = 0, 1, 2, 3
+"""Levels of ``diagnostic_msgs/msg/DiagnosticStatus``."""
+
+SERVICE_LEVELS: Final = {
+    ServiceState.READY: OK,
+    ServiceState.STARTING: WARN,
+    ServiceState.STOPPED: WARN,
+    ServiceState.BACKOFF: ERROR,
+    ServiceState.FAILED: ERROR,
+}
+
+
+def status(name: str, level: int, text: str, values: Mapping[str, Any], robot: str) -> RosValues:
+    """``diagnostic_msgs/msg/DiagnosticStatus``."""
+    rows = [{"key": key, "value": str(value)} for key, value in values.items() if value not in (None, "", ())]
+    return {"level": level, "name": f"{robot}: {name}", "message": text, "hardware_id": robot, "values": rows}
+
+
+def service_states(table: HealthTable, robot: str) -> list[RosValues]:
+    """``diagnostic_msgs/msg/DiagnosticStatus`` of every service."""
+    return [
+        status(
+            row.name,
+            SERVICE_LEVELS[row.state],
+            row.detail or row.state.value,
+            {"state": row.state.value, "reason": row.reason.value, "restarts": row.restarts},
+            robot,
+        )
+        for row in table.services
+    ]
+
+
+def gate_status(gate: GateState, robot: str) -> RosValues:
+    """``diagnostic_msgs/msg/DiagnosticStatus`` of the safety gate: who drives, and what limits the robot."""
+    level = ERROR if gate.mode is GateMode.ESTOPPED else WARN if gate.hindrances else OK
+    values = {
+        "mode": gate.mode_text,
+        "holder": gate.holder,
+        "role": gate.role and gate.role.value,
+        "speed_limit": f"{gate.speed_limit:.3f}",
+        "stopping_distance": f"{gate.stopping_distance:.3f}",
+        "reasons": ", ".join(reason.value for reason in gate.reasons),
+        "waiting": ", ".join(gate.waiting),
+    }
+    return status("gate", level, gate.why, values, robot)
+
+
+POINTS_MARKERS, FOOTPRINT_MARKER, STOPPING_MARKER = "points", "footprint", "stopping_distance"
+"""Namespaces of the markers."""
+
+_ARROW, _CYLINDER, _LINE_STRIP, _TEXT = 0, 3, 4, 9
+"""Kinds of ``visualization_msgs/msg/Marker``."""
+
+
+def _marker(header: RosValues, namespace: str, number: int, kind: int, colour: tuple[float, ...]) -> RosValues:
+    return {
+        "header": header,
+        "ns": namespace,
+        "id": number,
+        "type": kind,
+        "pose": {"position": vector(), "orientation": rotation((0.0, 0.0, 0.0, 1.0))},
+        "color": dict(zip("rgba", colour, strict=True)),
+        "frame_locked": True,
+    }
+
+
+def point_markers(message: PointsOfInterest, names: RosNames) -> RosValues:
+    """``visualization_msgs/msg/MarkerArray`` of all points of interest, each with its name."""
+    header = names.header_of(message.stamp, "map")
+    markers: list[RosValues] = [{"header": header, "ns": POINTS_MARKERS, "action": 3}]  # delete all
+    for number, point in enumerate(message.points):
+        place = Pose2D(x=point.x, y=point.y, yaw=point.yaw)
+        post = _marker(header, POINTS_MARKERS, 2 * number, _CYLINDER, (0.9, 0.5, 0.1, 0.9))
+        text = _marker(header, POINTS_MARKERS, 2 * number + 1, _TEXT, (1.0, 1.0, 1.0, 1.0))
+        # 0.1, 0.15: m, size of the post and of the letters; 0.2: m from the point up to its name
+        markers.append(post | {"pose": pose_of(place, point.z), "scale": vector(0.1, 0.1, 0.1)})
+        markers.append(text | {"pose": pose_of(place, point.z + 0.2), "scale": vector(z=0.15), "text": point.name})
+    return {"markers": markers}
+
+
+def outline(length: float, width: float) -> list[RosValues]:
+    """Corners of the robot's rectangle around base, m."""
+    x, y = length / 2.0, width / 2.0
+    return [vector(*corner) for corner in ((x, y), (-x, y), (-x, -y), (x, -y))]
+
+
+def gate_markers(gate: GateState, length: float, width: float, names: RosNames) -> RosValues:
+    """``visualization_msgs/msg/MarkerArray`` of the robot's footprint, red while it is stopped, and where it stops."""
+    header = {"frame_id": names.frame("base")}  # stamp 0: where the robot is now
+    free = gate.mode in (GateMode.ARMED, GateMode.DRIVING)
+    colour = (0.2, 0.8, 0.3, 1.0) if free else (0.9, 0.2, 0.2, 1.0)
+    corners = outline(length, width)
+    line = _marker(header, FOOTPRINT_MARKER, 0, _LINE_STRIP, colour)
+    arrow = _marker(header, STOPPING_MARKER, 0, _ARROW, (0.9, 0.7, 0.1, 0.8))
+    backward = gate.twist is not None and gate.twist.vx < 0.0
+    front = math.copysign(length / 2.0, -1.0 if backward else 1.0)
+    tip = front + math.copysign(max(gate.stopping_distance, 1e-3), front)  # 1e-3: m, an arrow has a length
+    return {
+        "markers": [
+            line | {"scale": vector(0.02), "points": [*corners, corners[0]]},
+            # 0.02, 0.05: m, width of the line, and of the arrow's shaft and head
+            arrow | {"scale": vector(0.02, 0.05), "points": [vector(front), vector(tip)]},
+        ]
+    }

@@ -1,0 +1,61 @@
+"""What a face needs of ROS 2: publishers, subscriptions and services of one node, by whatever middleware."""
+
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from monstertruckd.ros2.cdr import RosMessage
+from monstertruckd.ros2.rmw import RosQos
+
+Publish = Callable[[Mapping[str, Any]], None]
+"""Publishes one message; to be called on the event loop."""
+
+
+@dataclass(frozen=True, slots=True)
+class RosSender:
+    """A node that sends messages or calls services."""
+
+    node: str
+    """Qualified name, such as ``/teleop``."""
+    key: str
+    """Distinguishes nodes of the same name."""
+
+
+@dataclass(frozen=True, slots=True)
+class RosArrival:
+    """A message of another node."""
+
+    message: RosMessage
+    sender: RosSender | None
+    """None = the graph knows no publisher of this topic that could have sent it."""
+    publisher: bytes
+    """Identity of the publisher."""
+    sequence: int
+    """Grows with every message of the publisher."""
+    stamp: int
+    """When it was sent, by the sender's clock, ns since 1970."""
+
+
+Take = Callable[[RosArrival], None]
+Answer = Callable[[RosMessage, RosSender | None], Awaitable[Mapping[str, Any]]]
+"""Answers a request of a service."""
+
+
+class RosNode(Protocol):
+    """One node of the ROS 2 graph. All callbacks are called on the event loop."""
+
+    def publisher(self, topic: str, interface: str, qos: RosQos) -> Publish:
+        """Offer a topic; ``topic`` is absolute, or relative to the node's namespace."""
+
+    def subscribe(self, topic: str, interface: str, take: Take) -> None:
+        """Receive a topic: of every publisher the newest message, and none from before the subscription."""
+
+    def serve(self, service: str, interface: str, answer: Answer) -> None:
+        """Offer a service; requests are answered in parallel."""
+
+    @property
+    def malformed(self) -> int:
+        """Messages and requests so far that were not as the wire has them."""
+
+    def present(self, sender: RosSender) -> bool:
+        """Whether the graph still has this node."""

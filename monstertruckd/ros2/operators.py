@@ -1,0 +1,270 @@
+"""ROS 2 nodes as operators of the robot: what each may ask, under a name of its own.
+
+ROS 2 has neither leases nor priorities nor nonces: a face that only forwarded would take away what the gate protects.
+So every node is a source of its own, with its own session; a message that could be old, a repetition or from an unknown
+publisher is refused here, and all that passes is judged by the gate as any operator's request is.
+"""
+
+import asyncio
+import re
+from collections.abc import Awaitable, Callable, Coroutine
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from typing import Any, Final
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import BusyError, InputError, TruckError
+from monstertruckd.ros2.cdr import RosMessage
+from monstertruckd.ros2.node import RosArrival, RosSender
+
+MAX_AGE: Final = 0.5
+"""Seconds by which a stamp may differ from this clock: as old as a request may be for the gate."""
+LEASE: Final = 0.25
+"""Seconds for which a message that drives stands; nothing repeats it."""
+MOST_OPERATORS: Final = 16
+"""Nodes that are connected to the robot at once."""
+
+RosOrder = Callable[[TruckClient], Awaitable[Any]]
+"""Asks the robot for something."""
+
+
+def source_of(node: str, owner: str | None = None) -> str:
+    """Name of a node as a source of requests, such as ``ros2:teleop``, behind the owner of a certificate.
+
+    Args:
+        node: qualified name.
+        owner: common name of the certificate, to which the robot binds sources.
+    """
+    name = re.sub(r"[^A-Za-z0-9_.-]", ".", node.strip("/")) or "node"
+    before = "ros2" if owner is None else f"{owner}:ros2"
+    return f"{before}:{name}"[:64]  # 64: characters of a source
+
+
+def stamp_of(time: RosMessage) -> int:
+    """Nanoseconds of a ``builtin_interfaces/msg/Time``."""
+    return int(time["sec"]) * SECOND + int(time["nanosec"])
+
+
+def _require_recent(what: str, stamp: int, now: int) -> None:
+    difference = (now - stamp) / SECOND
+    if abs(difference) > MAX_AGE:
+        side = "behind" if difference > 0.0 else "ahead of"
+        raise InputError(
+            f"{what} is {abs(difference):.1f} s {side} this clock (at most {MAX_AGE} s): an old message, or clocks "
+            "that differ; run NTP on both computers"
+        )
+
+
+def check_arrival(arrival: RosArrival, now: int, newest: dict[bytes, int]) -> None:
+    """Accept a message that is neither old nor a repetition.
+
+    Args:
+        arrival: of a known publisher.
+        now: real time, ns.
+        newest: sequence numbers by publisher; gets that of the message.
+
+    Raises:
+        InputError: why it is refused.
+    """
+    _require_recent("its time of sending", arrival.stamp, now)
+    before = newest.get(arrival.publisher)
+    if before is not None and arrival.sequence <= before:
+        raise InputError(f"sequence number {arrival.sequence} after {before}: a repetition, or out of order")
+    newest[arrival.publisher] = arrival.sequence
+
+
+def check_header(header: RosMessage, now: int, frames: tuple[str, ...]) -> None:
+    """Accept the header of a message that drives; a stamp of 0 and an empty frame say nothing.
+
+    Args:
+        header: ``std_msgs/msg/Header``.
+        now: the time in which such stamps are, ns.
+        frames: that are possible.
+
+    Raises:
+        InputError: it is old, or in another frame.
+    """
+    stamp = stamp_of(header["stamp"])
+    if stamp:
+        _require_recent("its header's stamp", stamp, now)
+    if header["frame_id"].lstrip("/") not in ("", *frames):
+        raise InputError(f"frame {header['frame_id']!r}: expected {' or '.join(frames)}")
+
+
+def planar_twist(twist: RosMessage) -> tuple[float, float, float]:
+    """Velocities forward and to the left, m/s, and turn rate, rad/s.
+
+    Numbers that are not finite reach the gate, which refuses them by name.
+
+    Raises:
+        InputError: it has another component.
+    """
+    linear, angular = twist["linear"], twist["angular"]
+    others = {"linear.z": linear["z"], "angular.x": angular["x"], "angular.y": angular["y"]}
+    if wrong := [name for name, value in others.items() if value != 0.0]:
+        raise InputError(f"{', '.join(wrong)}: expected 0, the robot moves in a plane")
+    return linear["x"], linear["y"], angular["z"]
+
+
+@dataclass(slots=True)
+class RosOperator:
+    """One node with its session on the robot."""
+
+    client: TruckClient
+    exit: AsyncExitStack
+    waiting: RosOrder | None = None
+    """Newest request to drive that is not sent yet."""
+    task: asyncio.Task[None] | None = None
+
+
+class Operators:
+    """Sessions of the nodes that ask for something.
+
+    Args:
+        connect: makes the client of a source.
+        owner: of this side's certificate; None = without.
+        clock: time.
+        report: gets every refusal: node and text.
+    """
+
+    def __init__(
+        self,
+        connect: Callable[[str], TruckClient],
+        owner: str | None,
+        clock: Clock,
+        report: Callable[[str, str], None],
+    ) -> None:
+        self._connect = connect
+        self._owner = owner
+        self._clock = clock
+        self._report = report
+        self._operators: dict[RosSender, RosOperator] = {}
+        self._opening: dict[RosSender, asyncio.Task[RosOperator]] = {}
+        self._sequences: dict[RosSender, dict[bytes, int]] = {}
+        """Newest sequence number of every publisher."""
+        self._asking: set[asyncio.Task[None]] = set()
+        self.refused = 0
+        """Messages and requests that were refused here."""
+        self.last_refusal = ""
+
+    @property
+    def sources(self) -> list[str]:
+        """Sources that are connected."""
+        return [operator.client.source for operator in self._operators.values()]
+
+    def refuse(self, node: str, what: str, why: str) -> None:
+        """Count and report a refusal."""
+        self.refused += 1
+        self.last_refusal = f"{what} of {node} refused: {why}"
+        self._report(node, self.last_refusal)
+
+    def accepted(self, what: str, arrival: RosArrival, check: Callable[[int], None]) -> RosSender | None:
+        """Sender of a message that may be carried out; None = it is refused, which is reported.
+
+        Args:
+            what: name of the topic.
+            arrival: the message.
+            check: raises ``InputError`` for its content; gets the real time, ns.
+        """
+        sender = arrival.sender
+        if sender is None:
+            self.refuse("an unknown publisher", what, "the graph has no publisher of this topic with its identity")
+            return None
+        now = self._clock.now() + self._clock.real_offset()
+        try:
+            check_arrival(arrival, now, self._sequences.setdefault(sender, {}))
+            check(now)
+        except InputError as error:
+            self.refuse(sender.node, what, str(error))
+            return None
+        return sender
+
+    def drive(self, sender: RosSender, what: str, order: RosOrder) -> None:
+        """Have a node's request to drive sent; of several that wait only the newest is.
+
+        Requests that come while the node's session is opened are not sent: they would be old by then.
+        """
+        operator = self._operators.get(sender)
+        if operator is None:
+            if sender not in self._opening:
+                self.ask(sender, what, _connected)
+            return
+        operator.waiting = order
+        if operator.task is None or operator.task.done():
+            operator.task = asyncio.create_task(self._drive(sender, operator, what))
+
+    async def _drive(self, sender: RosSender, operator: RosOperator, what: str) -> None:
+        while operator.waiting is not None:
+            order, operator.waiting = operator.waiting, None
+            try:
+                await order(operator.client)
+            except TruckError as error:
+                self.refuse(sender.node, what, str(error))
+
+    def ask(self, sender: RosSender, what: str, order: RosOrder) -> None:
+        """Have a node's request carried out; a refusal is reported."""
+
+        async def carry_out() -> None:
+            await order(await self.session(sender))
+
+        self.run(sender.node, what, carry_out())
+
+    def run(self, node: str, what: str, work: Coroutine[Any, Any, Any]) -> None:
+        """Have ``work`` done; a refusal is reported as that of the node."""
+
+        async def reported() -> None:
+            try:
+                await work
+            except TruckError as error:
+                self.refuse(node, what, str(error))
+
+        task = asyncio.create_task(reported())
+        self._asking.add(task)
+        task.add_done_callback(self._asking.discard)
+
+    async def session(self, sender: RosSender) -> TruckClient:
+        """A node's session, opened when it is needed first.
+
+        Raises:
+            BusyError: too many nodes are connected.
+            TruckError: the robot cannot be reached.
+        """
+        if sender in self._operators:
+            return self._operators[sender].client
+        if sender not in self._opening:
+            if len(self._operators) + len(self._opening) >= MOST_OPERATORS:
+                raise BusyError(f"{MOST_OPERATORS} ROS nodes are connected: expected fewer")
+            self._opening[sender] = asyncio.create_task(self._open(sender))
+        return (await asyncio.shield(self._opening[sender])).client
+
+    async def _open(self, sender: RosSender) -> RosOperator:
+        stack = AsyncExitStack()
+        try:
+            client = await stack.enter_async_context(self._connect(source_of(sender.node, self._owner)))
+            await client.ready()
+        except BaseException:
+            await stack.aclose()
+            raise
+        finally:
+            del self._opening[sender]
+        operator = self._operators[sender] = RosOperator(client, stack)
+        return operator
+
+    async def leave_absent(self, present: Callable[[RosSender], bool]) -> None:
+        """End the sessions of nodes that have left."""
+        self._sequences = {sender: newest for sender, newest in self._sequences.items() if present(sender)}
+        for sender, operator in list(self._operators.items()):
+            if not present(sender):
+                del self._operators[sender]
+                await operator.exit.aclose()
+
+    async def close(self) -> None:
+        """End all sessions."""
+        for task in (*self._asking, *self._opening.values()):
+            task.cancel()
+        await self.leave_absent(lambda _: False)
+
+
+async def _connected(_: TruckClient) -> None:
+    """Ask for nothing more than the session."""

@@ -1,0 +1,298 @@
+"""A ROS 2 node over Zenoh, as ``rmw_zenoh`` has them: no ROS installation is needed on this side."""
+
+import asyncio
+import json
+import socket
+import threading
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, Final, Self
+
+import zenoh
+from zenoh import ext
+
+from monstertruck_runtime.client import in_network_thread
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.endpoints import endpoint_of, host_of, port_of, protocol_of
+from monstertruck_runtime.errors import BusyError, InputError, NotFoundError
+from monstertruck_runtime.threads import ThreadHop, in_daemon_thread, in_thread
+from monstertruckd.ros2.cdr import decode, encode
+from monstertruckd.ros2.interfaces import type_hash
+from monstertruckd.ros2.node import Answer, Publish, RosArrival, RosSender, Take
+from monstertruckd.ros2.rmw import (
+    LIVELINESS,
+    NO_HASH,
+    RELIABLE,
+    Attachment,
+    EntityKind,
+    RosEntity,
+    RosQos,
+    data_key,
+    dds_name,
+    gid_of,
+    mangled,
+    parsed_token,
+    token_key,
+)
+
+PUBLISHERS: Final = 64
+"""Publishers of a topic whose newest message may wait for the event loop; further ones are lost."""
+REQUESTS: Final = 64
+"""Requests of a service that may wait; the oldest is lost."""
+GRAPH: Final = 100_000
+"""Changes of the graph that may wait."""
+PORTS: Final = 10
+"""Ports that are tried for the first that is free."""
+
+
+def session_settings(connect: str | None, listen: str) -> dict[str, Any]:
+    """Configuration of the node's Zenoh session.
+
+    Args:
+        connect: endpoint of a running Zenoh router such as ``rmw_zenohd``; None = the node is the router itself.
+        listen: endpoint of that router.
+    """
+    settings: dict[str, Any] = {
+        "scouting": {"delay": 0, "multicast": {"enabled": False}},
+        "timestamping": {"enabled": True},
+        "transport": {"shared_memory": {"enabled": False}},
+    }
+    if connect is None:
+        return settings | {"mode": "router", "listen": {"endpoints": [listen]}}
+    reach = {"endpoints": [connect], "timeout_ms": 2500, "exit_on_failure": True}
+    return settings | {"mode": "client", "connect": reach}
+
+
+def free_endpoint(listen: str) -> str:
+    """The endpoint, or the same with the next free port: ``rmw_zenohd`` and the robot's daemon have one default.
+
+    Raises:
+        BusyError: none of the next ports is free.
+    """
+    protocol, host, first = protocol_of(listen), host_of(listen), port_of(listen) or 0
+    for port in range(first, first + PORTS):
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((host, port))
+            except OSError:
+                continue
+            return endpoint_of(protocol, host, probe.getsockname()[1])
+    raise BusyError(f"ports {first} to {first + PORTS - 1} of {host} are taken: expected a free one (--listen)")
+
+
+class ZenohNode:
+    """One node; an async context manager.
+
+    Args:
+        name: of the node, and its namespace, ``/`` or ``/truck1``.
+        domain: ``ROS_DOMAIN_ID``.
+        settings: as by ``session_settings``.
+        clock: time.
+        hashed: False for Humble.
+    """
+
+    def __init__(
+        self, name: tuple[str, str], domain: int, settings: Mapping[str, Any], clock: Clock, *, hashed: bool = True
+    ) -> None:
+        self._name, self._namespace = name
+        self._domain = domain
+        self._settings = settings
+        self._clock = clock
+        self._hashed = hashed
+        self._entities = 0
+        self._graph: dict[str, RosEntity] = {}
+        """Entities by their token."""
+        self._gids: dict[bytes, str] = {}
+        """Tokens by identity."""
+        self._kept: list[Any] = []
+        """Declarations of Zenoh, which end when they are dropped."""
+        self._answering: set[asyncio.Task[None]] = set()
+        self.malformed = 0
+
+    async def __aenter__(self) -> Self:
+        """Join the graph.
+
+        Raises:
+            BusyError: it has a node of this name already.
+            NotFoundError: no router answers, or the endpoint cannot be listened at.
+        """
+        self._loop = asyncio.get_running_loop()
+        text = json.dumps(self._settings)
+        try:
+            self._session = await in_thread(lambda: zenoh.open(zenoh.Config.from_json5(text)))
+        except zenoh.ZError as error:
+            places = self._settings.get("connect", self._settings.get("listen", {})).get("endpoints")
+            raise NotFoundError(f"no Zenoh session for ROS 2 at {', '.join(places or ())}: {error}") from None
+        hop: ThreadHop[tuple[str, bool]] = ThreadHop(self._seen, GRAPH, lambda _: None)
+        try:
+            await in_thread(partial(self._join, hop))
+        except BusyError:
+            await self.__aexit__()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Leave the graph."""
+        for task in self._answering:
+            task.cancel()
+        await in_daemon_thread(self._session.close)
+
+    def _join(self, hop: ThreadHop[tuple[str, bool]]) -> None:
+        own = f"*/*/*/{EntityKind.NODE}/*/{mangled('' if self._namespace == '/' else self._namespace)}/{self._name}"
+        key = f"{LIVELINESS}/{self._domain}/{own}"
+        found = [reply for reply in self._session.liveliness().get(key, timeout=0.5) if reply.ok is not None]
+        if found:
+            node = f"{self._namespace.rstrip('/')}/{self._name}"
+            raise BusyError(f"domain {self._domain} has a node {node} already: expected one face for a robot")
+
+        def follow(sample: zenoh.Sample) -> None:
+            hop.put((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+
+        graph = f"{LIVELINESS}/{self._domain}/**"
+        self._kept.append(self._session.liveliness().declare_subscriber(graph, follow, history=True))
+        self._token(EntityKind.NODE)
+
+    # Graph
+
+    def _seen(self, news: tuple[str, bool]) -> None:
+        key, here = news
+        if not here:
+            self._graph.pop(key, None)
+            self._gids.pop(gid_of(key), None)
+            return
+        try:
+            self._graph[key] = parsed_token(key)
+        except InputError:
+            self.malformed += 1
+            return
+        self._gids[gid_of(key)] = key
+
+    def _sender(self, gid: bytes, topic: str, interface: str, kind: EntityKind) -> RosSender | None:
+        entity = self._graph.get(self._gids.get(gid, ""))
+        if entity is None or (entity.kind, entity.topic, entity.interface) != (kind, topic, dds_name(interface)):
+            return None
+        return RosSender(entity.qualified_node, entity.owner)
+
+    def present(self, sender: RosSender) -> bool:
+        """Whether the graph still has this node."""
+        return any(entity.owner == sender.key for entity in self._graph.values())
+
+    def _qualified(self, name: str) -> str:
+        name = name.replace("~", self._name, 1) if name.startswith("~/") else name
+        return name if name.startswith("/") else f"{self._namespace.rstrip('/')}/{name}"
+
+    def _token(self, kind: EntityKind, topic: str = "", interface: str = "", qos: RosQos = RELIABLE) -> bytes:
+        """Declare an entity; returns its identity."""
+        own = self._entities
+        self._entities += 1
+        described = dds_name(interface) if interface else ""
+        entity = RosEntity(kind, self._namespace, self._name, topic, described)
+        types = "" if not interface else type_hash(interface) if self._hashed else NO_HASH
+        key = token_key(self._domain, str(self._session.zid()), (0, own), entity, (types, qos.text))
+        self._kept.append(self._session.liveliness().declare_token(key))
+        return gid_of(key)
+
+    def _key(self, name: str, interface: str) -> str:
+        return data_key(self._domain, name, interface, hashed=self._hashed)
+
+    def _real_time(self) -> int:
+        return self._clock.now() + self._clock.real_offset()
+
+    # Topics
+
+    def publisher(self, topic: str, interface: str, qos: RosQos) -> Publish:
+        """Offer a topic; see ``RosNode``."""
+        name = self._qualified(topic)
+        more: dict[str, Any] = {}
+        if qos.latched:
+            more = {"cache": ext.CacheConfig(qos.depth), "publisher_detection": True}
+            if qos.reliable:
+                # 0.5: seconds between two heartbeats, as rmw_zenoh has it
+                more["sample_miss_detection"] = ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
+        publisher = ext.declare_advanced_publisher(
+            self._session, self._key(name, interface), congestion_control=zenoh.CongestionControl.DROP, **more
+        )
+        self._kept.append(publisher)
+        gid = self._token(EntityKind.PUBLISHER, name, interface, qos)
+        sequence = 0
+
+        def publish(message: Mapping[str, Any]) -> None:
+            nonlocal sequence
+            sequence += 1
+            attachment = Attachment(sequence, self._real_time(), gid).packed()
+            publisher.put(encode(interface, message), attachment=attachment)
+
+        return publish
+
+    def subscribe(self, topic: str, interface: str, take: Take) -> None:
+        """Receive a topic; see ``RosNode``."""
+        name = self._qualified(topic)
+        newest: dict[bytes, tuple[Attachment, bytes]] = {}
+        """By publisher; filled by the thread that reads the network, emptied by the loop."""
+        lock = threading.Lock()
+
+        def receive(sample: zenoh.Sample) -> None:
+            try:
+                attachment = Attachment.parse(None if sample.attachment is None else sample.attachment.to_bytes())
+            except InputError:
+                self.malformed += 1
+                return
+            with lock:
+                scheduled = bool(newest)
+                waiting = newest.get(attachment.gid)
+                if waiting is None and len(newest) >= PUBLISHERS:
+                    self.malformed += 1
+                elif waiting is None or attachment.sequence > waiting[0].sequence:
+                    newest[attachment.gid] = attachment, sample.payload.to_bytes()
+                    if not scheduled:
+                        self._loop.call_soon_threadsafe(deliver)
+
+        def deliver() -> None:
+            with lock:
+                arrived = list(newest.values())
+                newest.clear()
+            for attachment, data in arrived:
+                try:
+                    message = decode(interface, data)
+                except InputError:
+                    self.malformed += 1
+                    continue
+                sender = self._sender(attachment.gid, name, interface, EntityKind.PUBLISHER)
+                take(RosArrival(message, sender, attachment.gid, attachment.sequence, attachment.stamp))
+
+        self._token(EntityKind.SUBSCRIPTION, name, interface)
+        handler = in_network_thread(receive)
+        self._kept.append(self._session.declare_subscriber(self._key(name, interface), handler))
+
+    # Services
+
+    def serve(self, service: str, interface: str, answer: Answer) -> None:
+        """Offer a service; see ``RosNode``."""
+        name = self._qualified(service)
+        key = self._key(name, interface)
+        hop: ThreadHop[zenoh.Query] = ThreadHop(
+            partial(self._request, key, name, interface, answer), REQUESTS, lambda _: None
+        )
+        # Clients ask with target ALL_COMPLETE.
+        self._kept.append(self._session.declare_queryable(key, hop.put, complete=True))
+        self._token(EntityKind.SERVICE, name, interface)
+
+    def _request(self, key: str, name: str, interface: str, answer: Answer, query: zenoh.Query) -> None:
+        task = self._loop.create_task(self._answer(key, name, interface, answer, query))
+        self._answering.add(task)
+        task.add_done_callback(self._answering.discard)
+
+    async def _answer(self, key: str, name: str, interface: str, answer: Answer, query: zenoh.Query) -> None:
+        with query:
+            try:
+                asked = Attachment.parse(None if query.attachment is None else query.attachment.to_bytes())
+                data = b"" if query.payload is None else query.payload.to_bytes()
+                message = decode(f"{interface}_Request", data)
+            except InputError as error:
+                self.malformed += 1
+                query.reply_err(str(error).encode())
+                return
+            reply = await answer(message, self._sender(asked.gid, name, interface, EntityKind.CLIENT))
+            attachment = Attachment(asked.sequence, self._real_time(), asked.gid)
+            query.reply(key, encode(f"{interface}_Response", reply), attachment=attachment.packed())

@@ -1,0 +1,112 @@
+"""``monstertruckd ros2``: the robot as a ROS 2 node."""
+
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from monstertruck_runtime.endpoints import is_endpoint
+from monstertruck_runtime.errors import InputError
+from monstertruckd.tools.cli.output import needs_extra, remark, until_stopped
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.clock import WallClock
+    from monstertruckd.config.truck import TruckConfig
+    from monstertruckd.ros2.facts import RobotFacts
+
+
+class Distribution(StrEnum):
+    """ROS 2 distributions by their type hashes."""
+
+    JAZZY = "jazzy"
+    KILTED = "kilted"
+    LYRICAL = "lyrical"
+    HUMBLE = "humble"
+
+
+def ros2(
+    robot: Annotated[
+        str | None,
+        typer.Option("--robot", "-r", metavar="NAME@ENDPOINT", help="The robot. Default: that of this computer."),
+    ] = None,
+    domain: Annotated[int, typer.Option("--domain", envvar="ROS_DOMAIN_ID", min=0, max=232)] = 0,
+    namespace: Annotated[
+        str, typer.Option("--namespace", help="Before all relative topics, such as /truck1: for several robots.")
+    ] = "/",
+    prefix: Annotated[
+        str, typer.Option("--frame-prefix", help="Before all frames, such as truck1/: for several robots.")
+    ] = "",
+    connect: Annotated[
+        str | None,
+        typer.Option("--connect", metavar="ENDPOINT", help="Running Zenoh router of ROS 2 (`rmw_zenohd`) to join."),
+    ] = None,
+    listen: Annotated[
+        str,
+        typer.Option(
+            "--listen",
+            metavar="ENDPOINT",
+            help="Without --connect: where ROS 2 nodes reach this program; of a port that is taken the next free one.",
+        ),
+    ] = "tcp/127.0.0.1:7447",
+    distribution: Annotated[
+        Distribution, typer.Option("--distro", help="Jazzy, Kilted and Lyrical are served at once; Humble alone.")
+    ] = Distribution.JAZZY,
+    map_to_odom: Annotated[bool, typer.Option(help="Publish map to odom; off where slam_toolbox or amcl does.")] = True,
+    odom_to_base: Annotated[
+        bool, typer.Option(help="Publish odom to base_link; off where robot_localization does.")
+    ] = True,
+    clock: Annotated[bool, typer.Option("--clock", help="Publish /clock, for nodes with use_sim_time.")] = False,
+    drive: Annotated[
+        bool, typer.Option(help="Let ROS 2 nodes drive, arm and send goals; the emergency stop they always may.")
+    ] = True,
+) -> None:
+    """Show the robot to ROS 2 as a node, and pass on what ROS 2 nodes ask of it.
+
+    It is a client of the robot like any other, and speaks to rmw_zenoh (RMW_IMPLEMENTATION=rmw_zenoh_cpp);
+    ROS 2 need not be installed here.
+    """
+    for name, endpoint in (("--connect", connect), ("--listen", listen)):
+        if endpoint is not None and not is_endpoint(endpoint):
+            raise InputError(f"{name} {endpoint!r}: expected tcp/HOST:PORT")
+    if not namespace.startswith("/"):
+        raise InputError(f"--namespace {namespace!r}: expected a name that begins with /")
+    with needs_extra("ros2"):
+        from monstertruckd.ros2.face import FaceOptions
+        from monstertruckd.ros2.serve import serve_zenoh
+        from monstertruckd.ros2.zenoh_node import free_endpoint, session_settings
+    from monstertruckd.station.address import RobotAddress
+
+    address = RobotAddress.default() if robot is None else RobotAddress.parse(robot)
+    own = free_endpoint(listen)
+    options = FaceOptions(prefix, map_to_odom, odom_to_base, clock, drive)
+    hashed = distribution is not Distribution.HUMBLE
+
+    def ready() -> None:
+        remark(f"ros2: robot {address.name} is node {namespace.rstrip('/')}/{address.name} of domain {domain}")
+        if connect is None:
+            remark(f"ros2: nodes reach it by ZENOH_CONFIG_OVERRIDE='connect/endpoints=[\"{own}\"]'")
+
+    async def serve(wall: "WallClock") -> None:
+        node = (address.name, namespace)
+        settings = session_settings(connect, own)
+        await serve_zenoh(address, node, domain, settings, robot_facts, options, wall, ready, hashed=hashed)
+
+    until_stopped(serve)
+
+
+def robot_facts(config: "TruckConfig") -> "RobotFacts":
+    """What ROS 2 needs of a configuration."""
+    from monstertruck_kinematics.description import urdf
+    from monstertruckd.ros2.facts import RobotFacts, WheelJoints
+    from monstertruckd.tools.cli.description import described
+
+    try:
+        description = urdf(described(config))
+    except InputError:  # its body has none
+        description = None
+    geometry, camera = config.geometry, config.devices.camera
+    wheels = None
+    if config.body.kind in ("truck", "ackermann"):
+        wheels = WheelJoints(config.chassis(), geometry.track, geometry.drive_ratio)
+    lens = None if camera is None else getattr(camera.driver, "lens", None)
+    return RobotFacts(geometry.length, geometry.width, lens, description, wheels)

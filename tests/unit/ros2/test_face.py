@@ -1,0 +1,396 @@
+"""A robot's bus on one side, nodes of ROS 2 over Zenoh on the other."""
+
+import asyncio
+import json
+import math
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+import zenoh
+from zenoh import ext
+
+from monstertruck_estimation.transforms import FIXED, mount, planar
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import SECOND, WallClock
+from monstertruck_runtime.errors import BusyError
+from monstertruck_runtime.mailbox import fifo
+from monstertruck_schemas import topics as t
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.req import Order, Role
+from monstertruck_schemas.roles import AccessRole
+from monstertruck_schemas.sensor import LaserScan
+from monstertruck_schemas.state import ClockOffset, Grid, Transforms
+from monstertruckd.ros2.cdr import decode, encode
+from monstertruckd.ros2.face import FaceOptions, RosFace
+from monstertruckd.ros2.facts import RobotFacts
+from monstertruckd.ros2.operators import Operators
+from monstertruckd.ros2.rmw import RELIABLE, Attachment, data_key
+from monstertruckd.ros2.zenoh_node import ZenohNode, session_settings
+from monstertruckd.ros2.zenoh_node import free_endpoint as next_endpoint
+from tests.bus_kit import free_endpoint, gate_state, odometry, running_robot
+
+OFFSET = 1_000_000 * SECOND
+TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+
+
+@dataclass
+class Scene:
+    robot: object
+    ros: str
+    """Endpoint of the face's router."""
+    requests: object
+    operators: Operators
+    texts: list[str] = field(default_factory=list)
+
+    async def until(self, condition, seconds=5.0):
+        async with asyncio.timeout(seconds):
+            while not condition():
+                await asyncio.sleep(0.01)
+
+    @asynccontextmanager
+    async def node(self, name="teleop"):
+        async with ZenohNode((name, "/"), 0, session_settings(self.ros, ""), WallClock()) as node:
+            yield node
+
+
+FACTS = RobotFacts(0.4, 0.3, description='<robot><link name="base" /></robot>')
+
+
+@asynccontextmanager
+async def scene(options=None):
+    options = options or FaceOptions()
+    async with running_robot() as robot:
+        clock, ros = WallClock(), free_endpoint()
+        outcomes = []
+
+        async def carry_out(payload):
+            outcomes.append(payload)
+            return json.loads(gate_state(1).model_dump_json())
+
+        for order in Order:
+            robot.rpc.register(order.value, carry_out, AccessRole.OBSERVER)
+        gate = robot.bus.publisher(t.GATE, t.Writer.GATE)
+        offset = robot.bus.publisher(t.CLOCK, t.Writer.DAEMON)
+
+        async def live():
+            while True:
+                now = clock.now()
+                gate.put(_gate(gate, now))
+                offset.put(ClockOffset(stamp=now, received=now, seq=offset.next_seq(), offset=OFFSET))
+                await asyncio.sleep(0.1)
+
+        texts = []
+        async with asyncio.TaskGroup() as tasks:
+            running = [tasks.create_task(live())]
+            async with (
+                TruckClient("truck", robot.endpoint, source="face", clock=clock) as client,
+                ZenohNode(("truck", "/"), 0, session_settings(None, ros), clock) as node,
+            ):
+                operators = Operators(
+                    lambda source: TruckClient("truck", robot.endpoint, source=source, clock=clock),
+                    None,
+                    clock,
+                    lambda _, text: texts.append(text),
+                )
+                ready = asyncio.Event()
+                face = RosFace(client, node, operators, FACTS, options, clock)
+                running.append(tasks.create_task(face.run(ready.set)))
+                await asyncio.wait_for(ready.wait(), 10)
+                requests = robot.bus.subscribe(t.REQ_DRIVE, fifo(1000))
+                found = Scene(robot, ros, requests, operators, texts)
+                found.outcomes = outcomes
+                try:
+                    yield found
+                finally:
+                    for task in running:
+                        task.cancel()
+                    await asyncio.wait(running)
+                    await operators.close()
+
+
+def _gate(gate, now):
+    return gate_state(1).model_copy(update={"stamp": now, "received": now, "seq": gate.next_seq()})
+
+
+async def drive(node, scene, values, interface=TWIST, times=1):
+    publish = node.publisher("cmd_vel", interface, RELIABLE)
+    await asyncio.sleep(0.3)  # until the graph has it
+    for _ in range(times):
+        publish(values)
+        await asyncio.sleep(0.05)
+
+
+def twist(vx=0.1, wz=0.2, **linear):
+    return {"linear": {"x": vx, **linear}, "angular": {"z": wz}}
+
+
+async def test_a_twist_drives_under_the_name_of_its_node():
+    async with scene() as found, found.node() as node:
+        await drive(node, found, twist(), times=20)
+        await found.until(lambda: found.requests.latest is not None)
+        request = found.requests.latest
+        assert (request.source, request.role, request.lease) == ("ros2:teleop", Role.STATION, 0.25)
+        assert (request.twist.vx, request.twist.vy, request.twist.wz) == (0.1, 0.0, 0.2)
+        assert found.operators.refused == 0
+
+
+async def test_each_node_is_a_source_of_its_own_and_leaves_with_its_tokens():
+    async with scene() as found:
+        async with found.node("one") as one, found.node("two") as two:
+            await asyncio.gather(drive(one, found, twist(), times=10), drive(two, found, twist(-0.1), times=10))
+            await found.until(lambda: len(found.operators.sources) == 2)
+            sources = {request.source for request in found.requests.drain()}
+            assert sources == {"ros2:one", "ros2:two"}
+        await found.until(lambda: not found.operators.sources)
+
+
+async def test_a_number_that_is_none_reaches_the_gate_which_refuses_it_by_name():
+    async with scene() as found, found.node() as node:
+        await drive(node, found, twist(math.nan), times=10)
+        await found.until(lambda: found.requests.latest is not None)
+        assert math.isnan(found.requests.latest.twist.vx)
+
+
+async def hostile(found, messages, *, gid=None):
+    """Puts messages (values, sequence, age in s) with a gid of no token, or that of a node."""
+    session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_settings(found.ros, ""))))
+    try:
+        clock = WallClock()
+        for values, sequence, age in messages:
+            stamp = clock.now() + clock.real_offset() - round(age * SECOND)
+            attachment = Attachment(sequence, stamp, gid or bytes(16)).packed()
+            session.put(data_key(0, "/cmd_vel", TWIST), encode(TWIST, values), attachment=attachment)
+            await asyncio.sleep(0.02)
+        await asyncio.sleep(0.3)
+    finally:
+        await asyncio.to_thread(session.close)
+
+
+async def test_an_unknown_publisher_is_refused():
+    async with scene() as found:
+        await hostile(found, [(twist(), number, 0.0) for number in range(1, 21)])
+        assert found.requests.latest is None
+        assert found.operators.refused == 20
+        assert "no publisher of this topic" in found.texts[0]
+
+
+async def test_messages_that_are_old_or_come_again_are_refused():
+    async with scene() as found, found.node() as node:
+        heard = []
+        listener = zenoh.open(zenoh.Config.from_json5(json.dumps(session_settings(found.ros, ""))))
+        listener.declare_subscriber(data_key(0, "/cmd_vel", TWIST), heard.append)
+        await drive(node, found, twist(), times=20)
+        await found.until(lambda: found.requests.latest is not None and heard)
+        gid = Attachment.parse(heard[0].attachment.to_bytes()).gid
+        await asyncio.to_thread(listener.close)
+        await asyncio.sleep(0.2)
+        found.requests.drain()
+        await hostile(found, [(twist(), number, 0.0) for number in range(1, 11)], gid=gid)
+        await hostile(found, [(twist(), 1000 + number, 30.0) for number in range(10)], gid=gid)
+        assert found.requests.drain() == []
+        assert any("a repetition, or out of order" in text for text in found.texts)
+        assert any("30.0 s behind this clock" in text for text in found.texts)
+
+
+@pytest.mark.parametrize(
+    ("interface", "values", "why"),
+    [
+        (TWIST, {"linear": {"x": 0.1, "z": 1.0}}, "linear.z: expected 0"),
+        (STAMPED, {"header": {"frame_id": "laser"}, "twist": twist()}, "frame 'laser': expected base_link"),
+        (STAMPED, {"header": {"stamp": {"sec": 5}}, "twist": twist()}, "stamp is"),
+    ],
+)
+async def test_what_the_robot_could_misunderstand_is_refused(interface, values, why):
+    async with scene() as found, found.node() as node:
+        await drive(node, found, values, interface, times=3)
+        await found.until(lambda: found.texts)
+        assert why in found.texts[0]
+        assert found.requests.latest is None
+
+
+async def test_a_flood_of_garbage_costs_no_exception_and_is_counted():
+    async with scene() as found, found.node() as node:
+        session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_settings(found.ros, ""))))
+        key = data_key(0, "/cmd_vel", TWIST)
+        for size in range(2000):
+            session.put(key, bytes(size % 50), attachment=None if size % 2 else bytes(size % 40))
+        session.close()
+        await drive(node, found, twist(), times=20)
+        await found.until(lambda: found.requests.latest is not None)
+        assert found.requests.latest.source == "ros2:teleop"
+
+
+async def call(found, service, node_kind="std_srvs/srv/Trigger"):
+    """Asks a service as ``rmw_zenoh`` does, from a client without a token."""
+    session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_settings(found.ros, ""))))
+    try:
+        await asyncio.sleep(0.2)
+        key = data_key(0, service, node_kind)
+        attachment = Attachment(7, 1, bytes(range(16))).packed()
+        ask = lambda: list(  # noqa: E731
+            session.get(
+                key,
+                payload=encode(f"{node_kind}_Request", {}),
+                attachment=attachment,
+                target=zenoh.QueryTarget.ALL_COMPLETE,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=5.0,
+            )
+        )
+        (reply,) = await asyncio.to_thread(ask)
+        sent = Attachment.parse(reply.ok.attachment.to_bytes())
+        assert (sent.sequence, sent.gid) == (7, bytes(range(16)))
+        return decode(f"{node_kind}_Response", reply.ok.payload.to_bytes())
+    finally:
+        session.close()
+
+
+async def test_everybody_may_stop_but_only_known_clients_arm():
+    async with scene() as found:
+        assert (await call(found, "/truck/estop"))["success"]
+        refused = await call(found, "/truck/arm")
+        assert not refused["success"]
+        assert "no client of this service" in refused["message"]
+        assert [outcome["source"] for outcome in found.outcomes] == ["face"]
+
+
+async def test_a_face_that_does_not_drive_still_stops():
+    async with scene(FaceOptions(drives=False)) as found, found.node() as node:
+        await drive(node, found, twist(), times=5)
+        assert (await call(found, "/truck/estop"))["success"]
+        assert found.requests.latest is None
+        assert not found.operators.sources
+
+
+async def test_a_second_face_of_the_robot_is_refused():
+    async with scene() as found:
+        with pytest.raises(BusyError, match="has a node /truck already"):
+            async with ZenohNode(("truck", "/"), 0, session_settings(found.ros, ""), WallClock()):
+                pass
+
+
+def scan(stamp):
+    ranges, codes = np.array([1.0, np.inf, np.inf]), np.array([255, 2, 7], np.uint8)
+    return LaserScan(
+        stamp=stamp,
+        received=stamp,
+        seq=1,
+        frame="lidar",
+        start_angle=-1.0,
+        end_angle=1.0,
+        time_increment=0.001,
+        scan_time=0.1,
+        range_min=0.1,
+        range_max=5.0,
+        ranges=ranges,
+        codes=codes,
+    )
+
+
+class Reader:
+    """Newest message of topics, by an AdvancedSubscriber with the options of rmw_zenoh."""
+
+    def __init__(self, found):
+        self.messages = {}
+        self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_settings(found.ros, ""))))
+        self._kept = []
+
+    def follow(self, topic, interface):
+        def take(sample):
+            self.messages[topic] = decode(interface, sample.payload.to_bytes())
+
+        history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+        self._kept.append(
+            ext.declare_advanced_subscriber(
+                self._session, data_key(0, topic, interface), take, history=history, subscriber_detection=True
+            )
+        )
+
+    def close(self):
+        self._session.close()
+
+
+async def test_topics_have_ros_s_frames_stamps_and_values_and_reach_who_comes_late():
+    async with scene(FaceOptions(prefix="t1/")) as found:
+        put = {
+            t.SCAN: scan(5 * SECOND),
+            t.ODOMETRY: odometry(3).model_copy(update={"frame": "odom"}),
+            t.TRANSFORMS: Transforms(
+                stamp=9,
+                received=9,
+                seq=1,
+                frame="map",
+                transforms=(planar("map", "odom", 9, (1.0, 0.0, 0.0)), mount("lidar", (0.2, 0.0, 0.1))),
+            ),
+            t.MAP: Grid(
+                stamp=9, received=9, seq=1, frame="map", resolution=0.5, width=2, height=2,
+                origin=Pose2D(x=-1.0, y=-1.0, yaw=0.0), cells=np.array([0, 100, -1, 0], np.int8),
+            ),
+        }  # fmt: skip
+        reader = Reader(found)
+        try:
+            reader.follow("/scan", "sensor_msgs/msg/LaserScan")
+            await asyncio.sleep(0.3)
+            for topic, message in put.items():
+                found.robot.bus.publisher(topic, topic.writer).put(message)
+            await found.until(lambda: "/scan" in reader.messages)
+            ros = reader.messages["/scan"]
+            assert ros["header"] == {"stamp": {"sec": 1_000_005, "nanosec": 0}, "frame_id": "t1/laser"}
+            assert ros["ranges"][:2].tolist() == [1.0, math.inf]
+            assert math.isnan(ros["ranges"][2])
+            for topic, interface in {
+                "/map": "nav_msgs/msg/OccupancyGrid",
+                "/tf_static": "tf2_msgs/msg/TFMessage",
+                "/robot_description": "std_msgs/msg/String",
+            }.items():
+                reader.follow(topic, interface)
+            await found.until(lambda: len(reader.messages) == 4)
+            assert reader.messages["/map"]["data"].tolist() == [0, 100, -1, 0]
+            frames = {
+                (row["header"]["frame_id"], row["child_frame_id"])
+                for row in reader.messages["/tf_static"]["transforms"]
+            }
+            assert frames == {("t1/base_link", "t1/laser"), ("t1/base_link", "t1/base_footprint")}
+            assert 'name="t1/base_link"' in reader.messages["/robot_description"]["data"]
+        finally:
+            reader.close()
+
+
+@pytest.mark.parametrize(("kept", "expected"), [(True, {"odom", "base_link"}), (False, set())])
+async def test_who_publishes_the_moving_frames_is_chosen(kept, expected):
+    async with scene(FaceOptions(map_to_odom=kept, odom_to_base=kept)) as found:
+        children = set()
+        reader = Reader(found)
+        try:
+            session = reader._session
+            interface = "tf2_msgs/msg/TFMessage"
+
+            def take(sample):
+                rows = decode(interface, sample.payload.to_bytes())["transforms"]
+                children.update(row["child_frame_id"] for row in rows)
+
+            kept_alive = session.declare_subscriber(data_key(0, "/tf", interface), take)
+            await asyncio.sleep(0.3)
+            tree = Transforms(
+                stamp=9, received=9, seq=1, frame="map", transforms=(planar("map", "odom", FIXED, (0.0, 0.0, 0.0)),)
+            )
+            found.robot.bus.publisher(t.TRANSFORMS, t.TRANSFORMS.writer).put(tree)
+            moved = odometry(3).model_copy(update={"frame": "odom"})
+            found.robot.bus.publisher(t.ODOMETRY, t.ODOMETRY.writer).put(moved)
+            await asyncio.sleep(0.5)
+            assert children == expected
+            kept_alive.undeclare()
+        finally:
+            reader.close()
+
+
+def test_of_a_port_that_is_taken_the_next_one_is_listened_at():
+    import socket
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert next_endpoint(f"tcp/127.0.0.1:{port}") == f"tcp/127.0.0.1:{port + 1}"

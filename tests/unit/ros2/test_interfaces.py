@@ -1,0 +1,53 @@
+"""Type hashes: those of rosidl, and those of independent programs."""
+
+from pathlib import Path
+
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from monstertruckd.ros2.interfaces import FILE, hash_of, interfaces, parsed, type_hash
+
+HASHES = Path(__file__).parents[2] / "data" / "ros2" / "hashes.txt"
+ROSIDL = dict(line.split() for line in HASHES.read_text().splitlines() if not line.startswith("#"))
+
+
+@pytest.mark.parametrize("name", sorted(ROSIDL))
+def test_a_hash_is_that_of_rosidl(name):
+    assert type_hash(name) == ROSIDL[name]
+
+
+STORES = (Stores.ROS2_IRON, Stores.ROS2_JAZZY, Stores.ROS2_KILTED, Stores.ROS2_LYRICAL)
+
+
+@pytest.mark.parametrize("store", STORES)
+def test_messages_have_one_hash_from_iron_to_lyrical(store):
+    types = get_typestore(store)
+    # rosbags takes a char of ROS 2 for another type than rosidl does
+    known = {name for name in interfaces() if name in types.fielddefs} - {"service_msgs/msg/ServiceEventInfo"}
+    assert len(known) > 50
+    assert {name: types.hash_rihs01(name) for name in known} == {name: type_hash(name) for name in known}
+
+
+@pytest.mark.parametrize(
+    ("name", "begins"),
+    [
+        ("nav2_msgs/action/NavigateToPose_SendGoal", "a4fcb3be"),
+        ("nav2_msgs/action/NavigateToPose_GetResult", "c4079203"),
+        ("nav2_msgs/action/NavigateToPose_FeedbackMessage", "9d1f6fa2"),
+        ("nav2_msgs/action/NavigateToPose@lyrical_FeedbackMessage", "2c1b4ec1"),
+        ("nav2_msgs/action/NavigateToPose@lyrical_SendGoal", "a4fcb3be"),
+    ],
+)
+def test_an_actions_hashes_are_those_of_public_builds_of_nav2(name, begins):
+    assert type_hash(name).removeprefix("RIHS01_").startswith(begins)
+
+
+def test_a_services_hash_is_that_of_the_design_of_rmw_zenoh():
+    service = "=== example_interfaces/srv/AddTwoInts\nint64 a\nint64 b\n---\nint64 sum\n"
+    known = parsed(FILE.read_text() + service)
+    assert hash_of("example_interfaces/srv/AddTwoInts", known).startswith("RIHS01_e118de6b")
+
+
+def test_a_line_that_is_no_field_is_refused():
+    with pytest.raises(ValueError, match="expected TYPE NAME"):
+        parsed("=== std_msgs/msg/Wrong\nfloat64 x = 3\n")
