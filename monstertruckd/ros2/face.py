@@ -10,7 +10,7 @@ from monstertruck_estimation.transforms import FIXED, mount, yaw_of
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
-from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.event import Event, LogRecord
 from monstertruck_schemas.plan import Path
@@ -30,10 +30,12 @@ from monstertruck_schemas.sensor import (
 from monstertruck_schemas.state import ClockOffset, Grid, Odometry, Transforms
 from monstertruck_schemas.topics import Topic
 from monstertruckd.ros2 import convert
+from monstertruckd.ros2.actions import GoalPose, NavigateToPose
 from monstertruckd.ros2.cdr import RosMessage
 from monstertruckd.ros2.facts import RobotFacts, renamed_links
 from monstertruckd.ros2.node import RosArrival, RosNode, RosSender
-from monstertruckd.ros2.operators import LEASE, Operators, check_header, planar_twist
+from monstertruckd.ros2.operators import LEASE, Operators, check_age, check_header, frame_in, planar_twist
+from monstertruckd.ros2.parameters import RosParameters
 from monstertruckd.ros2.rmw import LATCHED, RELIABLE, SENSOR, RosQos
 
 TF: Final = RosQos(depth=100)
@@ -113,6 +115,18 @@ class RosFace:
             raise NoAnswerError(f"robot {self._client.robot!r} does not publish {t.CLOCK.name}") from None
         self._describe()
         self._listen()
+        if self._options.drives:
+            navigation = NavigateToPose(
+                self._node, self._operators, self._client, self._goal_in, lambda: self._names, self._clock
+            )
+            RosParameters(self._node, self._operators, self._client)
+        try:
+            await self._serve(clock, ready)
+        finally:
+            if self._options.drives:
+                navigation.close()
+
+    async def _serve(self, clock: Mailbox[ClockOffset], ready: Callable[[], object]) -> None:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._each(clock, self._follow_clock))
             for topic, take in self._rows():
@@ -362,23 +376,27 @@ class RosFace:
 
     def _goal(self, arrival: RosArrival) -> None:
         goal = arrival.message
-        sender = self._operators.accepted("goal_pose", arrival, lambda now: self._check_goal(goal, now))
+
+        def check(now: int) -> None:
+            check_age("its header's stamp", goal["header"], now)
+            self._goal_in(goal)
+
+        sender = self._operators.accepted("goal_pose", arrival, check)
         if sender is not None:
-            pose, frame = self.goal_of(goal)
+            pose, frame = self._goal_in(goal)
             self._operators.ask(sender, "goal_pose", lambda client: client.goal(pose, frame))
 
-    def _check_goal(self, goal: RosMessage, now: int) -> None:
-        check_header(goal["header"], now, self._goal_frames())
+    def _goal_in(self, goal: RosMessage) -> GoalPose:
+        """Pose of a ``geometry_msgs/msg/PoseStamped``.
 
-    def _goal_frames(self) -> tuple[str, ...]:
-        return tuple(self._names.frame(frame) for frame in ("map", "odom"))
-
-    def goal_of(self, goal: RosMessage) -> tuple[tuple[float, float, float], str]:
-        """Pose x, y (m), yaw (rad) of a ``geometry_msgs/msg/PoseStamped``, and its frame as the robot calls it."""
+        Raises:
+            InputError: it is in another frame than map or odom.
+        """
+        frames = {self._names.frame(frame): frame for frame in ("map", "odom")}
+        frame = frame_in(goal["header"], (*frames,)) or next(iter(frames))
         position, orientation = goal["pose"]["position"], goal["pose"]["orientation"]
         yaw = yaw_of((orientation["x"], orientation["y"], orientation["z"], orientation["w"]))
-        frame = "odom" if goal["header"]["frame_id"].lstrip("/") == self._names.frame("odom") else "map"
-        return (position["x"], position["y"], yaw), frame
+        return (position["x"], position["y"], yaw), frames[frame]
 
     def _initial_pose(self, arrival: RosArrival) -> None:
         node = "an unknown publisher" if arrival.sender is None else arrival.sender.node

@@ -53,6 +53,9 @@ class RosNode(Protocol):
     def serve(self, service: str, interface: str, answer: Answer) -> None:
         """Offer a service; requests are answered in parallel."""
 
+    def qualified(self, name: str) -> str:
+        """Full name of a topic or service that is absolute, relative to the namespace, or to the node by ``~/``."""
+
     @property
     def malformed(self) -> int:
         """Messages and requests so far that were not as the wire has them."""

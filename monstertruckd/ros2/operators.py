@@ -74,22 +74,37 @@ def check_arrival(arrival: RosArrival, now: int, newest: dict[bytes, int]) -> No
     newest[arrival.publisher] = arrival.sequence
 
 
-def check_header(header: RosMessage, now: int, frames: tuple[str, ...]) -> None:
-    """Accept the header of a message that drives; a stamp of 0 and an empty frame say nothing.
+def check_age(what: str, header: RosMessage, now: int) -> None:
+    """Accept the stamp of a header; 0 says nothing.
 
     Args:
+        what: what it is in the refusal.
         header: ``std_msgs/msg/Header``.
-        now: the time in which such stamps are, ns.
-        frames: that are possible.
+        now: real time, ns.
 
     Raises:
-        InputError: it is old, or in another frame.
+        InputError: it is old, or in the future.
     """
-    stamp = stamp_of(header["stamp"])
-    if stamp:
-        _require_recent("its header's stamp", stamp, now)
-    if header["frame_id"].lstrip("/") not in ("", *frames):
-        raise InputError(f"frame {header['frame_id']!r}: expected {' or '.join(frames)}")
+    if stamp := stamp_of(header["stamp"]):
+        _require_recent(what, stamp, now)
+
+
+def frame_in(header: RosMessage, frames: tuple[str, ...]) -> str:
+    """The frame of a header, empty if it names none.
+
+    Raises:
+        InputError: it is none of ``frames``.
+    """
+    frame = str(header["frame_id"]).lstrip("/")
+    if frame not in ("", *frames):
+        raise InputError(f"frame {frame!r}: expected {' or '.join(frames)}")
+    return frame
+
+
+def check_header(header: RosMessage, now: int, frames: tuple[str, ...]) -> None:
+    """Accept the header of a message that drives. Raises as ``check_age`` and ``frame_in`` do."""
+    check_age("its header's stamp", header, now)
+    frame_in(header, frames)
 
 
 def planar_twist(twist: RosMessage) -> tuple[float, float, float]:

@@ -178,7 +178,8 @@ class ZenohNode:
         """Whether the graph still has this node."""
         return any(entity.owner == sender.key for entity in self._graph.values())
 
-    def _qualified(self, name: str) -> str:
+    def qualified(self, name: str) -> str:
+        """Full name of a topic or service; see ``RosNode``."""
         name = name.replace("~", self._name, 1) if name.startswith("~/") else name
         return name if name.startswith("/") else f"{self._namespace.rstrip('/')}/{name}"
 
@@ -203,7 +204,7 @@ class ZenohNode:
 
     def publisher(self, topic: str, interface: str, qos: RosQos) -> Publish:
         """Offer a topic; see ``RosNode``."""
-        name = self._qualified(topic)
+        name = self.qualified(topic)
         more: dict[str, Any] = {}
         if qos.latched:
             more = {"cache": ext.CacheConfig(qos.depth), "publisher_detection": True}
@@ -227,7 +228,7 @@ class ZenohNode:
 
     def subscribe(self, topic: str, interface: str, take: Take) -> None:
         """Receive a topic; see ``RosNode``."""
-        name = self._qualified(topic)
+        name = self.qualified(topic)
         newest: dict[bytes, tuple[Attachment, bytes]] = {}
         """By publisher; filled by the thread that reads the network, emptied by the loop."""
         lock = threading.Lock()
@@ -269,7 +270,7 @@ class ZenohNode:
 
     def serve(self, service: str, interface: str, answer: Answer) -> None:
         """Offer a service; see ``RosNode``."""
-        name = self._qualified(service)
+        name = self.qualified(service)
         key = self._key(name, interface)
         hop: ThreadHop[zenoh.Query] = ThreadHop(
             partial(self._request, key, name, interface, answer), REQUESTS, lambda _: None

@@ -5,6 +5,7 @@ import json
 import math
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,14 +15,17 @@ from zenoh import ext
 from monstertruck_estimation.transforms import FIXED, mount, planar
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, WallClock
-from monstertruck_runtime.errors import BusyError
+from monstertruck_runtime.errors import BusyError, InputError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.plan import GoalPhase, GoalState
+from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import ClockOffset, Grid, Transforms
+from monstertruckd.ros2.actions import ActionGoal, CancelCode, GoalStatus, chosen
 from monstertruckd.ros2.cdr import decode, encode
 from monstertruckd.ros2.face import FaceOptions, RosFace
 from monstertruckd.ros2.facts import RobotFacts
@@ -30,6 +34,7 @@ from monstertruckd.ros2.rmw import RELIABLE, Attachment, data_key
 from monstertruckd.ros2.zenoh_node import ZenohNode, session_settings
 from monstertruckd.ros2.zenoh_node import free_endpoint as next_endpoint
 from tests.bus_kit import free_endpoint, gate_state, odometry, running_robot
+from tests.ros2_kit import ServiceClient
 
 OFFSET = 1_000_000 * SECOND
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
@@ -58,19 +63,64 @@ class Scene:
 FACTS = RobotFacts(0.4, 0.3, description='<robot><link name="base" /></robot>')
 
 
+def answering(robot, clock):
+    """Remote calls of a robot that has a planner and one live setting; returns what was asked."""
+    outcomes = []
+
+    async def carry_out(payload):
+        outcomes.append(payload)
+        return json.loads(gate_state(1).model_dump_json())
+
+    for order in Order:
+        robot.rpc.register(order.value, carry_out, AccessRole.OBSERVER)
+    goals = robot.bus.publisher(t.GOAL, t.Writer.PLANNER)
+    settings = {"gate.limits.speed": 0.25}
+
+    def goal_state(**fields):
+        now = clock.now()
+        goals.put(GoalState(stamp=now, received=now, seq=goals.next_seq(), number=1, frame="map", **fields))
+
+    async def goal(payload):
+        outcomes.append(payload)
+        if payload["goal"]["x"] > 100.0:
+            raise RequestRefusedError(Reason.NO_MAP, "a wall is in the way")
+        goal_state(phase=GoalPhase.DRIVING, outcome=Reason.DRIVING, remaining=2.5, recoveries=1)
+        if payload["goal"]["x"] < 50.0:
+            asyncio.get_running_loop().call_later(0.3, partial(goal_state, outcome=Reason.GOAL_REACHED))
+        return {"number": 1}
+
+    async def goal_control(payload):
+        outcomes.append(payload)
+        goal_state(outcome=Reason.CANCELLED, text="as asked")
+        return {}
+
+    async def list_settings(_):
+        row = {"meaning": "Speed, m/s", "above": 0.0, "at_least": None, "below": None, "at_most": 0.3}
+        return {"settings": [{"key": key, "value": value} | row for key, value in settings.items()]}
+
+    async def set_settings(payload):
+        outcomes.append(payload)
+        if payload["values"].get("gate.limits.speed", 0.0) > 0.3:
+            raise InputError("gate.limits.speed: expected at most 0.3")
+        settings.update(payload["values"])
+        return {}
+
+    for name, serve in {
+        "goal": goal,
+        "goal_control": goal_control,
+        "settings": list_settings,
+        "set": set_settings,
+    }.items():
+        robot.rpc.register(name, serve, AccessRole.OBSERVER)
+    return outcomes
+
+
 @asynccontextmanager
 async def scene(options=None):
     options = options or FaceOptions()
     async with running_robot() as robot:
         clock, ros = WallClock(), free_endpoint()
-        outcomes = []
-
-        async def carry_out(payload):
-            outcomes.append(payload)
-            return json.loads(gate_state(1).model_dump_json())
-
-        for order in Order:
-            robot.rpc.register(order.value, carry_out, AccessRole.OBSERVER)
+        outcomes = answering(robot, clock)
         gate = robot.bus.publisher(t.GATE, t.Writer.GATE)
         offset = robot.bus.publisher(t.CLOCK, t.Writer.DAEMON)
 
@@ -222,29 +272,12 @@ async def test_a_flood_of_garbage_costs_no_exception_and_is_counted():
         assert found.requests.latest.source == "ros2:teleop"
 
 
-async def call(found, service, node_kind="std_srvs/srv/Trigger"):
-    """Asks a service as ``rmw_zenoh`` does, from a client without a token."""
-    session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_settings(found.ros, ""))))
+async def call(found, service, interface="std_srvs/srv/Trigger", request=None, name=None):
+    client = ServiceClient(found.ros, name)
     try:
-        await asyncio.sleep(0.2)
-        key = data_key(0, service, node_kind)
-        attachment = Attachment(7, 1, bytes(range(16))).packed()
-        ask = lambda: list(  # noqa: E731
-            session.get(
-                key,
-                payload=encode(f"{node_kind}_Request", {}),
-                attachment=attachment,
-                target=zenoh.QueryTarget.ALL_COMPLETE,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                timeout=5.0,
-            )
-        )
-        (reply,) = await asyncio.to_thread(ask)
-        sent = Attachment.parse(reply.ok.attachment.to_bytes())
-        assert (sent.sequence, sent.gid) == (7, bytes(range(16)))
-        return decode(f"{node_kind}_Response", reply.ok.payload.to_bytes())
+        return await client.ask(service, interface, request)
     finally:
-        session.close()
+        await asyncio.to_thread(client.close)
 
 
 async def test_everybody_may_stop_but_only_known_clients_arm():
@@ -253,7 +286,8 @@ async def test_everybody_may_stop_but_only_known_clients_arm():
         refused = await call(found, "/truck/arm")
         assert not refused["success"]
         assert "no client of this service" in refused["message"]
-        assert [outcome["source"] for outcome in found.outcomes] == ["face"]
+        assert (await call(found, "/truck/arm", name="rqt"))["success"]
+        assert [outcome["source"] for outcome in found.outcomes] == ["face", "ros2:rqt"]
 
 
 async def test_a_face_that_does_not_drive_still_stops():
@@ -394,3 +428,127 @@ def test_of_a_port_that_is_taken_the_next_one_is_listened_at():
         taken.listen()
         port = taken.getsockname()[1]
         assert next_endpoint(f"tcp/127.0.0.1:{port}") == f"tcp/127.0.0.1:{port + 1}"
+
+
+ACTION = "nav2_msgs/action/NavigateToPose"
+
+
+def pose(x, frame="map"):
+    header = {"frame_id": frame}
+    return {"header": header, "pose": {"position": {"x": x}, "orientation": {"w": 1.0}}}
+
+
+async def send(client, number, goal, tree=""):
+    request = {"goal_id": {"uuid": bytes([number]) * 16}, "goal": {"pose": goal, "behavior_tree": tree}}
+    return await client.ask("/navigate_to_pose/_action/send_goal", f"{ACTION}_SendGoal", request)
+
+
+async def result_of(client, number):
+    request = {"goal_id": {"uuid": bytes([number]) * 16}}
+    return await client.ask("/navigate_to_pose/_action/get_result", f"{ACTION}_GetResult", request)
+
+
+@asynccontextmanager
+async def asking(found, name="nav"):
+    client = ServiceClient(found.ros, name)
+    try:
+        yield client
+    finally:
+        await asyncio.to_thread(client.close)
+
+
+async def test_a_goal_is_driven_with_feedback_for_jazzy_and_lyrical_and_a_result():
+    async with scene() as found, asking(found) as client:
+        reader = Reader(found)
+        reader.follow("/navigate_to_pose/_action/feedback", f"{ACTION}_FeedbackMessage")
+        lyrical = []
+        key = data_key(0, "/navigate_to_pose/_action/feedback", f"{ACTION}@lyrical_FeedbackMessage")
+        kept = client.session.declare_subscriber(key, lyrical.append)
+        assert (await send(client, 1, pose(2.0)))["accepted"]
+        assert await result_of(client, 1) == {"status": 4, "result": {"error_code": 0, "error_msg": ""}}
+        feedback = reader.messages["/navigate_to_pose/_action/feedback"]
+        assert bytes(feedback["goal_id"]["uuid"]) == bytes([1]) * 16
+        assert lyrical
+        kept.undeclare()
+        reader.follow("/navigate_to_pose/_action/status", "action_msgs/msg/GoalStatusArray")
+        await found.until(lambda: len(reader.messages) == 2)
+        (row,) = reader.messages["/navigate_to_pose/_action/status"]["status_list"]
+        assert row["status"] == 4
+        reader.close()
+        assert found.outcomes[0]["source"] == "ros2:nav"
+        assert found.outcomes[0]["goal"] == {"x": 2.0, "y": 0.0, "yaw": 0.0}
+
+
+async def test_a_goal_without_a_route_ends_with_its_reason():
+    async with scene() as found, asking(found) as client:
+        assert (await send(client, 2, pose(200.0)))["accepted"]
+        result = await result_of(client, 2)
+        assert result["status"] == 6
+        assert "no_map" in result["result"]["error_msg"]
+        assert "a wall is in the way" in result["result"]["error_msg"]
+
+
+async def test_a_goal_is_cancelled_once():
+    async with scene() as found, asking(found) as client:
+        assert (await send(client, 3, pose(70.0)))["accepted"]
+        await found.until(lambda: found.outcomes)
+        request = {"goal_info": {"goal_id": {"uuid": bytes([3]) * 16}}}
+        cancel = partial(client.ask, "/navigate_to_pose/_action/cancel_goal", "action_msgs/srv/CancelGoal", request)
+        answer = await cancel()
+        assert (answer["return_code"], len(answer["goals_canceling"])) == (0, 1)
+        assert (await result_of(client, 3))["status"] == 5
+        assert (await cancel())["return_code"] == 3
+        assert found.outcomes[-1]["own"] is True
+
+
+@pytest.mark.parametrize(
+    ("goal", "tree", "why"),
+    [(pose(1.0, "laser"), "", "expected map or odom"), (pose(1.0), "tree.xml", "behavior_tree: expected none")],
+)
+async def test_a_goal_that_means_something_else_is_not_accepted(goal, tree, why):
+    async with scene() as found, asking(found) as client:
+        assert not (await send(client, 4, goal, tree))["accepted"]
+        assert why in found.texts[0]
+        assert (await result_of(client, 4))["status"] == 0
+
+
+@pytest.mark.parametrize(
+    ("number", "stamp", "code", "meant"),
+    [
+        (bytes(16), 0, CancelCode.NONE, [b"a", b"b"]),
+        (bytes(16), 15, CancelCode.NONE, [b"a"]),
+        (b"b" * 16, 15, CancelCode.NONE, [b"a", b"b"]),
+        (b"c" * 16, 0, CancelCode.TERMINATED, []),
+        (b"x" * 16, 0, CancelCode.UNKNOWN_GOAL, []),
+        (bytes(16), 5, CancelCode.REJECTED, []),
+    ],
+)
+def test_a_cancel_request_means_one_goal_all_or_all_until_a_time(number, stamp, code, meant):
+    goals = {name * 16: ActionGoal(name * 16, at) for name, at in ((b"a", 10), (b"b", 20), (b"c", 30))}
+    goals[b"c" * 16].status = GoalStatus.SUCCEEDED
+    found, chosen_goals = chosen(goals, number, stamp)
+    assert (found, [goal.number[:1] for goal in chosen_goals]) == (code, meant)
+
+
+async def test_live_settings_are_parameters():
+    name, kind = "gate.limits.speed", "rcl_interfaces/srv"
+    async with scene() as found, asking(found, "rqt") as client:
+        listed = await client.ask("/truck/list_parameters", f"{kind}/ListParameters")
+        assert listed["result"]["names"] == [name]
+        names = {"names": [name, "nothing"]}
+        types = await client.ask("/truck/get_parameter_types", f"{kind}/GetParameterTypes", names)
+        assert types["types"].tolist() == [3, 0]
+        described = await client.ask("/truck/describe_parameters", f"{kind}/DescribeParameters", names)
+        row = described["descriptors"][0]
+        assert (row["description"], row["floating_point_range"][0]["to_value"]) == ("Speed, m/s", 0.3)
+        value = {"type": 3, "double_value": 0.2}
+        change = {"parameters": [{"name": name, "value": value}]}
+        changed = await client.ask("/truck/set_parameters", f"{kind}/SetParameters", change)
+        assert changed["results"] == [{"successful": True, "reason": ""}]
+        got = await client.ask("/truck/get_parameters", f"{kind}/GetParameters", names)
+        assert [row["double_value"] for row in got["values"]] == [0.2, 0.0]
+        assert found.outcomes[-1]["source"] == "ros2:rqt"
+        value["double_value"] = 9.0
+        refused = await client.ask("/truck/set_parameters_atomically", f"{kind}/SetParametersAtomically", change)
+        assert not refused["result"]["successful"]
+        assert "expected at most 0.3" in refused["result"]["reason"]
