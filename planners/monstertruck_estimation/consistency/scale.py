@@ -35,11 +35,17 @@ def scale_change(newest: Revolution, earlier: Revolution, motions: list[Array]) 
     Args:
         newest: newest revolution.
         earlier: reference revolution.
-        motions: initial guesses of the registration, at least one, each of shape (3,), m and rad.
+        motions: initial guesses of the registration, the most likely one first, at least one, each of shape (3,), m
+            and rad.
     """
     cloud = Cloud.of(earlier.scan)
-    moved = max((_fits(newest.scan, cloud, motion) for motion in motions), key=np.count_nonzero)
-    if np.count_nonzero(~moved) < REFUTING or len(newest.ranges) != len(earlier.ranges):
+    fits = []
+    for motion in motions:
+        fits.append(_fits(newest.scan, cloud, motion))
+        if np.count_nonzero(~fits[-1]) < REFUTING:
+            return None
+    moved = max(fits, key=np.count_nonzero)
+    if len(newest.ranges) != len(earlier.ranges):
         return None
     factor = _factor(newest.ranges, earlier.ranges)
     if factor is None:

@@ -154,7 +154,7 @@ class ScanMotionStep:
         before, self._revolution = self._revolution, Revolution(inputs.scan.ranges, whole, inputs.scan.mount[:2])
         if before is None or inputs.rolled is None or not 0.0 < dt < GAP:
             return None
-        return scale_change(self._revolution, before, [np.array(inputs.rolled), *motions])
+        return scale_change(self._revolution, before, [*motions, np.array(inputs.rolled)])
 
     def _begin(self, front: KissFront | None, scan: Scan, pose: Array) -> None:
         self._reference = Cloud.of(scan), pose
