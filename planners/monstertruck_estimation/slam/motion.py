@@ -5,6 +5,7 @@ from collections import deque
 from typing import Final
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.config import MapperConfig
@@ -44,6 +45,7 @@ COMPARED: Final = (5.0, 2.0)
 SAMPLE: Final = (0.25, 0.1)
 """Least length of a step of the comparison, s and motion: the noise of single matches would add up to a distance."""
 FEWEST_SAMPLES: Final = 3
+"""Fewest steps of a comparison."""
 TOLERANCE: Final = 0.3
 """Tolerated difference of odometry and scans as a share of the distance, or of the turn."""
 SLACK: Final = (0.1, 0.2)
@@ -51,7 +53,8 @@ SLACK: Final = (0.1, 0.2)
 CROSSED: Final = 0.1
 """Tolerated difference of the distance per radian, m, and of the turn per metre, rad: levers, unequal wheels."""
 CONTRADICTIONS: Final = 2
-"""Comparisons in a row that contradict odometry before it is dropped."""
+"""Comparisons in a row that contradict odometry before it is dropped, by their last scans and by their first ones: one
+scan with a late stamp contradicts nothing, wherever it lies."""
 AGREEMENT: Final = 0.4
 """Mean error of a step, as a share of the motion, below which odometry is used again."""
 AGREED: Final = (2.0, 2.0)
@@ -103,10 +106,11 @@ class OdometryCheck:
         if self._seconds < SAMPLE[0] or _motion(step) < SAMPLE[1]:
             return
         self._steps.append(step)
-        while len(self._steps) > FEWEST_SAMPLES and self._long_enough_without_oldest():
+        while len(self._steps) >= FEWEST_SAMPLES + CONTRADICTIONS and self._long_enough_without_oldest():
             self._steps.popleft()
         self._odom, self._scans, self._seconds, self._seen = np.zeros(3), np.zeros(3), 0.0, True
-        self._judge()
+        if len(self._steps) >= FEWEST_SAMPLES + CONTRADICTIONS - 1:
+            self._judge()
 
     def interrupt(self, dt: float) -> None:
         """Over ``dt`` seconds there is nothing to compare, and the next motion does not follow the last one."""
@@ -117,7 +121,7 @@ class OdometryCheck:
         return sum(float(step[0]) for step in later) > COMPARED[0] and sum(map(_motion, later)) > COMPARED[1]
 
     def _judge(self) -> None:
-        """Compare over the last three and more steps; drop odometry, or take it back."""
+        """Compare over the last ``FEWEST_SAMPLES`` and more steps; drop odometry, or take it back."""
         rows = np.array(self._steps)[::-1]
         differences = np.cumsum(rows[:, 1:4] - rows[:, 4:7], axis=0)
         off = np.stack((np.hypot(differences[:, 0], differences[:, 1]), np.abs(differences[:, 2])), axis=1)
@@ -125,7 +129,8 @@ class OdometryCheck:
         seen = np.stack((rows[:, 7], np.ones(len(rows))), axis=1)
         motion = np.cumsum(lengths, axis=1).max(axis=0)
         slack = np.minimum(SLACK[0] + CROSSED * motion[:, ::-1], SLACK[1])
-        wrong = (off > TOLERANCE * motion + slack)[FEWEST_SAMPLES - 1 :].any(axis=0)
+        beyond = (off > TOLERANCE * motion + slack)[FEWEST_SAMPLES - 1 :]
+        wrong = sliding_window_view(beyond, CONTRADICTIONS, axis=0).all(axis=-1).any(axis=0)
         self._row = self._row + 1 if wrong.any() else 0
         if self._row >= CONTRADICTIONS:
             if not self.contradicted:

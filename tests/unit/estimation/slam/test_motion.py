@@ -170,6 +170,16 @@ def test_one_late_odometry_is_no_contradiction():
     assert not compared(check, 1.0, 50).contradicted
 
 
+def test_late_stamps_at_both_ends_of_a_comparison_are_no_contradiction():
+    check = OdometryCheck()
+    step = np.array((0.1, 0.0, 0.0))
+    ahead = np.zeros(30)
+    ahead[15], ahead[18:20] = 0.3, -0.15
+    for before, after in itertools.pairwise(ahead):
+        check.add(0.3, step + np.array((after - before, 0.0, 0.0)), step)
+        assert not check.contradicted
+
+
 def misled(wrong, **more):
     """A model after 10 s of odometry that makes ``wrong`` of every motion, and what it predicts of the next one."""
     model, odom = MotionPredictor(MapperConfig()), np.zeros(3)
