@@ -49,6 +49,10 @@ class ExportFormat(StrEnum):
     NPZ = "npz"
     ROS2 = "ros2"
     MCAP = "mcap"
+    PARQUET = "parquet"
+    ROSBAG2 = "rosbag2"
+    TUM = "tum"
+    KITTI = "kitti"
 
 
 LogArgument = Annotated[Path, typer.Argument(help="MCAP file, finished or not.", show_default=False)]
@@ -227,12 +231,12 @@ def export_command(
     end: EndOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Write a log as tables (csv, npz: a file per topic), as ROS 2 bag, or as MCAP with dates (mcap)."""
+    """Write a log as tables (csv, npz, parquet), ROS 2 bag, MCAP with dates, or trajectories (tum, kitti)."""
     from monstertruckd.recorder.reader import open_log
     from monstertruckd.tools.logs.messages import Selection
 
     selection = Selection(tuple(topics or ()), start, math.inf if end is None else end)
-    with needs_extra("logs"):
+    with needs_extra("tables" if form is ExportFormat.PARQUET else "logs"):
         export = _exporter(form)
     reader = open_log(log)
     with reading_log("export", log) as done:
@@ -332,8 +336,14 @@ def _exporter(form: ExportFormat) -> "Callable[[LogReader, Path, Selection, Prog
             from monstertruckd.tools.logs.export import export_csv as export
         case ExportFormat.NPZ:
             from monstertruckd.tools.logs.export import export_npz as export
-        case ExportFormat.ROS2:
+        case ExportFormat.ROS2 | ExportFormat.ROSBAG2:
             from monstertruckd.tools.logs.ros2 import export_ros2 as export
         case ExportFormat.MCAP:
             from monstertruckd.tools.logs.export import export_mcap as export
+        case ExportFormat.PARQUET:
+            from monstertruckd.tools.logs.arrow import export_parquet as export
+        case ExportFormat.TUM:
+            from monstertruckd.tools.logs.pose_files import export_tum as export
+        case ExportFormat.KITTI:
+            from monstertruckd.tools.logs.pose_files import export_kitti as export
     return export

@@ -48,7 +48,8 @@ def removed_on_failure() -> Iterator[list[Path]]:
         raise
 
 
-_LOG_TIME, _REAL_TIME = "log_time", "real_time"
+LOG_TIME, REAL_TIME = "log_time", "real_time"
+"""Columns of every table: daemon time and UNIX time, ns."""
 
 
 def export_csv(
@@ -67,15 +68,15 @@ def export_csv(
         NotFoundError: no such log.
         InputError: not a log, a message in it is invalid, or the folder cannot be written.
     """
-    directory = _folder(output)
+    directory = made_folder(output)
     files: dict[str, Path] = {}
-    with _tables(directory, ".csv", files) as place, ExitStack() as stack:
+    with whole_tables(directory, ".csv", files) as place, ExitStack() as stack:
         writers: dict[str, Any] = {}
         for topic, row in _rows(path, directory, selection, progress):
             if topic not in writers:
                 writers[topic] = csv.writer(stack.enter_context(place(topic).open("w", newline="")))
                 writers[topic].writerow(row)
-            row[_REAL_TIME] = f"{np.datetime64(row[_REAL_TIME], 'ns')}Z"
+            row[REAL_TIME] = f"{np.datetime64(row[REAL_TIME], 'ns')}Z"
             writers[topic].writerow(_cell(value) for value in row.values())
     return files
 
@@ -97,10 +98,10 @@ def export_npz(
         NotFoundError: no such log.
         InputError: not a log, a message in it is invalid, or the folder cannot be written.
     """
-    directory = _folder(output)
+    directory = made_folder(output)
     tables: dict[str, dict[str, Column]] = {}
     files: dict[str, Path] = {}
-    with tempfile.TemporaryFile(dir=directory) as file, _tables(directory, ".npz", files) as place:
+    with tempfile.TemporaryFile(dir=directory) as file, whole_tables(directory, ".npz", files) as place:
         spool = Spool(file)
         for topic, row in _rows(path, directory, selection, progress):
             if topic not in tables:
@@ -119,7 +120,7 @@ def _write_npz(file: Path, table: Mapping[str, Column]) -> None:
 
 
 @contextmanager
-def _tables(directory: Path, suffix: str, files: dict[str, Path]) -> Iterator[Callable[[str], Path]]:
+def whole_tables(directory: Path, suffix: str, files: dict[str, Path]) -> Iterator[Callable[[str], Path]]:
     """Yields a function from topic to file to write; all get their final names, in ``files``, once all are complete."""
     with ExitStack() as whole:
 
@@ -130,7 +131,12 @@ def _tables(directory: Path, suffix: str, files: dict[str, Path]) -> Iterator[Ca
         yield place
 
 
-def _folder(directory: str | Path) -> Path:
+def made_folder(directory: str | Path) -> Path:
+    """The folder, made if need be.
+
+    Raises:
+        InputError: it cannot be made.
+    """
     directory = Path(directory)
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -150,11 +156,11 @@ def _rows(
     reader = open_log(path)
     offset = real_offset(reader)
     for entry, message in selection.of(reader, progress):
-        row = _flat(message, type(message), "")
+        row = flat(message, type(message), "")
         for name, value in row.items():
             if isinstance(value, bytes):
                 row[name] = _save(value, directory, f"{_stem(entry.topic)}/{entry.log_time}.{row.get('format', 'bin')}")
-        yield entry.topic, {_LOG_TIME: entry.log_time, _REAL_TIME: entry.log_time + offset, **row}
+        yield entry.topic, {LOG_TIME: entry.log_time, REAL_TIME: entry.log_time + offset, **row}
 
 
 def _save(data: bytes, directory: Path, name: str) -> str:
@@ -164,17 +170,18 @@ def _save(data: bytes, directory: Path, name: str) -> str:
     return name
 
 
-def _flat(record: BaseModel | None, model: type[BaseModel], prefix: str) -> dict[str, Any]:
+def flat(record: BaseModel | None, model: type[BaseModel], prefix: str) -> dict[str, Any]:
     """Columns of a record; the same for all messages of a model."""
     row: dict[str, Any] = {}
     for name, field in model.model_fields.items():
         value = None if record is None else getattr(record, name)
-        nested = _record_type(field.annotation)
-        row |= {prefix + name: value} if nested is None else _flat(value, nested, f"{prefix}{name}.")
+        nested = record_type(field.annotation)
+        row |= {prefix + name: value} if nested is None else flat(value, nested, f"{prefix}{name}.")
     return row
 
 
-def _record_type(annotation: Any) -> type[BaseModel] | None:
+def record_type(annotation: Any) -> type[BaseModel] | None:
+    """The model of a field that is a record or an optional one; None for other fields."""
     for option in (annotation, *get_args(annotation)):
         if isinstance(option, type) and issubclass(option, BaseModel) and _is_plain(annotation):
             return option

@@ -185,6 +185,7 @@ FOREIGN = {
     "python docs/site/build.py": "test_site.py builds it into another folder",
     "python -m benchmarks.thesis --only 5.1 5.5": "drives for minutes; slowness and scores have their tests",
     "pip install 'monstertruckd[ros2]'": "needs a package index; the extra is looked up",
+    "pip install 'monstertruckd[tables]'": "needs a package index; the extra is looked up",
     "pip install 'monstertruckd[view]'": "needs a package index; the extra is looked up",
     "systemctl status monstertruckd": "needs an installed service; the unit's name is looked up",
     "journalctl -u monstertruckd -f": "needs an installed service; the unit's name is looked up",

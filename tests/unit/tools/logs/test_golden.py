@@ -15,6 +15,7 @@ from monstertruckd.config.load import load_truck
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.recorder.repair import recover
 from monstertruckd.tools.demo.runs import free_endpoint
+from monstertruckd.tools.logs.arrow import export_parquet
 from monstertruckd.tools.logs.export import export_csv, export_mcap, export_npz
 from monstertruckd.tools.logs.replay import replay_log
 from monstertruckd.tools.logs.report import report
@@ -73,7 +74,7 @@ def test_recovery_of_its_first_half(log, tmp_path):
         assert make_reader(file).get_summary().statistics.message_count == done.messages
 
 
-@pytest.mark.parametrize("export", [export_csv, export_npz, export_ros2])
+@pytest.mark.parametrize("export", [export_csv, export_npz, export_parquet, export_ros2])
 def test_exports(log, expected, tmp_path, export):
     assert export(log, tmp_path / "out").keys() == expected["topics"].keys()
 

@@ -1,0 +1,261 @@
+"""A log for a notebook: topics as NumPy arrays, pandas or polars tables, pictures, maps and events.
+
+Every read passes the file once, in bounded memory: what remains is what was asked for, so choose columns of long logs,
+or go through ``batches``.
+"""
+
+import warnings
+from collections.abc import Iterator, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.outside import MOST_PIXELS, reading
+from monstertruck_schemas import topics as t
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.state import Grid
+from monstertruck_schemas.topics import BY_NAME
+from monstertruckd.recorder.reader import LogReader
+from monstertruckd.tools.logs import arrow
+from monstertruckd.tools.logs.export import LOG_TIME
+from monstertruckd.tools.logs.messages import Selection, require_topics
+from monstertruckd.tools.logs.summary import info
+
+TIME: Final = "time"
+"""Column of seconds since the log's first message."""
+STAMP: Final = "stamp"
+
+Library = Literal["pandas", "polars"]
+
+
+class OpenedLog:
+    """A log opened for analysis, finished or not; damage is a warning, and what is whole is read.
+
+    Topics are named in full (``state/odometry``) or by their last part where only one topic besides ``health/`` has it
+    (``odometry``).
+    ``start`` and ``end`` of its methods are seconds after the log's first message.
+
+    Args:
+        path: an MCAP file of this program.
+
+    Raises:
+        NotFoundError: no such file.
+        InputError: not an MCAP file.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._reader = LogReader(Path(path))
+
+    def __repr__(self) -> str:
+        return f"<log {self._reader.path}>"
+
+    def topics(self) -> dict[str, int]:
+        """Messages by topic."""
+        return {name: row["messages"] for name, row in info(self._reader.path)["topics"].items()}
+
+    def config(self) -> dict[str, Any]:
+        """The robot's configuration as it was recorded; empty where there is none."""
+        return self._reader.config()
+
+    def messages(self, topic: str, start: float = 0.0, end: float = np.inf) -> Iterator[tuple[float, Message]]:
+        """Time (s) and message of a topic."""
+        first = self._first()
+        for entry, message in Selection((named(topic),), start, end).of(self._reader):
+            yield (entry.log_time - first) / SECOND, message
+        self._warn()
+
+    def batches(
+        self, topic: str, columns: Sequence[str] = (), start: float = 0.0, end: float = np.inf
+    ) -> Iterator[pa.RecordBatch]:
+        """A topic's rows as Arrow batches of a few MB: a log of any length passes through little memory."""
+        for _, batch in arrow.batches(self._reader, Selection((named(topic),), start, end), columns):
+            yield batch
+        self._warn()
+
+    def table(self, topic: str, columns: Sequence[str] = (), start: float = 0.0, end: float = np.inf) -> pa.Table:
+        """A topic as an Arrow table, with ``time``, s since the log's first message, as the first column.
+
+        Raises:
+            NotFoundError: no such topic or column.
+            InputError: a message is invalid.
+        """
+        return self._table(named(topic), columns, start, end)
+
+    def numpy(
+        self, topic: str, columns: Sequence[str] = (), start: float = 0.0, end: float = np.inf
+    ) -> dict[str, NDArray[Any]]:
+        """A topic as one array per column, shape (messages,) or (messages, length); absent numbers are NaN.
+
+        Arrays that differ in length are an object array of arrays.
+        """
+        table = self.table(topic, columns, start, end)
+        return {name: _as_numpy(table[name].combine_chunks()) for name in table.column_names}
+
+    def pandas(self, topic: str, columns: Sequence[str] = (), start: float = 0.0, end: float = np.inf) -> Any:
+        """A topic as a ``pandas.DataFrame`` with ``time`` (s since the log's first message) as its index."""
+        return _as_frame(self.table(topic, columns, start, end), "pandas")
+
+    def polars(self, topic: str, columns: Sequence[str] = (), start: float = 0.0, end: float = np.inf) -> Any:
+        """A topic as a ``polars.DataFrame``."""
+        return _as_frame(self.table(topic, columns, start, end), "polars")
+
+    def frame(
+        self,
+        *topics: str,
+        at: str | None = None,
+        within: float = np.inf,
+        columns: Sequence[str] = (),
+        start: float = 0.0,
+        end: float = np.inf,
+        library: Library = "pandas",
+    ) -> Any:
+        """Several topics in one table: a row per message of ``at``, beside it the messages nearest by their stamps.
+
+        Columns carry the topic's name as it is given here: ``odometry.pose.x``.
+
+        Args:
+            topics: names.
+            at: the topic whose messages make the rows; by default the first.
+            within: greatest difference of two stamps, s; without a message so near, the row's other cells are empty.
+            columns: names as they are in each topic's table, for those topics that have them; empty = all.
+            start: s after the log's first message.
+            end: as ``start``.
+            library: of the table.
+
+        Raises:
+            InputError: no topic, or ``at`` is not among them.
+            NotFoundError: no such topic, or none of the topics has a column.
+        """
+        at = topics[0] if at is None and topics else at
+        if at is None or at not in topics:
+            raise InputError(f"at {at!r}: expected one of the topics of the table ({', '.join(topics) or 'none'})")
+        known = {topic: arrow.schema_of(named(topic)).names for topic in topics}
+        for column in columns:
+            if not any(column in names for names in known.values()):
+                raise NotFoundError(f"no column {column} in {', '.join(topics)}")
+        tables = {
+            topic: self._table(named(topic), _wanted(names, columns), start, end) for topic, names in known.items()
+        }
+        stamps = tables[at][STAMP].to_numpy()
+        parts = {TIME: tables[at][TIME]}
+        for topic, table in tables.items():
+            rows = table if topic == at else table.take(_nearest(table[STAMP].to_numpy(), stamps, within))
+            for name in rows.column_names:
+                if name != TIME and (not columns or name in columns):
+                    parts[f"{topic}.{name}"] = rows[name]
+        return _as_frame(pa.table(parts), library)
+
+    def images(
+        self, topic: str = t.CAMERA.name, start: float = 0.0, end: float = np.inf
+    ) -> Iterator[tuple[float, NDArray[np.uint8]]]:
+        """Time (s) and picture, shape (height, width, 3), RGB, one at a time.
+
+        Raises:
+            InputError: a picture is damaged or has too many pixels.
+        """
+        from PIL import Image  # noqa: PLC0415 - only for pictures
+
+        for time, message in self.messages(topic, start, end):
+            where = f"{self._reader.path}: {topic} at {time:.3f} s"
+            if not isinstance(data := getattr(message, "data", None), bytes):
+                raise InputError(f"{topic} has no pictures")
+            with reading(Path(where), "a picture"), Image.open(BytesIO(data), formats=["JPEG"]) as image:
+                if image.width * image.height > MOST_PIXELS:
+                    raise InputError(f"{where}: {image.width} x {image.height} pixels: expected at most {MOST_PIXELS}")
+                yield time, np.asarray(image.convert("RGB"))
+
+    def maps(self, start: float = 0.0, end: float = np.inf) -> Iterator[tuple[float, Grid, NDArray[np.int8]]]:
+        """Time (s), map and its cells, shape (height, width), row 0 at the lowest y."""
+        for time, message in self.messages(t.MAP.name, start, end):
+            if isinstance(message, Grid):
+                yield time, message, message.cells.reshape(message.height, message.width)
+
+    def events(self, start: float = 0.0, end: float = np.inf) -> Any:
+        """Decisions, faults and recoveries as a ``pandas.DataFrame``."""
+        return self.pandas(t.EVENT.name, start=start, end=end)
+
+    def _first(self) -> int:
+        """Daemon time of the first message, ns; 0 of an empty log."""
+        return next((entry.log_time for entry in self._reader), 0)
+
+    def _table(self, topic: str, columns: Sequence[str], start: float, end: float) -> pa.Table:
+        wanted = [LOG_TIME, *columns] if columns else ()
+        found = [batch for _, batch in arrow.batches(self._reader, Selection((topic,), start, end), wanted)]
+        self._warn()
+        schema = pa.schema([field for field in arrow.schema_of(topic) if not wanted or field.name in wanted])
+        table = pa.Table.from_batches(found, schema)
+        time = (table[LOG_TIME].to_numpy() - self._first()) / SECOND
+        if columns and LOG_TIME not in columns:
+            table = table.drop_columns(LOG_TIME)
+        return table.add_column(0, TIME, pa.array(time))
+
+    def _warn(self) -> None:
+        if self._reader.fault is not None:
+            warnings.warn(f"{self._reader.path}: {self._reader.fault}; what is whole was read", stacklevel=3)
+
+
+def named(topic: str) -> str:
+    """A topic's full name, from that or from its last part.
+
+    Raises:
+        NotFoundError: no topic, or several topics, have it.
+    """
+    if topic in BY_NAME:
+        return topic
+    found = [name for name in BY_NAME if name.rpartition("/")[2] == topic]
+    found = [name for name in found if not name.startswith("health/")] or found  # a service and its output share names
+    if len(found) > 1:
+        raise NotFoundError(f"topic {topic}: expected one of {', '.join(found)}")
+    if not found:
+        require_topics(topic)
+    return found[0]
+
+
+def _wanted(names: Sequence[str], columns: Sequence[str]) -> list[str]:
+    """Those columns of a topic that a table needs; empty = all."""
+    return [STAMP, *(name for name in names if name in columns and name != STAMP)] if columns else []
+
+
+def _nearest(stamps: NDArray[np.int64], at: NDArray[np.int64], within: float) -> pa.Array:
+    """For each time the index of the nearest stamp, null where none is within ``within`` s.
+
+    Args:
+        stamps: shape (n,), ns, in any order.
+        at: shape (m,), ns.
+        within: s.
+    """
+    if not len(stamps):
+        return pa.nulls(len(at), pa.int64())
+    order = np.argsort(stamps, kind="stable")
+    rising = stamps[order]
+    after = np.searchsorted(rising, at).clip(1, max(len(rising) - 1, 1)) if len(rising) > 1 else np.zeros(len(at), int)
+    before = np.maximum(after - 1, 0)
+    index = np.where(at - rising[before] <= rising[after] - at, before, after)
+    return pa.array(order[index], mask=np.abs(rising[index] - at) > within * SECOND)
+
+
+def _as_frame(table: pa.Table, library: Library) -> Any:
+    if library == "polars":
+        import polars as pl  # noqa: PLC0415 - only for its tables
+
+        return pl.from_arrow(table)
+    return table.to_pandas().set_index(TIME)
+
+
+def _as_numpy(column: pa.Array) -> NDArray[Any]:
+    if not pa.types.is_list(column.type):
+        return np.asarray(column.to_numpy(zero_copy_only=False))
+    lengths = np.diff(column.offsets.to_numpy())
+    if not column.null_count and len(lengths) and (lengths == lengths[0]).all():
+        flat = column.flatten()
+        if pa.types.is_primitive(flat.type) and not flat.null_count:
+            return np.asarray(flat.to_numpy(zero_copy_only=False)).reshape(len(lengths), int(lengths[0]))
+    rows = np.empty(len(column), object)
+    rows[:] = column.to_numpy(zero_copy_only=False)
+    return rows
