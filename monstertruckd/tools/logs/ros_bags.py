@@ -1,7 +1,9 @@
 """Bags of ROS 1 and 2 by the package ``rosbags``, which comes with the extra ``logs``."""
 
 import bz2
+import sqlite3
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
@@ -53,6 +55,9 @@ def ros_messages(path: Path, version: int) -> Iterator[RawMessage]:
                 if log.fault is not None:
                     raise InputError(f"{part}: {log.fault}")
             return
+        if version == 2:
+            for database in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
+                _require_stored(database)
         encoding = "ros1" if version == 1 else "cdr"
         with Ros1Reader(path) if version == 1 else Ros2Reader(path) as bag:
             if isinstance(bag, Ros1Reader):
@@ -66,6 +71,21 @@ def ros_messages(path: Path, version: int) -> Iterator[RawMessage]:
             if read:
                 for one, time, data in bag.messages(connections=read):
                     yield RawMessage(one.topic, one.msgtype, encoding, time, bytes(data))
+
+
+def _require_stored(database: Path) -> None:
+    """Check that the database stores its rows.
+
+    Raises:
+        InputError: it computes rows or columns when it is read, which may never end.
+        sqlite3.DatabaseError: it is damaged.
+    """
+    with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as bag:
+        for kind, name, declared in bag.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
+            if kind == "view" or (kind == "table" and str(declared).upper().startswith("CREATE VIRTUAL")):
+                raise InputError(f"{database}: {name} is computed when it is read: expected stored tables")
+            if kind == "table" and any(row[-1] for row in bag.execute("SELECT * FROM pragma_table_xinfo(?)", (name,))):
+                raise InputError(f"{database}: table {name} has computed columns: expected stored ones")
 
 
 def _mcap_parts(folder: Path) -> list[Path] | None:

@@ -2,8 +2,9 @@
 
 import gzip
 import math
+import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -227,6 +228,31 @@ def test_bags_of_ros_2_that_are_packed_or_describe_too_much_are_refused(tmp_path
     (bag / "metadata.yaml").write_text(bomb + about)
     with pytest.raises(InputError, match=r"metadata\.yaml:.*more than 20000 keys and values"):
         read_scans(bag)
+
+
+ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i, 1, i, zeroblob(100) FROM n"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (f"CREATE VIEW messages(id, topic_id, timestamp, data) AS {ENDLESS}", "messages is computed when it is read"),
+        (
+            "CREATE TABLE messages(id INTEGER, topic_id INTEGER, timestamp INTEGER, data BLOB AS (zeroblob(9e8)))",
+            "table messages has computed columns",
+        ),
+        ("CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)", "messages is computed"),
+    ],
+)
+def test_a_database_that_computes_its_messages_is_refused(tmp_path: Path, change: str, said: str):
+    bag = write_ros2(tmp_path / "bag", drive(RosMessages(ROS2)))
+    (file,) = bag.glob("*.db3")
+    with closing(sqlite3.connect(file)) as database, database:
+        database.execute("ALTER TABLE messages RENAME TO others")
+        database.execute(change)
+    for path in (bag, file):
+        with pytest.raises(InputError, match=rf"{file.name}: .*{said}"):
+            read_scans(path)
 
 
 @contextmanager
