@@ -31,6 +31,8 @@ TRACED = re.compile(r"\] \S+ +(?P<time>[0-9.]+): sys_\w+(?:\(| (?P<exit>->))")
 """Line of the trace."""
 PORTS = ("/monstertruck_drivers/", "/site-packages/serial/", "/site-packages/serial_asyncio/")
 """Whose calls count."""
+LIMIT = 120.0
+"""Longest a situation may take (s); the whole run takes 240 s."""
 RESULTS: dict[str, Any] = {}
 
 
@@ -139,7 +141,8 @@ async def situation(name: str, act: Callable[[], Awaitable[dict[str, Any]]]) -> 
     Loop.take()
     begin = time.monotonic()
     try:
-        found = await act()
+        async with asyncio.timeout(LIMIT):
+            found = await act()
     except Exception as error:  # noqa: BLE001  # the next situation is independent
         traceback.print_exc()
         found = {"ok": False, "error": f"{type(error).__name__}: {error}"}
