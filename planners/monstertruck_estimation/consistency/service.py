@@ -38,7 +38,7 @@ from monstertruck_schemas.sensor import (
 )
 from monstertruck_schemas.state import Consistency, Doubt, DoubtKind, GateState
 
-TARGET: Final = "monstertruck_estimation.consistency.scan_odometry:ScanMotionStep"
+TARGET: Final = "monstertruck_estimation.consistency.scan_odometry:warmed"
 START_TIMEOUT: Final = 180.0
 """Real seconds the worker may take to start: numba compiles at the first start."""
 RATE: Final = 25.0

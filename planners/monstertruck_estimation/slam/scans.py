@@ -298,3 +298,24 @@ def downsample_indices(points: Array, cell: float) -> NDArray[np.intp]:
     order = np.argsort(np.arange(len(points)) * GOLDEN % 1.0, kind="stable")
     _, first = np.unique(_cells(points[order], cell), return_index=True)
     return np.sort(order[first])
+
+
+def scans_in_a_room() -> list[ScanInput]:
+    """Return four scans of a drive in a square room, by which workers compile and load all before their first scan."""
+    angles = np.linspace(-2.0, 2.0, 200)
+    along, across = np.cos(angles), np.sin(angles)
+    scans = []
+    for i in range(4):
+        x = 0.2 * i
+        scans.append(
+            ScanInput(
+                stamp=(i + 1) * 10**8,
+                ranges=np.minimum((2.0 - x * np.sign(along)) / np.abs(along), 2.0 / np.abs(across)),
+                start_angle=-2.0,
+                angle_increment=float(angles[1] - angles[0]),
+                range_min=0.02,
+                range_max=5.6,
+                odom=(x, 0.0, 0.0),
+            )
+        )
+    return scans

@@ -17,7 +17,7 @@ from monstertruck_estimation.slam.map_evidence import EvidenceGrid
 from monstertruck_estimation.slam.mapping import Estimator, MappingEstimator, MappingEvent
 from monstertruck_estimation.slam.registration import Cloud, fitting
 from monstertruck_estimation.slam.scan_matcher import ScanMatcher
-from monstertruck_estimation.slam.scans import prepare_input
+from monstertruck_estimation.slam.scans import prepare_input, scans_in_a_room
 from monstertruck_estimation.slam.worker_io import ScanInput, ScanLeftOut, Start, WorkerInput, WorkerOutput
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.memory import give_back
@@ -167,24 +167,11 @@ def _witness() -> "KissWitness":
 
 def _warm_up() -> None:
     """Compile everything before the first scan is due."""
-    angles = np.linspace(-2.0, 2.0, 200)
     estimator = MappingEstimator(MapperConfig(), GridConfig())
-    scans, poses = [], np.zeros((4, 3))
-    poses[:, 0] = 0.2 * np.arange(4)
-    for i, pose in enumerate(poses):
-        along, across = np.cos(angles), np.sin(angles)
-        ranges = np.minimum((2.0 - pose[0] * np.sign(along)) / np.abs(along), 2.0 / np.abs(across))
-        inputs = ScanInput(
-            stamp=(i + 1) * 10**8,
-            ranges=ranges,
-            start_angle=-2.0,
-            angle_increment=float(angles[1] - angles[0]),
-            range_min=0.02,
-            range_max=5.6,
-            odom=(float(pose[0]), 0.0, 0.0),
-        )
-        scans.append(prepare_input(inputs, 30.0))
-        estimator.step(scans[-1], inputs)
+    drive = scans_in_a_room()
+    scans, poses = [prepare_input(inputs, 30.0) for inputs in drive], np.array([inputs.odom for inputs in drive])
+    for scan, inputs in zip(scans, drive, strict=True):
+        estimator.step(scan, inputs)
     keyframes = estimator.mapper.map
     keyframes.optimise()
     finished(opposed(keyframes, np.array((0,)), np.array((len(keyframes) - 1,))))

@@ -1,5 +1,7 @@
 """Motion from scan to scan."""
 
+import subprocess
+import sys
 from itertools import pairwise
 
 import numpy as np
@@ -125,3 +127,22 @@ def test_scans_whose_motions_scatter_contradict_only_what_stands_out(scatter):
         if monitor.findings():
             break
     assert bool(monitor.findings()) is (scatter == 0.0)
+
+
+FIRST_SCAN = """
+import sys
+from importlib import import_module
+from monstertruck_estimation.consistency.exchange import StepInput
+from monstertruck_estimation.consistency.service import TARGET
+from monstertruck_estimation.slam.scans import scans_in_a_room
+module, name = TARGET.split(":")
+worker, first, *_ = getattr(import_module(module), name)(), *scans_in_a_room()
+before = set(sys.modules)
+output = worker.step(StepInput(first, "kiss"))
+print(output.front, output.since, sorted(set(sys.modules) - before))
+"""
+
+
+def test_a_worker_has_loaded_everything_before_its_first_scan():
+    said = subprocess.run([sys.executable, "-c", FIRST_SCAN], check=True, capture_output=True, text=True).stdout
+    assert said == "kiss None []\n"
