@@ -16,7 +16,7 @@ _ADDRESSED: Final = ("tcp", "tls", "udp", "quic", "ws")
 """Protocols whose addresses are a host and a port."""
 _OTHERS: Final = ("unixsock-stream", "unixpipe", "vsock", "serial")
 ANNOUNCED: Final = "monstertruckd/"
-"""Prefix of the abstract Unix socket that shows a daemon to all users; its port, protocol and robot follow."""
+"""Prefix of the abstract Unix socket that shows a daemon to all users; its ports, protocol and robot follow."""
 EVERYWHERE: Final = ("0.0.0.0", "::")  # noqa: S104
 """Addresses at which a program listens on all interfaces."""
 ANSWERS_WITHIN: Final = 0.2
@@ -93,6 +93,8 @@ class Announced(NamedTuple):
     protocol: str
     """``tls`` where it requires a certificate."""
     robot: str
+    others: tuple[int, ...] = ()
+    """Ports of its other endpoints."""
 
     @property
     def endpoint(self) -> str:
@@ -100,21 +102,29 @@ class Announced(NamedTuple):
         return endpoint_of(self.protocol, LOCAL_HOSTS[0], self.port)
 
 
-def local_endpoints(environment: Mapping[str, str] = os.environ) -> list[str]:
-    """Endpoints of the daemons that answer on this machine, by port, the default port first.
+def local_endpoints(environment: Mapping[str, str] = os.environ, *, near: str = DEFAULT_ENDPOINT) -> list[str]:
+    """Return an endpoint of each daemon that answers on this machine, by port, the port of ``near`` first.
 
-    Unix sockets are those of this user and of the service; a daemon of another user is reached by its port.
+    Unix sockets are those of this user and of the service; a daemon of another user is reached by its port. Of several
+    endpoints of a daemon ``near`` is preferred, then its Unix socket.
     """
     folders = runtime_folder(environment), SERVICE_FOLDER
-    known = {one.port: one.endpoint for one in announced()}
+    daemons = announced()
+    known = {one.port: one.endpoint for one in daemons}
     sockets = {int(path.stem) for folder in folders for path in folder.glob("*.sock") if path.stem.isdecimal()}
-    usual = port_of(DEFAULT_ENDPOINT) or 0
+    usual = port_of(public(near)) or 0
     found = {}
     for port in (usual, *sorted((sockets | known.keys()) - {usual})):
         plain = endpoint_of("tcp", LOCAL_HOSTS[0], port)
         socket_or_plain = nearest(plain, environment)
-        found[port] = known.get(port, plain) if socket_or_plain == plain else socket_or_plain
-    return [end for port, end in found.items() if end.startswith(UNIX) or _listens(LOCAL_HOSTS[0], port)]
+        end = known.get(port, plain) if socket_or_plain == plain else socket_or_plain
+        if end.startswith(UNIX) or _listens(LOCAL_HOSTS[0], port):
+            found[port] = end
+    for one in daemons:
+        ports = [port for port in (one.port, *one.others) if port in found]
+        for port in sorted(ports, key=lambda port: (port != usual, not found[port].startswith(UNIX)))[1:]:
+            del found[port]
+    return list(found.values())
 
 
 def announce(robot: str, listen: Iterable[str]) -> socket.socket | None:
@@ -128,13 +138,14 @@ def announce(robot: str, listen: Iterable[str]) -> socket.socket | None:
         Socket that holds the name; the kernel drops that of a process that ends. None if the endpoints are for other
         computers, or another program holds the name.
     """
-    hosts = (*LOCAL_HOSTS, *EVERYWHERE)
+    hosts, listen = (*LOCAL_HOSTS, *EVERYWHERE), tuple(listen)
     for endpoint in listen:
         protocol, port = protocol_of(endpoint), port_of(endpoint)
         if protocol in ("tcp", "tls") and host_of(endpoint) in hosts and port is not None:
+            ports = dict.fromkeys((port, *filter(None, map(port_of, listen))))
             name = socket.socket(socket.AF_UNIX)
             try:
-                name.bind(f"\0{ANNOUNCED}{port}/{protocol}/{robot}")
+                name.bind(f"\0{ANNOUNCED}{','.join(map(str, ports))}/{protocol}/{robot}")
             except OSError:
                 name.close()
                 return None
@@ -150,10 +161,12 @@ def announced(table: Path = Path("/proc/net/unix")) -> list[Announced]:
         return []
     found = []
     for name in names:
-        port, _, rest = name.removeprefix(ANNOUNCED).partition("/")
+        ports, _, rest = name.removeprefix(ANNOUNCED).partition("/")
         protocol, _, robot = rest.partition("/")
-        if name.startswith(ANNOUNCED) and port.isdecimal() and protocol in ("tcp", "tls") and robot:
-            found.append(Announced(int(port), protocol, robot))
+        numbers = ports.split(",")
+        if name.startswith(ANNOUNCED) and all(map(str.isdecimal, numbers)) and protocol in ("tcp", "tls") and robot:
+            port, *others = map(int, numbers)
+            found.append(Announced(port, protocol, robot, tuple(others)))
     return found
 
 

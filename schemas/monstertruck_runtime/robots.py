@@ -23,14 +23,14 @@ def robots_at(endpoint: str, timeout: float = 0.5) -> list[str]:  # timeout of a
         return []
 
 
-def robots_here() -> list[tuple[str, str]]:
-    """Robots of this computer's daemons with their endpoints, the default port first; asking takes up to a second.
+def robots_here(near: str = DEFAULT_ENDPOINT) -> list[tuple[str, str]]:
+    """Robots of this computer's daemons with their endpoints, that of ``near`` first; asking takes up to a second.
 
     All are asked at once; those that require a certificate are named by what they announce.
     """
     from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415 - most commands need no thread
 
-    endpoints = local_endpoints()
+    endpoints = local_endpoints(near=near)
     certified = {one.endpoint: [one.robot] for one in announced() if one.protocol == "tls"}
     with ThreadPoolExecutor(max(1, len(endpoints))) as pool:
         names = pool.map(lambda endpoint: certified.get(endpoint) or robots_at(endpoint), endpoints)

@@ -91,7 +91,9 @@ class Day:
         self._next = 0
         self._programs = 0
         monkeypatch.setattr("monstertruck_runtime.clock.run_wall", self._run)
-        monkeypatch.setattr("monstertruck_runtime.robots.local_endpoints", list)  # of other robots on this computer
+        monkeypatch.setattr(
+            "monstertruck_runtime.robots.local_endpoints", lambda **_: []
+        )  # of other robots on this computer
         for module in ("monstertruck_runtime.client", "monstertruckd.tools.status.watch"):
             monkeypatch.setattr(f"{module}.TruckClient", self._client)
         monkeypatch.setattr("monstertruck_drivers.computer.Machine", rig.computer.usb.machine)

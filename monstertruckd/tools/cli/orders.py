@@ -133,8 +133,8 @@ def _run(name: str, robot: str, endpoint: str, *, json_output: bool, hold: bool 
 
 def _name_others(robot: str, endpoint: str) -> None:
     """Name the robots of this computer that an emergency stop did not go to."""
-    if len(local_endpoints()) > 1:
-        for other in robots_here():
+    if len(local_endpoints(near=endpoint)) > 1:
+        for other in robots_here(endpoint):
             if other != (robot, endpoint):
                 remark(f"not stopped: {other[0]}: monstertruckd estop {options_for(*other)}")
 

@@ -1,6 +1,7 @@
 """Places: sessions that hold all those of stations keep neither pilots nor the robot's own command line out."""
 
 import asyncio
+import socket
 import threading
 from pathlib import Path
 
@@ -74,15 +75,13 @@ async def test_two_daemons_on_one_computer_are_both_found(monkeypatch: pytest.Mo
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     monkeypatch.setattr(endpoints, "announced", list)  # those of other tests
     async with running_robot() as first, running_robot(robot="second") as second:
-        monkeypatch.setattr(endpoints, "DEFAULT_ENDPOINT", first.endpoint)
-        found = local_endpoints()
+        found = local_endpoints(near=first.endpoint)
         assert found == [nearest(first.endpoint), nearest(second.endpoint)]
         assert [await asyncio.to_thread(robots_at, endpoint) for endpoint in found] == [["truck"], ["second"]]
         assert (await asyncio.to_thread(holder_of, found)).startswith("robot 'truck', robot 'second', process ")
         other = free_endpoint()
-        monkeypatch.setattr(endpoints, "DEFAULT_ENDPOINT", other)
-        assert sorted(local_endpoints()) == sorted(found), "nobody answers at the default port"
-    assert local_endpoints() == []
+        assert sorted(local_endpoints(near=other)) == sorted(found), "nobody answers at this port"
+    assert local_endpoints(near=other) == []
 
 
 async def test_daemons_of_other_users_are_found_by_what_they_announce(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
@@ -103,12 +102,28 @@ def test_only_what_can_be_asked_from_this_computer_is_announced():
         for protocol in ("tcp", "tls"):
             with announce("rover-1_b", [f"udp/{host}:1", f"{protocol}/{host}:{free}", "tcp/localhost:1"]):
                 (shown,) = [one for one in announced() if one.port == free]
-                assert shown == (free, protocol, "rover-1_b")
+                assert shown == (free, protocol, "rover-1_b", (1,))
                 assert shown.endpoint == f"{protocol}/127.0.0.1:{free}"
     assert free not in {one.port for one in announced()}
 
 
-@pytest.mark.parametrize("name", ["7447", "x/tcp/truck", "7447/tcp/", "7447/udp/truck", "7447/tcp"])
+def test_a_daemon_with_several_local_endpoints_is_found_once(tmp_path: Path):
+    where = {"RUNTIME_DIRECTORY": str(tmp_path)}
+    with socket.create_server(("127.0.0.1", 0)) as one, socket.create_server(("127.0.0.1", 0)) as other:
+        first, second = one.getsockname()[1], other.getsockname()[1]
+        with announce("rover", [f"tls/127.0.0.1:{first}", f"tcp/127.0.0.1:{second}"]):
+            ends = {f"tls/127.0.0.1:{first}", f"tcp/127.0.0.1:{second}"}
+            assert ends & {*local_endpoints(where)} == {f"tls/127.0.0.1:{first}"}
+            near = f"tcp/127.0.0.1:{second}"
+            assert ends & {*local_endpoints(where, near=near)} == {near}, "where the caller is already"
+            with socket.socket(socket.AF_UNIX) as unix:
+                unix.bind(str(tmp_path / f"{second}.sock"))
+                unix.listen()
+                here = f"unixsock-stream/{tmp_path}/{second}.sock"
+                assert {*ends, here} & {*local_endpoints(where)} == {here}
+
+
+@pytest.mark.parametrize("name", ["7447", "7447,/tcp/truck", "x/tcp/truck", "7447/tcp/", "7447/udp/truck", "7447/tcp"])
 def test_names_that_are_no_daemons_are_passed_over(tmp_path: Path, name: str):
     table = tmp_path / "unix"
     rows = (f"0: 00000002 00000000 00010000 0001 01 42 @monstertruckd/{each}" for each in (name, "7448/tls/rover"))
@@ -122,7 +137,7 @@ def test_a_computer_without_the_kernels_table_shows_none(tmp_path: Path):
 
 def test_all_robots_of_this_computer_are_asked_at_once(monkeypatch: pytest.MonkeyPatch):
     """A program at such a port that does not answer costs its timeout once, however many there are."""
-    monkeypatch.setattr(robots, "local_endpoints", lambda: ["tcp/a:1", "tcp/b:2", "tcp/c:3"])
+    monkeypatch.setattr(robots, "local_endpoints", lambda near: ["tcp/a:1", "tcp/b:2", "tcp/c:3"])
     together = threading.Barrier(3, timeout=5)
 
     def asked(endpoint: str) -> list[str]:

@@ -29,14 +29,14 @@ SOCKETS = {"truck": "unixsock-stream//run/x/7447.sock", "second": "unixsock-stre
 def reached(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
     """Two robots on this computer; what commands reach is kept, and nothing is done."""
     found: list[tuple[str, str]] = []
-    monkeypatch.setattr(robots, "local_endpoints", lambda: list(SOCKETS.values()))
-    monkeypatch.setattr(orders, "local_endpoints", lambda: list(SOCKETS.values()))
+    monkeypatch.setattr(robots, "local_endpoints", lambda **_: list(SOCKETS.values()))
+    monkeypatch.setattr(orders, "local_endpoints", lambda **_: list(SOCKETS.values()))
     for module in (robots, options):
         monkeypatch.setattr(
             module, "nearest", lambda endpoint: SOCKETS["truck"] if endpoint == DEFAULT_ENDPOINT else endpoint
         )
-    monkeypatch.setattr(robots, "robots_here", lambda: list(SOCKETS.items()))
-    monkeypatch.setattr(orders, "robots_here", lambda: list(SOCKETS.items()))
+    monkeypatch.setattr(robots, "robots_here", lambda *_: list(SOCKETS.items()))
+    monkeypatch.setattr(orders, "robots_here", lambda *_: list(SOCKETS.items()))
 
     def stop(_: Any, robot: str, endpoint: str, *__: Any, **___: Any) -> None:
         found.append((robot, endpoint))
@@ -142,7 +142,7 @@ def test_a_robot_elsewhere_is_named_but_not_reached_unasked(
 
 def test_nobody_answers_on_this_computer(reached: list, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(robots, "nearest", lambda endpoint: endpoint)
-    monkeypatch.setattr(robots, "local_endpoints", list)
+    monkeypatch.setattr(robots, "local_endpoints", lambda **_: [])
     CliRunner().invoke(app, ["disarm"])
     assert reached == [("truck", DEFAULT_ENDPOINT)]
 
