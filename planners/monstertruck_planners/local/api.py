@@ -84,6 +84,11 @@ class LocalPlannerState:
     turning: tuple[float, ...] = ()
     """Emergency turn: start x, y, yaw and wanted yaw."""
 
+    @property
+    def final(self) -> bool:
+        """Whether the band ends where the route does."""
+        return self.route is not None and self.entered == len(self.route.poses)
+
 
 @dataclass(frozen=True)
 class LocalPlan:

@@ -80,24 +80,13 @@ def escape_motion(
 
 
 @dataclass(frozen=True)
-class RouteInWindow:
-    """The route in the window."""
-
-    band: PosePath
-    """From near the truck to the last free pose."""
-    entered: int
-    """Poses of the route that are in the band or behind the truck."""
-    final: bool
-    """Whether the band ends where the route does."""
-
-
-@dataclass(frozen=True)
 class CycleStart:
     """Beginning of a cycle."""
 
     robot_pose: Array
     """Shape (3,): the truck's pose."""
-    local: RouteInWindow
+    band: PosePath
+    """The route in the window, from near the truck to the last free pose."""
     state: LocalPlannerState
     """With the new band."""
 
@@ -132,18 +121,20 @@ class LocalPlannerCore:
         robot_pose = checked_pose(pose)
         if state.route is not route:
             state = LocalPlannerState(route=route)
-        local = self.cut(route, obstacles, robot_pose, state)
-        if local is None:
+        cut = self.cut(route, obstacles, robot_pose, state)
+        if cut is None:
             return LocalPlan(Reason.PATH_BLOCKED, state, text="no pose of the route in the window is free")
-        return CycleStart(robot_pose, local, replace(state, band=local.band, entered=local.entered))
+        band, entered = cut
+        return CycleStart(robot_pose, band, replace(state, band=band, entered=entered))
 
     def cut(
         self, route: PosePath, obstacles: DistanceField, pose: Array, state: LocalPlannerState
-    ) -> RouteInWindow | None:
+    ) -> tuple[PosePath, int] | None:
         """The rest of the last cycle's band from the truck on, and poses of the route that entered the window since.
 
         Returns:
-            None: no pose of the route in the window is free.
+            The band, and the number of poses of the route that are in it or behind the truck; None if no pose of the
+            route in the window is free.
         """
         band, entered = state.band, state.entered
         if band is None:
@@ -159,7 +150,7 @@ class LocalPlannerCore:
             entered += count
         if near is None:
             return None
-        return RouteInWindow(near, entered, entered == len(route.poses))
+        return near, entered
 
     def _entered(self, ahead: PosePath, near: PosePath | None, obstacles: DistanceField, pose: Array) -> int:
         """Number of route poses that join the band: up to the last free one that is in the window and in reach."""
@@ -191,7 +182,7 @@ class LocalPlannerCore:
         return float(samples.travelled[max(int(np.argmin(free)) - 1, 0)])
 
     def search(
-        self, obstacles: DistanceField, pose: Array, local: RouteInWindow, failed: int
+        self, obstacles: DistanceField, pose: Array, band: PosePath, failed: int, *, final: bool
     ) -> tuple[MotionPath | None, PosePath | None, Reason]:
         """Path along the band by a search of little effort, with the margin or at least without contact.
 
@@ -201,20 +192,20 @@ class LocalPlannerCore:
         Args:
             obstacles: in the window.
             pose: of the truck.
-            local: the band; where it does not end with the route, other headings are accepted.
+            band: the route in the window.
             failed: searches in sequence without a result.
+            final: whether the band ends with the route; where it does not, other headings are accepted.
 
         Returns:
             The path and the band that follows from it, or the reason why there are none.
         """
-        band = local.band
         free = obstacles.free(self.vehicle.footprint, band.poses, self.config.margin)
         inside = np.flatnonzero(self._in_window(band.poses, obstacles, 0.0) & free)
         last = int(inside[-1]) if len(inside) else len(band.poses) - 1
         goal = band.poses[last].copy()
         # headings tried at the goal of a local search, relative to that of the route, rad
         goal_headings = (0.0, 1.0, -1.0)
-        if last < len(band.poses) - 1 or not local.final:
+        if last < len(band.poses) - 1 or not final:
             # 5: searches without a result before another heading is tried
             goal[2] += goal_headings[failed // 5 % len(goal_headings)]
         path, reason = self._search_to(obstacles, pose, goal)

@@ -19,7 +19,7 @@ from monstertruck_planners.collision import DiscFootprint, DistanceField
 from monstertruck_planners.local import elastic_band
 from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath
 from monstertruck_planners.local.config import BandConfig, PublishedConfig
-from monstertruck_planners.local.core import LocalPlannerCore, RouteInWindow, checked_pose, ends_at
+from monstertruck_planners.local.core import LocalPlannerCore, checked_pose, ends_at
 from monstertruck_planners.local.elastic_band import band_parameters, relax_band
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.config import HybridConfig
@@ -64,21 +64,22 @@ class PublishedPlanner:
             state = LocalPlannerState(route=route)
         ahead_only = PosePath(moved(route.poses, -self.vehicle.reference), np.ones(len(route.poses)))
         before = replace(state, band=self._pruned(state.band, obstacles, robot_pose))
-        local = self._band.cut(ahead_only, obstacles, robot_pose, before)
-        if local is None:
+        cut = self._band.cut(ahead_only, obstacles, robot_pose, before)
+        if cut is None:
             return LocalPlan(Reason.PATH_BLOCKED, state, text="no pose of the route in the window is free")
-        whole = PosePath(np.vstack((robot_pose, local.band.poses)), np.ones(len(local.band.poses) + 1))
+        ahead, entered = cut
+        whole = PosePath(np.vstack((robot_pose, ahead.poses)), np.ones(len(ahead.poses) + 1))
         band = relax_band(whole, obstacles, self._band.cover, self._band_parameters)
         if band.path is None:
             return LocalPlan(Reason.PATH_BLOCKED, LocalPlannerState(route=route), text="the band is broken")
-        state = replace(state, band=band.path.part(1, len(band.path.poses)), entered=local.entered)
+        state = replace(state, band=band.path.part(1, len(band.path.poses)), entered=entered)
         poses = oriented(band.path.poses)
         path = self._joined(poses, obstacles)
         behind = abs(poses[0, 2] - poses[1, 2]) > math.pi / 2
         if path is None or behind:
             return self._emergency(state, obstacles, poses)
         goal = ahead_only.poses[-1]
-        return LocalPlan(Reason.OK, replace(state, turning=()), path, local.final and ends_at(path, goal))
+        return LocalPlan(Reason.OK, replace(state, turning=()), path, state.final and ends_at(path, goal))
 
     def _pruned(self, band: PosePath | None, obstacles: DistanceField, robot_pose: Array) -> PosePath | None:
         """The band from the furthest bubble on that touches the truck's."""
@@ -97,8 +98,8 @@ class PublishedPlanner:
         path = self._reeds_shepp.path(robot_pose, goal)
         if len(path.segments) and self._states.free(obstacles, path):
             return path
-        end = RouteInWindow(PosePath(goal[None], np.ones(1)), 0, final=True)
-        return self._states.search(obstacles, robot_pose, end, 0)[0]
+        end = PosePath(goal[None], np.ones(1))
+        return self._states.search(obstacles, robot_pose, end, 0, final=True)[0]
 
     def _joined(self, poses: Array, obstacles: DistanceField) -> MotionPath | None:
         """The path of the strategy."""

@@ -25,7 +25,6 @@ from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_planners.local.core import (
     PATH_CUSP_REACHED,
     LocalPlannerCore,
-    RouteInWindow,
     costs_of,
     ends_at,
     remaining_path,
@@ -62,17 +61,17 @@ class RsbandPlanner:
         cycle = self._core.begin(route, obstacles, pose, state)
         if isinstance(cycle, LocalPlan):
             return cycle
-        robot_pose, local, state = cycle.robot_pose, cycle.local, cycle.state
+        robot_pose, band, state = cycle.robot_pose, cycle.band, cycle.state
         rest, far = remaining_path(state.path, robot_pose) if state.path is not None else (None, 0.0)
         ended_there = rest is not None and ends_at(rest, route.poses[-1])
         if (
             rest is not None
-            and self._worth_keeping(rest, far, to_end=ended_there, to_cusp=ends_at_cusp(rest, local.band))
+            and self._worth_keeping(rest, far, to_end=ended_there, to_cusp=ends_at_cusp(rest, band))
             and self._core.free(obstacles, rest)
         ):
             kept = replace(state, path=rest)
             return LocalPlan(Reason.OK, kept, rest, ended_there, statistics={"kept": 1.0})
-        return self._new_path(local, obstacles, robot_pose, state, rest)
+        return self._new_path(band, obstacles, robot_pose, state, rest)
 
     def _worth_keeping(self, rest: MotionPath, far: float, *, to_end: bool, to_cusp: bool) -> bool:
         if far > self.config.off_path or not len(rest.segments):
@@ -84,14 +83,14 @@ class RsbandPlanner:
 
     def _new_path(
         self,
-        local: RouteInWindow,
+        ahead: PosePath,
         obstacles: DistanceField,
         robot_pose: Array,
         state: LocalPlannerState,
         rest: MotionPath | None,
     ) -> LocalPlan:
         """Relax the band and join its poses, else search."""
-        whole = starting_at(local.band, robot_pose)
+        whole = starting_at(ahead, robot_pose)
         band = relax_band(whole, obstacles, self._core.cover, self._band_parameters)
         statistics = {
             "kept": 0.0,
@@ -106,7 +105,7 @@ class RsbandPlanner:
                 done = ends_at(path, state.route.poses[-1])  # type: ignore[union-attr]
                 return LocalPlan(Reason.OK, after, path, done, statistics=statistics)
         statistics["searched"] = 1.0
-        path, band_of_path, why = self._core.search(obstacles, robot_pose, local, state.failed)
+        path, band_of_path, why = self._core.search(obstacles, robot_pose, ahead, state.failed, final=state.final)
         if path is None:
             result = self._core.partial(state, obstacles, robot_pose, rest, why)
             return replace(result, statistics=statistics)

@@ -28,7 +28,6 @@ from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePa
 from monstertruck_planners.local.config import TebConfig
 from monstertruck_planners.local.core import (
     LocalPlannerCore,
-    RouteInWindow,
     costs_of,
     ends_at,
     remaining_path,
@@ -350,42 +349,42 @@ class TebPlanner:
         cycle = self._core.begin(route, obstacles, pose, state)
         if isinstance(cycle, LocalPlan):
             return cycle
-        robot_pose, local, state = cycle.robot_pose, cycle.local, cycle.state
+        robot_pose, ahead, state = cycle.robot_pose, cycle.band, cycle.state
         statistics = {"searched": 0.0, "poses": 0.0, "steps": 0.0, "kept": 0.0}
         rest = remaining_path(state.path, robot_pose)[0] if state.path is not None else None
         path = None
         if rest is None or not turns_soon(rest):
-            path = self._from_band(local, obstacles, robot_pose, statistics)
-        if path is None and rest is not None and self._usable(rest, local, obstacles):
+            path = self._from_band(ahead, obstacles, robot_pose, statistics)
+        if path is None and rest is not None and self._usable(rest, ahead, obstacles):
             path = rest
             statistics["kept"] = 1.0
         if path is None:
             statistics["searched"] = 1.0
-            found, way, why = self._core.search(obstacles, robot_pose, local, state.failed)
+            found, way, why = self._core.search(obstacles, robot_pose, ahead, state.failed, final=state.final)
             if found is None:
                 result = self._core.partial(state, obstacles, robot_pose, rest, why)
                 return replace(result, statistics=statistics)
             path = self._optimised(PosePath.from_motion(found, self.config.spacing), obstacles, statistics) or found
-            local = replace(local, band=way or local.band)
-        done = local.final and ends_at(path, route.poses[-1])
-        end = local.band.poses[-1]
+            ahead = way or ahead
+        done = state.final and ends_at(path, route.poses[-1])
+        end = ahead.poses[-1]
         # 0.05: a path that ends further from its band's end is only a part of it, m
         whole = math.hypot(*(path.end - end)[:2]) < 0.05
-        band = PosePath.from_motion(path, self.config.spacing) if whole else local.band
+        band = PosePath.from_motion(path, self.config.spacing) if whole else ahead
         after = replace(state, band=band, path=path, failed=0)
         return LocalPlan(Reason.OK, after, path, done, statistics=statistics)
 
-    def _usable(self, rest: MotionPath, local: RouteInWindow, obstacles: DistanceField) -> bool:
+    def _usable(self, rest: MotionPath, ahead: PosePath, obstacles: DistanceField) -> bool:
         """Whether the last path may be kept: long enough, free, and not one that ends before the band does."""
         long = rest.length > self.config.shortest
-        near = long and math.hypot(*(rest.end - local.band.poses[-1])[:2]) < self.config.reach / 3
+        near = long and math.hypot(*(rest.end - ahead.poses[-1])[:2]) < self.config.reach / 3
         return near and self._core.free(obstacles, rest)
 
     def _from_band(
-        self, local: RouteInWindow, obstacles: DistanceField, robot_pose: Array, statistics: dict[str, float]
+        self, ahead: PosePath, obstacles: DistanceField, robot_pose: Array, statistics: dict[str, float]
     ) -> MotionPath | None:
         """The band after optimisation; None if it is broken or not free."""
-        whole = starting_at(local.band, robot_pose)
+        whole = starting_at(ahead, robot_pose)
         if len(whole.poses) < 2:
             return None
         stretched = relax_band(whole, obstacles, self._core.cover, self._band_parameters)

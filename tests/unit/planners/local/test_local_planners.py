@@ -10,7 +10,7 @@ from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.local.api import LocalPlannerState, PosePath, nearest_pose
 from monstertruck_planners.local.catalog import LOCAL_PLANNERS, make_local_planner
 from monstertruck_planners.local.config import LocalPlannerConfig, PublishedConfig, RsbandConfig, TebConfig
-from monstertruck_planners.local.core import LocalPlannerCore, RouteInWindow, remaining_band, remaining_path
+from monstertruck_planners.local.core import LocalPlannerCore, remaining_band, remaining_path
 from monstertruck_planners.local.elastic_band import cover_footprint
 from monstertruck_planners.local.published import oriented
 from monstertruck_planners.local.teb import WIDTH, NormalEquations, _assemble, resampled, teb_parameters
@@ -202,7 +202,7 @@ def test_the_way_found_is_kept_while_its_end_is_out_of_sight():
     vehicle = CARS["4ws"]
     surveyor = LocalPlannerCore(vehicle, RsbandConfig())
     band = line(begin=1.0, end=6.0)
-    path, way, reason = surveyor.search(window(), np.array(START), RouteInWindow(band, 99, final=False), 0)
+    path, way, reason = surveyor.search(window(), np.array(START), band, 0, final=False)
     assert reason is Reason.OK
     assert path.end[0] < 4.0 - vehicle.footprint.circumscribed_radius
     assert way.poses[-1].tolist() == band.poses[-1].tolist()
