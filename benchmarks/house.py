@@ -51,6 +51,7 @@ REST: Final = (
     "drivers/monstertruck_drivers/vesc",
     "drivers/monstertruck_drivers/wt61",
     "drivers/monstertruck_sim",
+    "monstertruckd/ros2",
     "monstertruckd/station/foxglove.py",
     "monstertruckd/tools/cli/description.py",
     "monstertruckd/tools/cli/drill.py",
