@@ -44,7 +44,7 @@ COMPARED: Final = (5.0, 2.0)
 """Time (s) and motion (m or rad) over which odometry is compared with the scans."""
 SAMPLE: Final = (0.25, 0.1)
 """Least length of a step of the comparison, s and motion: the noise of single matches would add up to a distance."""
-FEWEST_SAMPLES: Final = 3
+FEWEST_SAMPLES: Final = 2
 """Fewest steps of a comparison."""
 TOLERANCE: Final = 0.3
 """Tolerated difference of odometry and scans as a share of the distance, or of the turn."""
