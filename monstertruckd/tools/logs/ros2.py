@@ -17,7 +17,6 @@ from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, get_typestore
 
 from monstertruck_estimation.transforms import quaternion_from_yaw
-from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas import topics as t
@@ -27,6 +26,7 @@ from monstertruck_schemas.sensor import Battery, CompressedImage, LaserScan
 from monstertruck_schemas.state import Grid, Odometry, Transforms
 from monstertruck_schemas.topics import BY_NAME, Topic
 from monstertruckd.recorder.reader import LogReader, open_log
+from monstertruckd.ros2.convert import full_covariance
 from monstertruckd.tools.logs.export import removed_on_failure
 from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
 
@@ -114,14 +114,6 @@ def _pose(pose: Pose2D) -> Any:
     return _ros("geometry_msgs/msg/Pose", position=position, orientation=rotation)
 
 
-def _covariance(planar: Array) -> Array:
-    """Shape (36,) from the (9,) of x, y, yaw; what the plane does not know is 0."""
-    full = np.zeros((6, 6))
-    plane = (0, 1, 5)  # rows of (x, y, yaw) in ROS's covariances over (x, y, z, roll, pitch, yaw)
-    full[np.ix_(plane, plane)] = planar.reshape(3, 3)
-    return full.ravel()
-
-
 def _scan(scan: LaserScan, offset: int) -> Any:
     return _ros(
         "sensor_msgs/msg/LaserScan",
@@ -141,7 +133,7 @@ def _scan(scan: LaserScan, offset: int) -> Any:
 def _odometry(odometry: Odometry, offset: int) -> Any:
     twist = odometry.twist
     velocity = _ros("geometry_msgs/msg/Twist", linear=_vector(twist.vx, twist.vy), angular=_vector(z=twist.wz))
-    covariances = _covariance(odometry.pose_covariance), _covariance(odometry.twist_covariance)
+    covariances = full_covariance(odometry.pose_covariance), full_covariance(odometry.twist_covariance)
     return _ros(
         "nav_msgs/msg/Odometry",
         header=_header(odometry.stamp, odometry.frame, offset),
