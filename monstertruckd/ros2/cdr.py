@@ -4,6 +4,7 @@ A field that is left out is zero or empty. Sequences of numbers are arrays of nu
 read-only. A decoder refuses what it cannot read; it never reserves more memory than the message has bytes.
 """
 
+import math
 import struct
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -43,6 +44,7 @@ Read = Callable[[memoryview, int], tuple[Any, int]]
 
 _EMPTY: Final[RosMessage] = {}
 _COUNT: Final = struct.Struct("<I")
+_FLOAT32: Final = struct.Struct("<f")
 
 
 def encode(name: str, message: Mapping[str, Any]) -> bytes:
@@ -125,7 +127,8 @@ def _field_writer(field: RosField) -> Write:
                 one(body, value)
         elif len(values):
             _pad(body, size)
-            body += values if isinstance(values, bytes) else np.asarray(values).astype(dtype, copy=False).tobytes()
+            with np.errstate(over="ignore"):
+                body += values if isinstance(values, bytes) else np.asarray(values).astype(dtype, copy=False).tobytes()
 
     return write
 
@@ -137,6 +140,8 @@ def _writer(field: RosField) -> Write:
         return _write_text
     number = struct.Struct(f"<{_CODES[field.kind]}")
     size, pack = number.size, number.pack
+    if field.kind == "float32":
+        return _write_float32
 
     def write(body: bytearray, value: Any) -> None:
         if extra := -len(body) % size:
@@ -144,6 +149,15 @@ def _writer(field: RosField) -> Write:
         body += pack(value)
 
     return write
+
+
+def _write_float32(body: bytearray, value: float) -> None:
+    """What is beyond the range of 32 bits becomes infinite, as numpy makes it in arrays."""
+    _pad(body, _FLOAT32.size)
+    try:
+        body += _FLOAT32.pack(value)
+    except OverflowError:
+        body += _FLOAT32.pack(math.copysign(math.inf, value))
 
 
 def _write_text(body: bytearray, text: str) -> None:

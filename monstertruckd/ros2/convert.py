@@ -38,6 +38,10 @@ FRAMES: Final = {"base": "base_link", "lidar": "laser"}
 """Frames that ROS calls otherwise."""
 
 
+LAST: Final = 2**31 * SECOND - 1
+"""Last time that a ``builtin_interfaces/msg/Time`` can hold, ns."""
+
+
 def _own_name(frame: str) -> str:
     return frame
 
@@ -52,8 +56,8 @@ class RosNames:
     """Name of a frame of the robot."""
 
     def time(self, stamp: int) -> RosValues:
-        """``builtin_interfaces/msg/Time`` of the robot's time."""
-        seconds, nanoseconds = divmod(max(0, stamp + self.offset), SECOND)
+        """``builtin_interfaces/msg/Time`` of the robot's time; its end, in 2038, for what is later."""
+        seconds, nanoseconds = divmod(min(max(0, stamp + self.offset), LAST), SECOND)
         return {"sec": seconds, "nanosec": nanoseconds}
 
     def header(self, message: Message) -> RosValues:
@@ -95,7 +99,8 @@ def full_covariance(planar: Array) -> Array:
 
 def scan(message: LaserScan, names: RosNames) -> RosValues:
     """``sensor_msgs/msg/LaserScan``: +inf where a beam met nothing, NaN where the sensor does not know (REP 117)."""
-    ranges = message.ranges.astype(np.float32)
+    with np.errstate(over="ignore"):  # beyond the range of 32 bits is infinite
+        ranges = message.ranges.astype(np.float32)
     ranges[(message.codes > NO_ECHO) & (message.codes != VALID_BEAM)] = np.nan
     return {
         "header": names.header(message),

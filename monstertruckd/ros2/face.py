@@ -1,6 +1,7 @@
 """The robot on a ROS 2 node: its topics outwards, requests of ROS 2 nodes inwards."""
 
 import asyncio
+import math
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -413,7 +414,7 @@ def _further_frames(fixed: Iterable[Any]) -> list[Any]:
     """Fixed transforms that ROS 2 expects besides."""
     frames = [mount(FOOTPRINT, (0.0, 0.0, 0.0))]
     if any(row.child == "camera" for row in fixed):
-        half = 1.5707963267948966  # rad: x forward, y left, z up to z forward, x right, y down
+        half = math.pi / 2  # x forward, y left, z up to z forward, x right, y down
         frames.append(mount(OPTICAL, (0.0, 0.0, 0.0), (-half, 0.0, -half), parent="camera"))
     return frames
 

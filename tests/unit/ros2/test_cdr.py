@@ -8,8 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
+from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruckd.ros2.cdr import decode, encode
+from monstertruckd.ros2.convert import RosNames
 from monstertruckd.ros2.interfaces import ARRAY, PRIMITIVES, interfaces
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -165,3 +167,18 @@ def test_a_mistake_of_ours_is_noticed(message, match):
 def test_other_byte_orders_are_refused_by_name():
     with pytest.raises(InputError, match="little endian, found 00000000"):
         decode("std_msgs/msg/String", bytes(8))
+
+
+@pytest.mark.parametrize("value", [1e300, -1e300, math.inf, -math.inf])
+def test_a_number_beyond_32_bits_is_infinite_alone_and_in_arrays(value: float):
+    single = decode("sensor_msgs/msg/Range", encode("sensor_msgs/msg/Range", {"range": value}))
+    assert single["range"] == math.copysign(math.inf, value)
+    scan = decode("sensor_msgs/msg/LaserScan", encode("sensor_msgs/msg/LaserScan", {"ranges": np.array([value, 1.0])}))
+    assert scan["ranges"].tolist() == [math.copysign(math.inf, value), 1.0]
+
+
+@pytest.mark.parametrize(("stamp", "sec"), [(-5, 0), (3 * SECOND, 3), (2**31 * SECOND, 2**31 - 1), (2**62, 2**31 - 1)])
+def test_a_stamp_stays_within_the_range_of_its_field(stamp: int, sec: int):
+    time = RosNames().time(stamp)
+    assert time["sec"] == sec
+    assert decode("builtin_interfaces/msg/Time", encode("builtin_interfaces/msg/Time", time)) == time
