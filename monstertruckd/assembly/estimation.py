@@ -8,7 +8,7 @@ from typing import Final, Self
 
 from monstertruck_drivers.catalog import DEVICES
 from monstertruck_estimation.catalog import ODOMETRY
-from monstertruck_estimation.consistency.config import ConsistencyConfig
+from monstertruck_estimation.consistency.config import SCAN_LIBRARIES, ConsistencyConfig
 from monstertruck_estimation.consistency.service import START_TIMEOUT as SCANS_START
 from monstertruck_estimation.consistency.service import TARGET as SCAN_ODOMETRY
 from monstertruck_estimation.consistency.service import ConsistencyInputs, ConsistencyService, ScanSetup
@@ -134,7 +134,7 @@ def _build_consistency(
 ) -> ConsistencyService:
     devices, chassis = config.devices, body.chassis
     scans = None
-    if consistency.scans is not None and devices.lidar is not None and find_spec("numba") is not None:
+    if consistency.scans is not None and devices.lidar is not None and all(map(find_spec, SCAN_LIBRARIES)):
         # On the virtual clock nothing runs meanwhile: a process of its own would only take time to start.
         placement: Placement = "loop" if isinstance(clock, VirtualClock) else "worker"
         actor = actors.actor(

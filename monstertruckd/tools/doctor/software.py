@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator, Iterator
 from importlib import metadata
 from pathlib import Path
 
+from monstertruck_estimation.consistency.config import SCAN_LIBRARIES
 from monstertruck_runtime.errors import TruckError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine, warn
@@ -86,8 +87,9 @@ def motion(context: HostContext) -> Iterator[Finding]:
     if scans == "kiss" and context.versions("kiss-icp") is None:
         text = "kiss-icp is not installed: this repository's own scan odometry measures the motion"
         yield warn("scan odometry", Reason.NOT_INSTALLED, text, _install_command(context))
-    if scans is not None and context.versions("numba") is None:
-        text = "numba is not installed: the motion by scans is not measured"
+    missing = [name for name in SCAN_LIBRARIES if context.versions(name) is None]
+    if scans is not None and missing:
+        text = f"{', '.join(missing)} not installed: the motion by scans is not measured"
         yield warn("scan odometry", Reason.NOT_INSTALLED, text, _install_command(context))
 
 

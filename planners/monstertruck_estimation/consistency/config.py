@@ -1,12 +1,14 @@
 """Settings of the consistency check; light, for the daemon's start."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
 from monstertruck_schemas.base import Positive, Schema
 
 Share = Annotated[float, Field(ge=0, lt=1)]
+SCAN_LIBRARIES: Final = ("numba", "scipy")
+"""Packages without which the motion by scans is not measured."""
 
 
 class ConsistencyConfig(Schema):

@@ -179,5 +179,8 @@ def test_measures_of_the_motion_and_what_is_missing(tmp_path: Path):
     assert bad(found) == {}
     assert found["motion"].seen == "measured by wheels, scans, compass"
     assert bad(see(tmp_path / "b", motion, without("kiss-icp"))).keys() == {"scan odometry"}
+    for name in ("numba", "scipy"):
+        missing = see(tmp_path / name, motion, without(name))["scan odometry"]
+        assert missing.seen == f"{name} not installed: the motion by scans is not measured"
     alone = see(tmp_path / "c", motion, lambda emulated: emulated.change(consistency=None))["motion"]
     assert (alone.level, alone.reason) == (Level.WARN, Reason.UNWITNESSED)
