@@ -99,7 +99,7 @@ def sync(extras: tuple[str, ...]) -> None:
     ]
     environment = {name: value for name, value in os.environ.items() if name != "VIRTUAL_ENV"}
     if not VENV.exists():
-        size = "about 430 MB" if extras == EXTRAS["demo"] else "a gigabyte or two"
+        size = "about 570 MB" if extras == EXTRAS["demo"] else "a gigabyte or two"
         print(f"Setting up {VENV}: {size}, the first time only ...", file=sys.stderr)
     code = subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
     if code:
