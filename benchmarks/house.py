@@ -57,6 +57,7 @@ REST: Final = (
     "monstertruckd/tools/cli/drill.py",
     "monstertruckd/tools/cli/kinematics.py",
     "monstertruckd/tools/cli/replay.py",
+    "monstertruckd/tools/cli/ros2.py",
     "monstertruckd/tools/cli/stand",
     "monstertruckd/tools/cli/study.py",
     "monstertruckd/tools/cli/tune.py",

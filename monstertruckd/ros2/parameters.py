@@ -68,7 +68,7 @@ class RosParameters:
         node.serve("~/set_parameters", f"{interfaces}/SetParameters", self._set)
         node.serve("~/set_parameters_atomically", f"{interfaces}/SetParametersAtomically", self._set_atomically)
         self._changed = node.publisher("/parameter_events", "rcl_interfaces/msg/ParameterEvent", RELIABLE)
-        self._name = node.qualified("~/")[:-1]
+        self._name = node.qualified("~/set_parameters").rpartition("/")[0]
 
     async def _rows(self) -> dict[str, dict[str, Any]]:
         """Settings by name; none if the robot does not answer."""

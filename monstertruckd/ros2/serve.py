@@ -2,8 +2,10 @@
 
 import json
 import logging
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from pathlib import Path
+from typing import Any, Final
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
@@ -11,30 +13,58 @@ from monstertruck_runtime.stations import tls_for
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.ros2.face import FaceOptions, RosFace
 from monstertruckd.ros2.facts import RobotFacts
+from monstertruckd.ros2.node import RosNode
 from monstertruckd.ros2.operators import Operators
-from monstertruckd.ros2.zenoh_node import ZenohNode
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.remarks import Remarks
 
 log = logging.getLogger(__name__)
 
-TIMEOUT = 2.5
+RVIZ: Final = Path(__file__).parent / "robot.rviz"
+"""Configuration of RViz for one robot without a namespace."""
+TIMEOUT: Final = 2.5
 """Seconds in which the robot answers."""
 
 
-async def serve_zenoh(
+@asynccontextmanager
+async def zenoh_node(
+    name: tuple[str, str], domain: int, settings: Mapping[str, Any], clock: Clock, *, hashed: bool
+) -> AsyncIterator[RosNode]:
+    """A node over ``rmw_zenoh``'s wire; arguments and errors of ``ZenohNode``."""
+    from monstertruckd.ros2.zenoh_node import ZenohNode  # noqa: PLC0415 - each face has libraries of its own
+
+    async with ZenohNode(name, domain, settings, clock, hashed=hashed) as node:
+        yield node
+
+
+@asynccontextmanager
+async def rclpy_node(name: tuple[str, str], domain: int) -> AsyncIterator[RosNode]:
+    """A node of the installed ROS 2; arguments and errors of ``RclpyNode``."""
+    from monstertruckd.ros2.rclpy_node import RclpyNode  # noqa: PLC0415
+
+    async with RclpyNode(name, domain) as node:
+        yield node
+        if node.missing:
+            log.warning("not offered, for their packages are not installed: %s", ", ".join(sorted(node.missing)))
+
+
+async def serve_face(
     address: RobotAddress,
-    name: tuple[str, str],
-    domain: int,
-    settings: Mapping[str, Any],
+    join: Callable[[], AbstractAsyncContextManager[RosNode]],
     facts: Callable[[TruckConfig], RobotFacts],
     options: FaceOptions,
     clock: Clock,
     ready: Callable[[], object],
-    *,
-    hashed: bool = True,
 ) -> None:
-    """Show a robot to ``rmw_zenoh`` until cancelled; see ``ZenohNode`` and ``RosFace`` for the arguments.
+    """Show a robot to ROS 2 until cancelled.
+
+    Args:
+        address: of the robot.
+        join: makes the node.
+        facts: what ROS 2 needs of the robot's configuration.
+        options: as chosen.
+        clock: time.
+        ready: called once ROS 2 sees the robot.
 
     Raises:
         TruckError: the robot or the router cannot be reached, or it has a face already.
@@ -50,7 +80,7 @@ async def serve_zenoh(
         running = await client.call("config")
         running.pop("sim", None)
         config = TruckConfig.model_validate_json(json.dumps(running))
-        async with ZenohNode(name, domain, settings, clock, hashed=hashed) as node:
+        async with join() as node:
             operators = Operators(connect, owner, clock, remarks.add)
             try:
                 await RosFace(client, node, operators, facts(config), options, clock).run(ready)

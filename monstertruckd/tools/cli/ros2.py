@@ -10,9 +10,19 @@ from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.output import needs_extra, remark, until_stopped
 
 if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
+
     from monstertruck_runtime.clock import WallClock
     from monstertruckd.config.truck import TruckConfig
     from monstertruckd.ros2.facts import RobotFacts
+    from monstertruckd.ros2.node import RosNode
+
+
+class Face(StrEnum):
+    """How ROS 2 is spoken to."""
+
+    ZENOH = "zenoh"
+    RCLPY = "rclpy"
 
 
 class Distribution(StrEnum):
@@ -29,6 +39,13 @@ def ros2(
         str | None,
         typer.Option("--robot", "-r", metavar="NAME@ENDPOINT", help="The robot. Default: that of this computer."),
     ] = None,
+    face: Annotated[
+        Face,
+        typer.Option(
+            "--face",
+            help="zenoh: the wire of rmw_zenoh, without ROS 2 here; rclpy: any middleware, by the ROS 2 here.",
+        ),
+    ] = Face.ZENOH,
     domain: Annotated[int, typer.Option("--domain", envvar="ROS_DOMAIN_ID", min=0, max=232)] = 0,
     namespace: Annotated[
         str, typer.Option("--namespace", help="Before all relative topics, such as /truck1: for several robots.")
@@ -62,8 +79,8 @@ def ros2(
 ) -> None:
     """Show the robot to ROS 2 as a node, and pass on what ROS 2 nodes ask of it.
 
-    It is a client of the robot like any other, and speaks to rmw_zenoh (RMW_IMPLEMENTATION=rmw_zenoh_cpp);
-    ROS 2 need not be installed here.
+    It is a client of the robot like any other. With face zenoh it speaks to rmw_zenoh
+    (RMW_IMPLEMENTATION=rmw_zenoh_cpp), and ROS 2 need not be installed here.
     """
     for name, endpoint in (("--connect", connect), ("--listen", listen)):
         if endpoint is not None and not is_endpoint(endpoint):
@@ -72,7 +89,7 @@ def ros2(
         raise InputError(f"--namespace {namespace!r}: expected a name that begins with /")
     with needs_extra("ros2"):
         from monstertruckd.ros2.face import FaceOptions
-        from monstertruckd.ros2.serve import serve_zenoh
+        from monstertruckd.ros2.serve import RVIZ, rclpy_node, serve_face, zenoh_node
         from monstertruckd.ros2.zenoh_node import free_endpoint, session_settings
     from monstertruckd.station.address import RobotAddress
 
@@ -81,15 +98,23 @@ def ros2(
     options = FaceOptions(prefix, map_to_odom, odom_to_base, clock, drive)
     hashed = distribution is not Distribution.HUMBLE
 
+    node = (address.name, namespace)
+
     def ready() -> None:
         remark(f"ros2: robot {address.name} is node {namespace.rstrip('/')}/{address.name} of domain {domain}")
-        if connect is None:
+        remark(f"ros2: RViz: rviz2 -d {RVIZ}")
+        if connect is None and face is Face.ZENOH:
             remark(f"ros2: nodes reach it by ZENOH_CONFIG_OVERRIDE='connect/endpoints=[\"{own}\"]'")
 
     async def serve(wall: "WallClock") -> None:
-        node = (address.name, namespace)
         settings = session_settings(connect, own)
-        await serve_zenoh(address, node, domain, settings, robot_facts, options, wall, ready, hashed=hashed)
+
+        def join() -> "AbstractAsyncContextManager[RosNode]":
+            if face is Face.RCLPY:
+                return rclpy_node(node, domain)
+            return zenoh_node(node, domain, settings, wall, hashed=hashed)
+
+        await serve_face(address, join, robot_facts, options, wall, ready)
 
     until_stopped(serve)
 

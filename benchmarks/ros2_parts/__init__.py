@@ -1,0 +1,1 @@
+"""Parts of ``benchmarks/ros2.py``: independent programs, each a process."""

@@ -1,0 +1,222 @@
+"""A ROS 2 node by ``rclpy``: for every middleware that ROS 2 has, in an environment where ROS 2 is installed.
+
+Messages pass as the bytes that the face encodes and decodes itself. Interfaces whose package is not installed are left
+out. ``rclpy`` says of a message neither its publisher nor, of a request, its client:
+
+- A message counts as that of the publisher of its topic where there is exactly one, and as that of an unknown one
+  otherwise.
+- All clients of services are one sender.
+"""
+
+import asyncio
+import importlib
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Final, Self
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+
+from monstertruck_runtime.errors import BusyError, InputError
+from monstertruck_runtime.threads import in_daemon_thread, in_thread
+from monstertruckd.ros2.cdr import decode, encode
+from monstertruckd.ros2.interfaces import wire_name
+from monstertruckd.ros2.node import Answer, Publish, RosArrival, RosSender, Take
+from monstertruckd.ros2.rmw import RosQos
+
+CLIENTS: Final = RosSender("/service_clients", "clients")
+"""All clients of services."""
+ANSWER_TIMEOUT: Final = 3600.0
+"""Seconds that a request may wait for its answer: the result of an action comes at its end."""
+THREADS: Final = 8
+"""Requests that are answered at once, and one thread for messages."""
+
+
+def rclpy_interface(name: str) -> Any:
+    """Class of an interface, or None if its package, or the interface in it, is not installed."""
+    package, group, own = wire_name(name).split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.{group}"), own, None)
+    except ModuleNotFoundError:
+        return None
+
+
+def _profile(qos: RosQos) -> QoSProfile:
+    return QoSProfile(
+        depth=qos.depth,
+        reliability=ReliabilityPolicy.RELIABLE if qos.reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if qos.latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+@dataclass(slots=True)
+class Participant:
+    """A context of ``rclpy`` with one node."""
+
+    context: Context
+    node: Node
+    executor: MultiThreadedExecutor
+    interfaces: dict[str, str] = field(default_factory=dict)
+    """By topic."""
+
+    def leave(self) -> None:
+        """Leave the graph."""
+        self.executor.shutdown(1.0)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+def _spin(executor: MultiThreadedExecutor) -> None:
+    try:
+        executor.spin()
+    except ExternalShutdownException:
+        return
+
+
+class RclpyNode:
+    """One node; an async context manager.
+
+    Args:
+        name: of the node, and its namespace, ``/`` or ``/truck1``.
+        domain: ``ROS_DOMAIN_ID``.
+    """
+
+    def __init__(self, name: tuple[str, str], domain: int) -> None:
+        self._name, self._namespace = name
+        self._domain = domain
+        self.malformed = 0
+        self.missing: set[str] = set()
+        """Interfaces that are not installed."""
+
+    async def __aenter__(self) -> Self:
+        """Join the graph.
+
+        Raises:
+            BusyError: it has a node of this name already.
+        """
+        self._loop = asyncio.get_running_loop()
+        self._participants = [await in_thread(self._join)]
+        own = self._name, self._namespace
+        await asyncio.sleep(1.0)  # in which the nodes that are there are discovered
+        if self._node.get_node_names_and_namespaces().count(own) > 1:
+            await self.__aexit__()
+            where = f"{self._namespace.rstrip('/')}/{self._name}"
+            raise BusyError(f"domain {self._domain} has a node {where} already: expected one face for a robot")
+        return self
+
+    @property
+    def _node(self) -> Any:
+        """The first participant's."""
+        return self._participants[0].node
+
+    def _join(self, number: int = 1) -> "Participant":
+        context = Context()
+        context.init(domain_id=self._domain)
+        node = Node(
+            self._name if number == 1 else f"{self._name}_{number}",
+            namespace=self._namespace,
+            context=context,
+            start_parameter_services=False,
+            enable_rosout=False,
+        )
+        executor = MultiThreadedExecutor(THREADS, context=context)
+        executor.add_node(node)
+        threading.Thread(target=_spin, args=(executor,), name="rclpy", daemon=True).start()
+        return Participant(context, node, executor)
+
+    async def __aexit__(self, *_: object) -> None:
+        """Leave the graph."""
+
+        def leave() -> None:
+            for participant in self._participants:
+                participant.leave()
+
+        await in_daemon_thread(leave)
+
+    def _node_for(self, topic: str, interface: str) -> Any:
+        """The node for a topic with an interface: a participant of DDS has one interface for a topic.
+
+        A second one, such as a stamped ``cmd_vel``, gets a participant and node of its own.
+        """
+        for participant in self._participants:
+            if participant.interfaces.setdefault(topic, interface) == interface:
+                return participant.node
+        self._participants.append(self._join(len(self._participants) + 1))
+        return self._node_for(topic, interface)
+
+    def qualified(self, name: str) -> str:
+        """Full name of a topic or service; see ``RosNode``."""
+        return str(self._node.resolve_topic_name(name))
+
+    def present(self, sender: RosSender) -> bool:
+        """Whether the graph still has this node."""
+        names = {f"{space.rstrip('/')}/{name}" for name, space in self._node.get_node_names_and_namespaces()}
+        return sender is CLIENTS or sender.node in names
+
+    def _interface(self, name: str) -> Any:
+        found = rclpy_interface(name)
+        if found is None:
+            self.missing.add(wire_name(name))
+        return found
+
+    def publisher(self, topic: str, interface: str, qos: RosQos) -> Publish:
+        """Offer a topic; see ``RosNode``."""
+        kind = None if "@" in interface else self._interface(interface)  # one edition is that of this distribution
+        if kind is None:
+            return lambda _: None
+        publisher = self._node_for(topic, interface).create_publisher(kind, topic, _profile(qos))
+        return lambda message: publisher.publish(encode(interface, message))
+
+    def subscribe(self, topic: str, interface: str, take: Take) -> None:
+        """Receive a topic; see ``RosNode``."""
+        kind = self._interface(interface)
+        if kind is None:
+            return
+
+        def receive(data: bytes, info: Mapping[str, Any]) -> None:
+            try:
+                message = decode(interface, data)
+            except InputError:
+                self.malformed += 1
+                return
+            sender, gid = self._publisher_of(topic)
+            number, stamp = info["publication_sequence_number"], info["source_timestamp"]
+            arrival = RosArrival(message, sender, gid, int(number or 0), int(stamp))
+            self._loop.call_soon_threadsafe(take, arrival)
+
+        # A queue of 1: of messages that wait only the newest counts.
+        profile = _profile(RosQos(depth=1, reliable=False))
+        self._node_for(topic, interface).create_subscription(kind, topic, receive, profile, raw=True)
+
+    def _publisher_of(self, topic: str) -> tuple[RosSender | None, bytes]:
+        """The publisher of a topic, if it is the only one."""
+        found = self._node.get_publishers_info_by_topic(self.qualified(topic))
+        if len(found) != 1:
+            return None, b""
+        gid = bytes(found[0].endpoint_gid)
+        node = f"{found[0].node_namespace.rstrip('/')}/{found[0].node_name}"
+        return RosSender(node, node), gid
+
+    def serve(self, service: str, interface: str, answer: Answer) -> None:
+        """Offer a service; see ``RosNode``."""
+        kind = self._interface(interface)
+        if kind is None:
+            return
+
+        def reply(request: Any, _: Any) -> Any:
+            message = decode(f"{interface}_Request", serialize_message(request))
+            work = partial(answer, message, CLIENTS)
+            values = asyncio.run_coroutine_threadsafe(_awaited(work), self._loop).result(ANSWER_TIMEOUT)
+            return deserialize_message(encode(f"{interface}_Response", values), kind.Response)
+
+        self._node.create_service(kind, service, reply, callback_group=ReentrantCallbackGroup())
+
+
+async def _awaited(work: Any) -> Any:
+    return await work()
