@@ -273,7 +273,9 @@ class DeviceKind(Plugin):
         return cast("Probe", load(self.probe))
 
 
-RESERVED: Final = frozenset({*map(str, ServiceName), "at_present", "controller", "present", "shafts", "steers"})
+RESERVED: Final = frozenset(
+    {*map(str, ServiceName), "at_present", "controller", "measures", "present", "shafts", "steers"}
+)
 """Names that no role of another distribution may have: of the services that are no device, and of what a section of the
 configuration has besides its roles (a test compares)."""
 

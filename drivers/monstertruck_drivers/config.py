@@ -21,6 +21,7 @@ from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.roles import SHAFTS
+from monstertruck_schemas.topics import Topic
 
 if TYPE_CHECKING:
     from monstertruck_drivers.ax12.config import Ax12Config
@@ -102,6 +103,11 @@ class _Devices(Schema):
             if isinstance(device.port, UsbPortConfig)
         }
         return self.model_copy(update=moved)
+
+    def measures(self, topic: Topic[Any]) -> bool:
+        """Whether a configured device publishes a sensor's topic."""
+        written = ((*DEVICES.roles[role].writes.values(), *d.kind.also.values()) for role, d in self.present().items())
+        return any(topic in topics for topics in written)
 
     def shafts(self) -> dict[str, Device[Any]]:
         """The controllers of the driven shafts, by shaft; one may be there for several."""

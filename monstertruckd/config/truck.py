@@ -35,6 +35,7 @@ from monstertruck_runtime.slowness import Board
 from monstertruck_schemas.base import Name, Schema
 from monstertruck_schemas.body import Metres, TruckBody
 from monstertruck_schemas.roles import SHAFTS, DeviceRole
+from monstertruck_schemas.topics import COMPASS
 from monstertruckd.bus.zenoh_config import PeerConfig, ZenohConfig
 from monstertruckd.config.device_safety import beyond_devices, packs, unattended_times, weakened_devices
 from monstertruckd.gate.catalog import AnyCheck
@@ -264,6 +265,8 @@ class TruckConfig(Schema):
         devices = beyond_devices(self.devices, self.monitors, self.gate.standstill, body)
         for excess in (*impossible_settings(self.gate, body, times), *devices):
             raise ValueError(excess)
+        if self.gate.attitude is None and self.devices.measures(COMPASS):
+            raise ValueError("gate.attitude null: a device measures the attitude; expected its limits, or no such line")
         self._check_planner()
         if self.behaviours.keys() - {MOVE} and (lack := self.missing_actuators()):
             raise ValueError(f"behaviours need {lack}")

@@ -210,7 +210,8 @@ class GateConfig(Schema):
     passes 0.2 m above or below an obstacle."""
     drive: SensorLimit = _limit(topics.DRIVE)
     steering: SensorLimit = _limit(topics.STEERING)
-    attitude: SensorLimit = _limit(topics.COMPASS)
+    attitude: SensorLimit | None = _limit(topics.COMPASS)
+    """Null for a robot without a compass or tilt sensor: no tilt limits, and no attitude is expected."""
     battery: SensorLimit = _limit(topics.BATTERY, critical=False)
     max_latency: Positive = 0.4
     """Greatest time between a sample's stamp and its arrival, s; a later sample is not valid."""
@@ -471,6 +472,8 @@ def weakened(config: GateConfig) -> tuple[str, ...]:
         for name, limit in required_sensors(config).items()
         if not limit.critical
     ]
+    if config.attitude is None:
+        texts.append("gate.attitude null: no slope stops the robot, and servos without supply are not noticed")
     if config.turning is None:
         texts.append("gate.turning null: servos without supply are not noticed")
     if config.blocked is None:

@@ -115,7 +115,8 @@ class ConsistencyCheck(Check):
             DeviceRole.ACTUATORS.value: config.drive,
             DeviceRole.BATTERY.value: config.battery,
         }
-        return sensor in limits and limits[sensor].critical
+        limit = limits.get(sensor)
+        return limit is not None and limit.critical
 
 
 def _reason(doubt: Doubt) -> Reason:

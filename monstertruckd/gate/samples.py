@@ -153,8 +153,9 @@ class Samples:
         self._refused[stale] = Measurement(name="latency", value=latency, unit="s", limit=limit)
         return False
 
-    def _fresh(self, message: Message | None, limit: SensorLimit, now: int, stale: Reason) -> bool:
-        if message is None or message.received <= self._lost.get(stale, -1):
+    def _fresh(self, message: Message | None, limit: SensorLimit | None, now: int, stale: Reason) -> bool:
+        """Whether a sample is fresh; never of a sensor that the robot does not have (no limit)."""
+        if limit is None or message is None or message.received <= self._lost.get(stale, -1):
             return False
         return now - message.received <= limit.stale_after * SECOND
 
@@ -226,15 +227,16 @@ class Samples:
         return drives if len(drives) == len(self.drives) else []
 
     def sensor_limits(self) -> dict[Reason, SensorLimit]:
-        """Limit of every sensor by the reason of its staleness, worst first."""
+        """Limit of every sensor of the robot by the reason of its staleness, worst first."""
         config = self._limits.config
-        return {
+        limits = {
             Reason.DRIVE_STALE: config.drive,
             Reason.STEERING_STALE: config.steering,
             Reason.SCAN_STALE: config.scan,
             Reason.ATTITUDE_STALE: config.attitude,
             Reason.BATTERY_STALE: config.battery,
         }
+        return {reason: limit for reason, limit in limits.items() if limit is not None}
 
     def fresh(self, now: int) -> dict[Reason, bool]:
         """Which sensors are fresh, by the reason of the stale ones."""

@@ -44,7 +44,7 @@ sim:
 
 
 BNO085 = "imu: { driver: { kind: bno085 } }"
-NO_ATTITUDE = "gate: { attitude: { stale_after: 0.25, critical: false } }"
+NO_ATTITUDE = "gate: { attitude: null }"
 
 
 def car(folder: Path, imu: str = "", gate: str = NO_ATTITUDE) -> SimulatedTruckConfig:
@@ -88,7 +88,7 @@ devices:
       kind: maestro_esc
       esc: {{ channel: 2, max_rate: 60.0, deceleration: 400.0, quick_deceleration: 500.0 }}
       unit: {{ dead_time: 0.012, lag: 0.0 }}
-gate: {{ attitude: {{ stale_after: 0.25, critical: false }} }}
+gate: {{ attitude: null }}
 sim:
   world:
     truck:

@@ -10,6 +10,7 @@ from pathlib import Path
 from monstertruck_estimation.consistency.config import SCAN_LIBRARIES
 from monstertruck_runtime.errors import TruckError
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import COMPASS, SCAN
 from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine, warn
 from monstertruckd.tools.install.apply import Change, install
 from monstertruckd.tools.install.plan import RULES, SERVICE, UNIT, USER, plan
@@ -91,6 +92,20 @@ def motion(context: HostContext) -> Iterator[Finding]:
     if scans is not None and missing:
         text = f"{', '.join(missing)} not installed: the motion by scans is not measured"
         yield warn("scan odometry", Reason.NOT_INSTALLED, text, _install_command(context))
+
+
+def sensors(context: HostContext) -> Iterator[Finding]:
+    """Sensors that the gate waits for although the configuration has none: the robot could never be armed."""
+    config = context.config
+    if config is None or config.missing_actuators() is not None:
+        return
+    gate, devices = config.gate, config.devices
+    if gate.attitude is not None and gate.attitude.critical and not devices.measures(COMPASS):
+        seen = "no device measures the attitude, so the robot cannot be armed; without a compass: gate.attitude: null"
+        yield fail("attitude", Reason.ATTITUDE_STALE, seen)
+    if gate.scan.critical and not devices.measures(SCAN):
+        seen = "no lidar, so the robot cannot be armed; to drive without one: gate.scan.critical: false"
+        yield fail("scan", Reason.SCAN_STALE, seen)
 
 
 def _missing(context: HostContext, requirements: list[str]) -> dict[str, list[str]]:

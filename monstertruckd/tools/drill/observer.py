@@ -30,7 +30,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_schemas.roles import SHAFTS, DeviceRole
 from monstertruck_sim.world.plant import TruthState
 from monstertruck_sim.world.world import World
-from monstertruckd.gate.config import GateConfig
+from monstertruckd.gate.config import GateConfig, SensorLimit
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 TRUTH_PERIOD: Final = SECOND // 100
@@ -862,12 +862,13 @@ def _indispensable(config: SimulatedTruckConfig, taps: Mapping[str, WireTap]) ->
     Without the deadman line nothing stops an EPOS that cannot be reached; steppers have a watchdog of their own.
     """
     gate = config.gate
-    limits = dict.fromkeys(map(str, MOTORS), gate.drive)
-    limits |= {
+    limits: dict[str, SensorLimit | None] = {
+        **dict.fromkeys(map(str, MOTORS), gate.drive),
         DeviceRole.STEERING.value: gate.steering,
         DeviceRole.LIDAR.value: gate.scan,
         DeviceRole.COMPASS.value: gate.attitude,
     }
     for role, tap in taps.items():
-        if limits[role].critical and (role not in SHAFTS or config.sim.deadman_wired):
-            yield role, tap, limits[role].stale_after
+        limit = limits[role]
+        if limit is not None and limit.critical and (role not in SHAFTS or config.sim.deadman_wired):
+            yield role, tap, limit.stale_after

@@ -193,6 +193,7 @@ def test_a_limit_above_the_speed_is_none_and_named(name):
 def test_sensors_checks_and_services_that_are_switched_off_are_named():
     config = GateConfig(
         scan={"stale_after": 0.25, "critical": False},
+        attitude=None,
         turning=None,
         blocked=None,
         runaway=None,
@@ -202,6 +203,7 @@ def test_sensors_checks_and_services_that_are_switched_off_are_named():
     )
     assert weakened(config) == (
         "gate.scan.critical false: a silent sensor does not stop the robot",
+        "gate.attitude null: no slope stops the robot, and servos without supply are not noticed",
         "gate.turning null: servos without supply are not noticed",
         "gate.blocked null: a blocked shaft is not noticed",
         "gate.runaway null: a motor that does not obey is not noticed",
@@ -223,6 +225,11 @@ def truck(**gate):
 def test_a_truck_so_configured_is_refused(gate):
     with pytest.raises(ValueError, match="gate"):
         truck(**gate)
+
+
+def test_an_attitude_that_is_measured_keeps_its_limits():
+    with pytest.raises(ValueError, match=r"gate\.attitude null: a device measures the attitude"):
+        truck(attitude=None)
 
 
 def test_a_truck_knows_its_limits_and_what_weakens_it():

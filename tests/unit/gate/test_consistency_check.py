@@ -64,6 +64,13 @@ def test_a_sensor_in_doubt_stops_the_robot_where_its_silence_would(sensor, key):
     assert tolerant.reasons() == ()
 
 
+def test_a_robot_without_a_compass_does_not_stop_for_one():
+    rig = Rig(attitude=None)
+    rig.arm(NOW - SECOND)
+    rig.say(doubt("compass"))
+    assert rig.reasons() == ()
+
+
 def test_sensors_that_the_gate_does_not_use_stop_nothing():
     rig = Rig()
     rig.arm(NOW - SECOND)

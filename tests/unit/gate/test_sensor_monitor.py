@@ -294,6 +294,16 @@ def test_a_body_without_servos_misses_no_steering():
     assert Reason.STEERING_STALE in monitor().assess(NOW).blocks
 
 
+def test_a_robot_without_a_compass_expects_no_attitude_and_has_no_tilt():
+    sensors = complete(monitor(attitude=None))
+    show(sensors, attitude(NOW, roll=0.5))
+    found = sensors.assess(NOW + 3600 * SECOND)
+    assert Reason.ATTITUDE_STALE not in found.blocks
+    assert Reason.TILT_STOP not in sensors.assess(NOW).blocks
+    assert not sensors.samples.tips(NOW)
+    assert "tilt" not in sensors.assess(NOW).values
+
+
 def test_a_stale_attitude_has_no_tilt():
     sensors = monitor(attitude={"stale_after": 0.25, "critical": False})
     show(sensors, attitude(NOW, roll=0.5))

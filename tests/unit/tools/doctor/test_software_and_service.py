@@ -5,7 +5,7 @@ from pathlib import Path
 
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.doctor.context import Account, HostContext, Level, account_of, inspect
-from monstertruckd.tools.doctor.software import configuration, motion, packages, python, rights, rules, service
+from monstertruckd.tools.doctor.software import configuration, motion, packages, python, rights, rules, sensors, service
 from monstertruckd.tools.install.plan import RULES, UNIT
 from tests.unit.tools.doctor.kit import EmulatedHost, bad, see
 from tests.unit.tools.install.kit import PROGRAM, ROOT, TRUCK
@@ -184,3 +184,22 @@ def test_measures_of_the_motion_and_what_is_missing(tmp_path: Path):
         assert missing.seen == f"{name} not installed: the motion by scans is not measured"
     alone = see(tmp_path / "c", motion, lambda emulated: emulated.change(consistency=None))["motion"]
     assert (alone.level, alone.reason) == (Level.WARN, Reason.UNWITNESSED)
+
+
+def test_a_gate_that_waits_for_a_sensor_that_the_robot_does_not_have(tmp_path: Path):
+    def lacking(folder: str, gate: dict[str, object]) -> dict[str, Reason | None]:
+        def change(emulated: EmulatedHost) -> None:
+            assert emulated.context.config is not None
+            devices = emulated.context.config.devices.model_dump() | {"lidar": None, "compass": None}
+            emulated.change(devices=devices, gate=gate, slam=None, explorer=None, planner=None, tracker=None)
+
+        return {name: finding.reason for name, finding in see(tmp_path / folder, sensors, change).items()}
+
+    assert see(tmp_path / "a", sensors, without()) == {}
+    assert lacking("b", {"speed": 0.1, "reverse_speed": 0.1}) == {
+        "attitude": Reason.ATTITUDE_STALE,
+        "scan": Reason.SCAN_STALE,
+    }
+    unseeing = {"speed": 0.1, "reverse_speed": 0.1, "scan": {"stale_after": 0.25, "critical": False}}
+    assert lacking("c", unseeing) == {"attitude": Reason.ATTITUDE_STALE}
+    assert lacking("d", unseeing | {"attitude": None}) == {}
