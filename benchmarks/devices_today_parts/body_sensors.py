@@ -49,8 +49,10 @@ class SensorBench(Bench):
         return bool(self.out.kept) and self.clock.now() - self.out.kept[-1].received < 0.2 * SECOND
 
 
-def trouble(make: Callable[[VirtualClock], SensorBench], healthy: str, *stalls: tuple[str, str]) -> str:
-    """Passed of all trouble."""
+def trouble(
+    make: Callable[[VirtualClock], SensorBench], healthy: str, *stalls: tuple[str, str], mute: str = "silent on"
+) -> str:
+    """Passed of all trouble; ``mute`` is the fault that makes the emulator say nothing."""
 
     async def all_of_it(bench: SensorBench) -> dict[str, bool]:
         async with running(bench.serve()):
@@ -58,7 +60,7 @@ def trouble(make: Callable[[VirtualClock], SensorBench], healthy: str, *stalls: 
             return await survived(bench, getattr(bench, healthy), *stalls)
 
     async def refused(bench: SensorBench) -> bool:
-        bench.emulator.inject("silent", "on")
+        bench.emulator.inject(*mute.split())
         return await stranger_refused(bench)
 
     found = on_bench(make, all_of_it)

@@ -1,4 +1,4 @@
-"""Rows of the lidars that turn clockwise, in the middle of a square room, on a robot that turns by 1 rad/s either way.
+"""Rows of the lidars, in the middle of a square room, on a robot that turns by 1 rad/s either way.
 
 `step`: by how many steps of the scan the worst beam is out of place. `deskew_mm`: distance from a wall 3 m away of 19
 in 20 ends of beams that meet it head-on, each beam placed by its own time, worst scan of either sense of turning.
@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 from benchmarks.devices_today_parts.body_sensors import SensorBench, trouble
 from benchmarks.devices_today_parts.kit import Newest, on_bench, running
 from monstertruck_drivers.emulation import RangeSheet
+from monstertruck_drivers.hokuyo_urg.config import HokuyoLxConfig
+from monstertruck_drivers.hokuyo_urg.driver import HokuyoDriver
+from monstertruck_drivers.hokuyo_urg.lx_emulator import LxEmulator
+from monstertruck_drivers.hokuyo_urg.models import LX
 from monstertruck_drivers.ld19.config import Ld19Config
 from monstertruck_drivers.ld19.driver import Ld19Driver
 from monstertruck_drivers.ld19.emulator import Ld19Emulator
@@ -87,7 +91,16 @@ def clock_error(scan: LaserScan, rate: float) -> float:
     return abs(float(TURNS[int(np.argmin(misfit))])) * 1000
 
 
-def measured(make: Callable[[VirtualClock, float], SensorBench], foreign: str) -> dict[str, Any]:
+TURNING_HEAD = (("silent on", "silent off"), ("blocked on", "blocked off"))
+"""How the emulator of a turning head is stalled, and goes on."""
+
+
+def measured(
+    make: Callable[[VirtualClock, float], SensorBench],
+    foreign: str,
+    stalls: tuple[tuple[str, str], ...] = TURNING_HEAD,
+    mute: str = "silent on",
+) -> dict[str, Any]:
     """The row of a lidar; ``make`` takes the clock and the robot's turn rate."""
     found: dict[str, list[float]] = {"step": [], "deskew_mm": [], "clock_ms": []}
     for rate in (1.0, -1.0):
@@ -102,8 +115,8 @@ def measured(make: Callable[[VirtualClock, float], SensorBench], foreign: str) -
             found["deskew_mm"].append(deskew_error(scan, rate))
             found["clock_ms"].append(clock_error(scan, rate))
     row: dict[str, Any] = {name: round(max(values), 1) for name, values in found.items()}
-    stalls = ("silent on", "silent off"), ("blocked on", "blocked off")
-    return row | {"trouble": trouble(lambda clock: make(clock, 0.0), "healthy", *stalls), "foreign": foreign}
+    passed = trouble(lambda clock: make(clock, 0.0), "healthy", *stalls, mute=mute)
+    return row | {"trouble": passed, "foreign": foreign}
 
 
 def ld19(model: Any) -> dict[str, Any]:
@@ -130,7 +143,22 @@ def rplidar(model: Any, mode: str) -> dict[str, Any]:
     return measured(make, "tests/unit/drivers/rplidar/test_third_party.py")
 
 
+def hokuyo(model: Any) -> dict[str, Any]:
+    """A UST or UTM."""
+
+    def make(clock: VirtualClock, rate: float) -> SensorBench:
+        def driver(port: Any, events: Any, out: Newest[LaserScan]) -> HokuyoDriver:
+            return HokuyoDriver(HokuyoLxConfig(model=model), port, clock, out, events)
+
+        return SensorBench(clock, LxEmulator(clock, Turning(rate), LX[model]), driver)
+
+    stalls = ("deaf on", "deaf off"), ("unstable 60", "unstable 0")
+    return measured(make, "tests/unit/drivers/hokuyo_urg/test_lx.py", stalls, mute="deaf on")
+
+
 ROWS: dict[str, Callable[[], dict[str, Any]]] = {
+    "ust_10lx": lambda: hokuyo("ust_10lx"),
+    "utm_30lx": lambda: hokuyo("utm_30lx"),
     "ld19": lambda: ld19("ld19"),
     "stl19p": lambda: ld19("stl19p"),
     "rplidar_a1": lambda: rplidar("a1", "Express"),

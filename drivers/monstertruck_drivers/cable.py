@@ -3,8 +3,11 @@
 import asyncio
 import contextlib
 import contextvars
+import errno
 import fcntl
 import os
+import socket
+import struct
 import tty
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -337,3 +340,117 @@ class PtyPort:
         # What a pty of about 10 kB has no room for is lost, as are bytes of a USB device that are not fetched in time.
         with contextlib.suppress(BlockingIOError):
             os.write(self._fds[0], frame)
+
+
+class SocketPort:
+    """A device on the network, emulated at an address of this computer; it serves one client at a time.
+
+    Unplugged it is silent, as behind a cable that is pulled. Plugged in again it comes up as after a loss of its supply
+    and resets the connection from before.
+
+    Args:
+        address: of 127.0.0.0/8.
+        number: TCP port; 0 = any free one.
+
+    Raises:
+        BusyError: another program has the port.
+        OSError: this computer has no such address.
+    """
+
+    def __init__(self, address: str, number: int) -> None:
+        try:
+            self._listener = socket.create_server((address, number), backlog=1)
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                raise BusyError(f"{address}:{number}: another program serves this port") from None
+            raise
+        self._listener.setblocking(False)
+        self.address: tuple[str, int] = self._listener.getsockname()
+        self.name = f"{address}:{self.address[1]}"
+        self.device = DeviceEnd(self.name)
+        self._client: socket.socket | None = None
+        self._plugged = False
+
+    def plug(self) -> None:
+        """Connect the cable. Needs a running loop."""
+        if self._plugged:
+            return
+        self._plugged = True
+        self._drop()
+        while (gone := self._next_client()) is not None:  # the kernel connected them meanwhile
+            _reset(gone)
+        asyncio.get_running_loop().add_reader(self._listener, self._accept)
+        if self.device.on_plug is not None:
+            self.device.on_plug(True)
+
+    def unplug(self) -> None:
+        """Pull the cable: the host hears nothing any more."""
+        if not self._plugged:
+            return
+        self._plugged = False
+        self.device.connect(None)
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._listener)
+        if self._client is not None:
+            loop.remove_reader(self._client)
+        if self.device.on_plug is not None:
+            self.device.on_plug(False)
+
+    def close(self) -> None:
+        """Give the address up."""
+        self.unplug()
+        self._drop()
+        self._listener.close()
+
+    def _accept(self) -> None:
+        if self._client is not None:
+            self._readable()  # its end may have come before the newcomer
+        client = self._next_client()
+        if client is None:
+            return
+        if self._client is not None:
+            _reset(client)
+            return
+        client.setblocking(False)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._client = client
+        asyncio.get_running_loop().add_reader(client, self._readable)
+        self.device.connect(self._send)
+
+    def _next_client(self) -> socket.socket | None:
+        """A client that waits; None if none does."""
+        try:
+            return self._listener.accept()[0]
+        except BlockingIOError:
+            return None
+
+    def _readable(self) -> None:
+        assert self._client is not None
+        try:
+            data = self._client.recv(4096)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if data:
+            self.device.take(data)
+        else:
+            self._drop()
+
+    def _send(self, data: bytes) -> None:
+        assert self._client is not None
+        # Bytes that do not fit into the socket are dropped.
+        with contextlib.suppress(OSError):
+            self._client.send(data)
+
+    def _drop(self) -> None:
+        client, self._client = self._client, None
+        if client is not None:
+            self.device.connect(None)
+            asyncio.get_running_loop().remove_reader(client)
+            _reset(client)
+
+
+def _reset(client: socket.socket) -> None:
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    client.close()

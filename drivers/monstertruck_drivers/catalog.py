@@ -345,6 +345,15 @@ DEVICES: Final = DeviceCatalog(
         usb=UsbIdentity("15d1:0000", "URG-Series USB Driver", "ttyACM"),
     ),
     DeviceKind(
+        name="hokuyo_lx",
+        doc="Hokuyo UST-10LX, UST-20LX or UTM-30LX-EW laser scanner (SCIP 2.2 over TCP)",
+        roles=(LIDAR,),
+        settings="monstertruck_drivers.hokuyo_urg.config:HokuyoLxConfig",
+        implementation="monstertruck_drivers.hokuyo_urg.driver:HokuyoDriver",
+        emulator="monstertruck_drivers.hokuyo_urg.lx_emulator:emulated",
+        probe="monstertruck_drivers.hokuyo_urg.probe:probe_lx",
+    ),
+    DeviceKind(
         name="ld19",
         doc="LDROBOT LD06, LD19 or STL-19P laser scanner",
         roles=(LIDAR,),

@@ -5,18 +5,18 @@ Both have a key for every role of the catalog, and take the settings of every ki
 
 from collections.abc import Iterator
 from functools import reduce
+from ipaddress import IPv4Address
 from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, Self, TypeVar
 
-from pydantic import Discriminator, Field, Tag, create_model, model_validator
+from pydantic import Discriminator, Field, Tag, create_model, field_validator, model_validator
 
 from monstertruck_drivers.catalog import DEVICES, DeviceKind, Duty, RoleSpec
 from monstertruck_drivers.computer import Sysfs
 from monstertruck_drivers.link import BAUD, Framing
 from monstertruck_drivers.shafts import SteeringOutputs, steering_outputs
 from monstertruck_drivers.usb.config import Baud, UsbPortConfig
-from monstertruck_drivers.usb.tree import place
 from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import Mount
@@ -51,15 +51,50 @@ class PortConfig(Schema):
     framing: Framing | None = None
     """Bits of a byte; null = the device's own"""
 
+    @property
+    def label(self) -> str:
+        """Path of the node."""
+        return str(self.path)
+
+
+class TcpPortConfig(Schema):
+    """Where a device listens on the network."""
+
+    address: str
+    """IPv4 address; an emulated device has one of 127.0.0.0/8"""
+    tcp: Annotated[int, Field(ge=1, le=65535)]
+    """TCP port"""
+
+    @field_validator("address")
+    @classmethod
+    def _numeric(cls, address: str) -> str:
+        return str(IPv4Address(address))
+
+    @property
+    def is_local(self) -> bool:
+        """Whether the address is one of this computer's own, as an emulated device has."""
+        return IPv4Address(self.address).is_loopback
+
+    @property
+    def label(self) -> str:
+        """Address and port."""
+        return f"{self.address}:{self.tcp}"
+
+
+_WAYS: Final = {"hub": "port by hub", "address": "port by address"}
+
 
 def _way(port: Any) -> str:
-    """Which of the two ways to name a port ``port`` is; not a key of either, so that complaints find their line."""
-    by_hub = isinstance(port, UsbPortConfig) or (isinstance(port, dict) and "hub" in port)
-    return "port by hub" if by_hub else "port by path"
+    """Which of the ways to name a port ``port`` is; not a key of any, so that complaints find their line."""
+    keys = port if isinstance(port, dict) else vars(port) if isinstance(port, Schema) else {}
+    return next((way for key, way in _WAYS.items() if key in keys), "port by path")
 
 
 AnyPort = Annotated[
-    Annotated[PortConfig, Tag("port by path")] | Annotated[UsbPortConfig, Tag("port by hub")], Discriminator(_way)
+    Annotated[PortConfig, Tag("port by path")]
+    | Annotated[UsbPortConfig, Tag("port by hub")]
+    | Annotated[TcpPortConfig, Tag("port by address")],
+    Discriminator(_way),
 ]
 
 
@@ -79,7 +114,8 @@ class Device(Schema, Generic[C]):
     @model_validator(mode="after")
     def _own_baud(self) -> Self:
         own = {"baud": getattr(self.driver, "own_baud", self.kind.baud) or BAUD, "framing": self.kind.framing}
-        missing = {name: value for name, value in own.items() if value and getattr(self.port, name) is None}
+        unset = {name for name, value in self.port if value is None}  # a network socket has neither
+        missing = {name: value for name, value in own.items() if value and name in unset}
         return self.model_copy(update={"port": self.port.model_copy(update=missing)}) if missing else self
 
 
@@ -138,10 +174,25 @@ class _Devices(Schema):
         taken: dict[str, str] = {}
         for role, device in self.present().items():
             port = device.port
-            where = place(port.device) if isinstance(port, UsbPortConfig) else str(port.path)
+            where = port.label
             if other := taken.get(where):
                 raise ValueError(f"{other} and {role} share the port {where}; every device needs its own")
             taken[where] = role
+        return self
+
+    @model_validator(mode="after")
+    def _sensors_alone_on_the_network(self) -> Self:
+        for role, device in self.present().items():
+            if not isinstance(device.port, TcpPortConfig):
+                continue
+            if DEVICES.roles[role].duty is Duty.ACTUATOR:
+                raise ValueError(
+                    f"{role}: the stop script cannot stop it over the network; expected a path, or hub and port"
+                )
+            if device.kind.opens != "serial":
+                raise ValueError(
+                    f"{role}: a {device.kind.name} has no network address; expected a path, or hub and port"
+                )
         return self
 
     @model_validator(mode="after")

@@ -6,8 +6,9 @@ from typing import Any
 
 from monstertruck_drivers.catalog import DEVICES, Duty, RoleSpec
 from monstertruck_drivers.computer import Computer, Machine
-from monstertruck_drivers.config import AnyPort, Device, kind_of
+from monstertruck_drivers.config import AnyPort, Device, TcpPortConfig, kind_of
 from monstertruck_drivers.link import BAUD, Port
+from monstertruck_drivers.tcp import TcpPort
 from monstertruck_drivers.tty import SerialPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.hub import HubCoordinator, UsbService
@@ -68,6 +69,8 @@ class Cabling:
             return self._given[role]
         if isinstance(port, UsbPortConfig):
             return HubPort(port, self._machine, self._events, self._hubs, self._power, role)
+        if isinstance(port, TcpPortConfig):
+            return TcpPort(port.address, port.tcp)
         return SerialPort(port.path, port.baud or BAUD, dtr=port.dtr, rts=port.rts, framing=port.framing or "8N1")
 
     def camera(self, role: str) -> FrameSource:
@@ -77,7 +80,7 @@ class Cabling:
             return RenderedSource(self._given[role], self._machine.clock)
         if isinstance(port, UsbPortConfig):
             return HubCamera(HubNode(port, self._machine, self._hubs, role, "video4linux"), self._machine)
-        return PathSource(str(port.path), self._machine.clock)
+        return PathSource(port.label, self._machine.clock)
 
     async def cut(self) -> None:
         """Switch off the ports of ``usb.power.cut`` at the same time: one that hangs or refuses holds up no other."""

@@ -11,7 +11,7 @@ from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
 from monstertruck_drivers.battery.config import PackConfig
 from monstertruck_drivers.config import Devices, Monitors
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
+from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig, HokuyoLxConfig
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
 from monstertruck_drivers.os4000.config import Os4000Config
@@ -42,6 +42,7 @@ WEAKER_ABOVE: Final[dict[type[Schema], tuple[str, ...]]] = {
     ),
     MaestroConfig: ("answer_timeout", "command_timeout"),
     HokuyoConfig: ("skip",),
+    HokuyoLxConfig: ("skip",),
     Os4000Config: ("delay", "field_tolerance", "gravity_tolerance"),
     PackConfig: (
         "max_compensation",
@@ -69,6 +70,7 @@ WEAKER_BELOW: Final[dict[type[Schema], tuple[str, ...]]] = {
     VescConfig: ("deceleration_rpm_s", "quick_stop_deceleration_rpm_s", "brake_current", "rate", "battery_rate"),
     MaestroConfig: ("poll_rate", "battery_rate"),
     HokuyoConfig: (),
+    HokuyoLxConfig: (),
     Os4000Config: (),
     PackConfig: ("low", "clear", "clear_after", "critical", "collapsed"),
 }

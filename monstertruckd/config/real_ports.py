@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from monstertruck_drivers.config import AnyPort, TcpPortConfig
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruckd.config.truck import TruckConfig
 
@@ -17,16 +18,12 @@ PSEUDO: Final = (Path("/dev/pts"), Path("/dev/shm"))  # noqa: S108 - nothing is 
 
 
 def real_ports(config: TruckConfig) -> tuple[str, ...]:
-    """Roles of the devices whose port belongs to this computer: by hub on its own USB tree, or by a node below /dev.
+    """Roles of the devices that are real: by hub on its own USB tree, by a node below /dev, or at another address.
 
     Links are followed. A port that does not exist yet is judged by its name.
     """
     own_tree = _resolved(config.machine) == Path("/")
-    return tuple(
-        role
-        for role, device in config.devices.present().items()
-        if (own_tree if isinstance(device.port, UsbPortConfig) else _is_device(device.port.path))
-    )
+    return tuple(role for role, device in config.devices.present().items() if _is_real(device.port, own_tree=own_tree))
 
 
 def mixed(config: TruckConfig) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], str]]:
@@ -47,6 +44,16 @@ def mixed(config: TruckConfig) -> Iterator[tuple[tuple[str, ...], tuple[str, ...
         )
     if config.stand == "simulator":
         yield ("stand",), port, "expected none or overhead of a real robot"
+
+
+def _is_real(port: AnyPort, *, own_tree: bool) -> bool:
+    match port:
+        case UsbPortConfig():
+            return own_tree
+        case TcpPortConfig():
+            return not port.is_local
+        case _:
+            return _is_device(port.path)
 
 
 def _is_device(path: Path) -> bool:

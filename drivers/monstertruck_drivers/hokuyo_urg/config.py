@@ -1,20 +1,23 @@
-"""Configuration of the URG-04LX driver; the port is named elsewhere."""
+"""Settings of Hokuyo scanners."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from monstertruck_drivers.scanning.config import ReturnsConfig
 from monstertruck_schemas.base import FrameId, Schema
 
 
-class HokuyoConfig(Schema):
-    """How the scanner is driven; its geometry is always read from the sensor itself."""
+class ScipConfig(Schema):
+    """How a scanner that speaks SCIP is driven; its geometry is always read from the sensor itself."""
 
-    kind: Literal["hokuyo_urg"] = "hokuyo_urg"
+    SERIES: ClassVar[tuple[str, ...]]
+    """One of these is in the name of the product or of the model."""
+
     frame: FrameId = "lidar"
     """Frame of the published scans."""
     serial_number: str | None = None
-    """Unit expected on this port (``SERI`` of VV); None accepts any URG."""
+    """Unit expected on this port (``SERI`` of VV); None accepts any."""
     scan_format: Literal["MD", "MS"] = "MD"
     """MD: three characters a range; MS: two, at most 4095 mm, two thirds of the bytes."""
     cluster: Annotated[int, Field(ge=1, le=99)] = 1
@@ -33,3 +36,25 @@ class HokuyoConfig(Schema):
     """Seconds the sensor may take to verify a suspected fault of its own (statuses 21-49)."""
     clock_samples: Annotated[int, Field(ge=1, le=100)] = 12
     """Exchanges of the start-up clock comparison; the quickest one counts."""
+
+
+class HokuyoConfig(ScipConfig):
+    """URG-04LX."""
+
+    SERIES = ("URG",)
+
+    kind: Literal["hokuyo_urg"] = "hokuyo_urg"
+
+
+class HokuyoLxConfig(ScipConfig, ReturnsConfig):
+    """UST-10LX, UST-20LX or UTM-30LX."""
+
+    SERIES = ("UST", "UTM")
+
+    kind: Literal["hokuyo_lx"] = "hokuyo_lx"
+    model: Literal["ust_10lx", "ust_20lx", "utm_30lx"] = "ust_10lx"
+    """Which one is emulated; the driver reads the geometry from the sensor"""
+    stale_periods: Annotated[float, Field(gt=1)] = 20.0
+    """Scan intervals (25 ms) without a good scan before the session restarts."""
+    first_scan_periods: Annotated[float, Field(gt=1)] = 60.0
+    """Scan intervals allowed for the first scan after starting."""

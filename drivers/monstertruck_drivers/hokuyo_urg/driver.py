@@ -9,7 +9,10 @@ from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
 
-from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_drivers.hokuyo_urg.config import HokuyoLxConfig, ScipConfig
 from monstertruck_drivers.hokuyo_urg.protocol import (
     SCIP1_PARAMETERS,
     InternalState,
@@ -29,6 +32,7 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
     request,
     scan_command,
     scip1_scan_command,
+    split_lx_ranges,
     split_ranges,
 )
 from monstertruck_drivers.link import Link, Port
@@ -86,7 +90,7 @@ class Sensor:
 class ScipSession:
     """Asks one thing at a time over an open link."""
 
-    def __init__(self, link: Link, clock: Clock, config: HokuyoConfig) -> None:
+    def __init__(self, link: Link, clock: Clock, config: ScipConfig) -> None:
         self.parser = ScipParser()
         self.arrival = 0
         """When the newest bytes came, ns."""
@@ -282,8 +286,9 @@ class ScipSession:
 
     def _check(self, sensor: Sensor) -> None:
         names = f"{sensor.identity.product} {sensor.parameters.model if sensor.state else ''}".strip()
-        if "URG" not in names:
-            raise WrongDeviceError(f"{self._link.name}: expected a URG scanner, found {names!r}")
+        series = self._config.SERIES
+        if not any(name in names for name in series):
+            raise WrongDeviceError(f"{self._link.name}: expected a {' or '.join(series)} scanner, found {names!r}")
         if sensor.state is not None and not sensor.identity.protocol.startswith("SCIP 2"):
             raise ProtocolError(f"{self._link.name}: expected SCIP 2, the sensor states {sensor.identity.protocol!r}")
         wanted, found = self._config.serial_number, sensor.identity.serial
@@ -292,7 +297,7 @@ class ScipSession:
 
 
 class HokuyoDriver:
-    """URG-04LX on a port.
+    """Scanner that speaks SCIP on a port: tty or network socket.
 
     Args:
         config: how it is driven.
@@ -305,7 +310,7 @@ class HokuyoDriver:
 
     def __init__(
         self,
-        config: HokuyoConfig,
+        config: ScipConfig,
         port: Port,
         clock: Clock,
         out: Publisher[LaserScan],
@@ -377,7 +382,7 @@ class HokuyoDriver:
                     assert block.counter is not None  # SCIP 2.0
                     step_0 = self._watch.stamp(mapping, block.counter, session.arrival, self._port.name)
                     self._publish(block, step_0, geometry, session.arrival)
-                elif outcome is StatusMeaning.DATA:
+                elif outcome in (StatusMeaning.DATA, StatusMeaning.UNSTABLE):
                     bad += 1
                 else:
                     due = self._deadline(await self._other_status(session, reply.status, outcome, interval))
@@ -449,7 +454,7 @@ class HokuyoDriver:
         # A cluster's range is the least of its steps: it stands for their middle.
         first = geometry.first_step + (config.cluster - 1) / 2
         last = first + (len(block.values) - 1) * config.cluster
-        ranges, codes = split_ranges(block.values, geometry.least_mm)
+        ranges, codes = split(block.values, geometry, config)
         longest = geometry.greatest_mm / 1000
         self._out.put(
             LaserScan(
@@ -484,6 +489,16 @@ class HokuyoDriver:
         self, severity: Severity, text: str, *, reason: Reason = Reason.DEVICE_FAULT, **values: str | int
     ) -> None:
         self._events(reason, severity, self.name, text, **values)
+
+
+def split(
+    values: NDArray[np.int32], geometry: Parameters, config: ScipConfig
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Ranges and codes of the values of a scan, as the scanner's series reports errors."""
+    if isinstance(config, HokuyoLxConfig):
+        free = config.no_return == "free"
+        return split_lx_ranges(values, geometry.least_mm, geometry.greatest_mm, free=free)
+    return split_ranges(values, geometry.least_mm)
 
 
 def _sweep(geometry: Parameters) -> float:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, RangeSource
+from monstertruck_drivers.hokuyo_urg.models import URG_04LX, ScannerModel
 from monstertruck_drivers.hokuyo_urg.protocol import (
     COUNTER_MASK,
     RANGE_WIDTH,
@@ -34,9 +35,6 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
-
-LAST_STEP: Final = 768
-LEAST_MM: Final = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +59,8 @@ class ScanOrder:
         return f"{self.prefix}{self.left or 0:02d}" + (f";{self.tag}" if self.tag else "")
 
 
-def parse_order(text: str, tag: str = "") -> ScanOrder | str:
-    """Parse MD, MS, GD or GS; a refusal is its two-character status."""
+def parse_order(text: str, tag: str = "", greatest: int = URG_04LX.greatest_step) -> ScanOrder | str:
+    """Parse a request for scans (MD, GS ...) of steps up to ``greatest``; a refusal is its two-character status."""
     command, digits = text[:2], text[2:]
     multi = command[0] == "M"
     wanted = 13 if multi else 10
@@ -73,7 +71,7 @@ def parse_order(text: str, tag: str = "") -> ScanOrder | str:
         if not part.isdigit():
             return status
     start, end, cluster, skip, count = (int(part) for part in parts)
-    if end > LAST_STEP:
+    if end > greatest:
         return "04"
     if end < start:
         return "05"
@@ -86,7 +84,7 @@ def parse_scip1_order(text: str) -> ScanOrder | None:
     if text[:1] != "G" or len(digits) != 8 or not digits.isdigit():
         return None
     start, end, cluster = int(digits[:3]), int(digits[3:6]), int(digits[6:])
-    return ScanOrder("G", start, end, max(cluster, 1)) if start <= end <= LAST_STEP else None
+    return ScanOrder("G", start, end, max(cluster, 1)) if start <= end <= URG_04LX.greatest_step else None
 
 
 def scan_lines(order: ScanOrder, counter: int, revolution: NDArray[np.int32]) -> list[bytes]:
@@ -95,14 +93,21 @@ def scan_lines(order: ScanOrder, counter: int, revolution: NDArray[np.int32]) ->
     Args:
         order: what was requested.
         counter: milliseconds at step 0, 24 bits.
-        revolution: shape (769,), mm or error codes.
+        revolution: of all steps, mm or error codes.
     """
     values = _clustered(revolution[order.start : order.end + 1], order.cluster)
+    if order.command.endswith("E"):
+        values = np.column_stack((values, _strength(values))).reshape(-1)
     width = RANGE_WIDTH[order.command]
     payload = encode_array(np.minimum(values, (1 << 6 * width) - 1), width)
     if order.command == "G":
         return wrap_lines(payload, sums=False)
     return [counter_line(counter), *wrap_lines(payload)]
+
+
+def _strength(values: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Intensities of the returns of ranges, mm: of a near white surface, falling with the distance."""
+    return np.rint(BRIGHT / (1.0 + (np.maximum(values, 0) / FADING) ** 2)).astype(np.int32)
 
 
 def counter_line(counter: int) -> bytes:
@@ -117,15 +122,14 @@ def _clustered(values: NDArray[np.int32], cluster: int) -> NDArray[np.int32]:
         return values
     groups = np.pad(values, (0, -len(values) % cluster)).reshape(-1, cluster)
     huge = np.iinfo(np.int32).max
-    least = np.where(groups >= LEAST_MM, groups, huge).min(axis=1)
+    least = np.where(groups >= URG_04LX.least_mm, groups, huge).min(axis=1)
     return np.where(least < huge, least, groups[:, 0]).astype(np.int32)
 
 
-STEPS: Final = 1024
-PERIOD: Final = SECOND // 10
-"""Nanoseconds of one revolution, of the sensor's clock."""
-FRONT_STEP: Final = 384
-GREATEST_MM: Final = 5600
+BRIGHT: Final = 4000
+"""Intensity of a near white surface; it falls with the distance."""
+FADING: Final = 6000
+"""Distance that halves the intensity, mm."""
 PROCESSING: Final = 1_500_000
 """Nanoseconds from the last step to the first byte."""
 DEFAULT_BAUD: Final = 19200
@@ -145,11 +149,11 @@ RANGE: Final = "range"
 """All distances of a scan, mm."""
 COUNTER: Final = "counter"
 """Time stamp of a scan, ms."""
-MIRROR: Final = 18
-"""Error code of a strongly reflecting object."""
 SPECULAR: Final = 0.2
 """Share of a mirror, in its middle, from which the light comes straight back."""
 
+Handler = Callable[[str, str], tuple[str, list[bytes]]]
+"""Answers a request and its note by a status and lines."""
 Cover = Callable[[NDArray[np.int32]], NDArray[np.int32]]
 """What becomes of the values (n,) of the steps behind something."""
 
@@ -161,6 +165,7 @@ class HokuyoEmulator:
         clock: the world's time.
         source: what it sees; asked at the end of each revolution that is sent.
         seed: of the USB jitter.
+        model: which one it is.
         state: what the host finds: freshly powered (SCIP 1.1), configured to start in SCIP 2.0, left streaming or
             in time-adjust mode by a dead host.
         serial: ``SERI`` of VV.
@@ -168,8 +173,8 @@ class HokuyoEmulator:
         timer_start: counter at construction, ms.
         drift_ppm: how much faster than the world the sensor's clock runs.
         jitter: greatest delay of a scan by USB batching, s.
-        min_step: first step that measures (``AMIN``).
-        max_step: last step that measures (``AMAX``).
+        min_step: first step that measures (``AMIN``); by default the model's.
+        max_step: last step that measures (``AMAX``); by default the model's.
     """
 
     def __init__(
@@ -178,14 +183,15 @@ class HokuyoEmulator:
         source: RangeSource,
         *,
         seed: int = 0,
+        model: ScannerModel = URG_04LX,
         state: StartState = "scip1",
         serial: str = "H0706400",
         firmware: str = "3.1.04(02/Aug./2007)",
         timer_start: int = 0,
         drift_ppm: float = 0.0,
         jitter: float = 0.0,
-        min_step: int = 44,
-        max_step: int = 725,
+        min_step: int | None = None,
+        max_step: int | None = None,
     ) -> None:
         self.name = "lidar"
         self.received: deque[str] = deque(maxlen=1000)
@@ -195,12 +201,16 @@ class HokuyoEmulator:
         self._rng = np.random.default_rng(seed)
         kinds = {RANGE: SignalKind.ARRAY, COUNTER: SignalKind.NUMBER}
         kinds |= dict.fromkeys(ORDERED.values(), SignalKind.SWITCH)
-        self.signals = Signals(clock.now, kinds, self._rng, codes={RANGE: LEAST_MM})
+        self.signals = Signals(clock.now, kinds, self._rng, codes={RANGE: model.least_mm})
         self._state: StartState = state
         self._identity = {"SERI": serial, "FIRM": firmware}
         self._rate = 1.0 + drift_ppm * 1e-6
         self._jitter = jitter
-        self._steps = (min_step, max_step)
+        self._model = model
+        self._steps = (
+            model.first_step if min_step is None else min_step,
+            model.last_step if max_step is None else max_step,
+        )
         self._born = clock.now()
         self._fragile = self._cut = self._laser_broken = self._seri_quirk = self._tm_refused = False
         self._elapsed = 0
@@ -216,7 +226,7 @@ class HokuyoEmulator:
         self._timer_zero = self._time() - timer_start * 1_000_000
         if state == "streaming":
             self._laser = True
-            self._order = ScanOrder("MD", *self._steps, prefix=f"MD{min_step:04d}{max_step:04d}010")
+            self._order = ScanOrder("MD", *self._steps, prefix="MD{:04d}{:04d}010".format(*self._steps))
 
     # Emulator protocol
 
@@ -289,17 +299,28 @@ class HokuyoEmulator:
         def cover(values: NDArray[np.int32]) -> NDArray[np.int32]:
             return np.where(self._rng.random(len(values)) < part, np.int32(shown), values)
 
-        self._covers.append((_steps_between(begin, end), cover))
+        self._covers.append((self._steps_between(begin, end), cover))
 
     def _inject_mirror(self, begin: str, end: str) -> None:
         def mirror(values: NDArray[np.int32]) -> NDArray[np.int32]:
-            values = np.where(values >= LEAST_MM, 2 * values, values)
-            values[values > GREATEST_MM] = 0
+            model = self._model
+            values = np.where(values >= model.least_mm, 2 * values, values)
+            values[values > model.greatest_mm] = model.unreturned
             half = round(len(values) * SPECULAR / 2)
-            values[len(values) // 2 - half : len(values) // 2 + half] = MIRROR
+            values[len(values) // 2 - half : len(values) // 2 + half] = model.dazzled
             return values
 
-        self._covers.append((_steps_between(begin, end), mirror))
+        self._covers.append((self._steps_between(begin, end), mirror))
+
+    def _steps_between(self, begin: str, end: str) -> slice:
+        """Steps between two directions, degrees from straight ahead, left positive."""
+        model = self._model
+        first, last = (
+            model.front_step + round(float(degrees) * model.steps_per_turn / 360) for degrees in (begin, end)
+        )
+        if not 0 <= first < last <= model.greatest_step:
+            raise ValueError(f"{begin}..{end} degrees")
+        return slice(first, last + 1)
 
     # Supply and time
 
@@ -344,17 +365,19 @@ class HokuyoEmulator:
 
     async def _next_revolution(self, previous: int | None) -> int | None:
         """Sensor's time at step 0 of the revolution after ``previous``; None = it never turns again."""
+        period = self._model.period
         if previous is None:
-            return -(-self._time() // PERIOD) * PERIOD
-        late = (self._time() - previous) // PERIOD
-        return previous + PERIOD * (1 if late <= CATCH_UP else late)
+            return -(-self._time() // period) * period
+        late = (self._time() - previous) // period
+        return previous + period * (1 if late <= CATCH_UP else late)
 
     def _latest_revolution(self) -> int:
         """Sensor's time at step 0 of the last revolution that is complete."""
-        return (self._time() - self._sweep()) // PERIOD * PERIOD
+        period = self._model.period
+        return (self._time() - self._sweep()) // period * period
 
     def _measure(self, begin: int) -> NDArray[np.int32]:
-        """Shape (769,), mm or codes."""
+        """Values of all steps, mm or codes."""
         revolution = self._source.scan(self._world_time(begin))
         if self._covers:
             revolution = revolution.copy()
@@ -363,7 +386,7 @@ class HokuyoEmulator:
         return revolution
 
     def _sweep(self) -> int:
-        return self._steps[1] * PERIOD // STEPS + PROCESSING
+        return self._steps[1] * self._model.period // self._model.steps_per_turn + PROCESSING
 
     def _sent_at(self, begin: int) -> int:
         """The world's time at which the scan begun at ``begin`` reaches the host."""
@@ -442,7 +465,20 @@ class HokuyoEmulator:
             return build_reply(line, "0B")
         if self._adjusting and text[:2] not in ("TM", "RS"):
             return build_reply(line, "0E")
-        handlers: dict[str, Callable[[str, str], tuple[str, list[bytes]]]] = {
+        handler = self._handlers().get(text[:2])
+        if handler is None or (len(text) > 2 and text[:2] in ("VV", "PP", "II", "BM", "QT", "RS")):
+            self._deaf = self._fragile
+            return b"" if self._deaf else build_reply(line, "0E")
+        request = partial(handler, text)
+        name = ORDERED.get(text[:2])
+        done = request(tag) if name is None else self.signals.order(name, tag, request)
+        status, lines = ("00", list[bytes]()) if done is None else done
+        reply = build_reply(line, status, lines)
+        return reply.replace(b"\nFIRM", b"\n\nFIRM") if text == "VV" and self._seri_quirk else reply
+
+    def _handlers(self) -> dict[str, Handler]:
+        """Handlers of requests, by the first two characters."""
+        return {
             "VV": self._vv,
             "PP": self._pp,
             "II": self._ii,
@@ -457,23 +493,13 @@ class HokuyoEmulator:
             "MD": self._multi,
             "MS": self._multi,
         }
-        handler = handlers.get(text[:2])
-        if handler is None or (len(text) > 2 and text[:2] in ("VV", "PP", "II", "BM", "QT", "RS")):
-            self._deaf = self._fragile
-            return b"" if self._deaf else build_reply(line, "0E")
-        request = partial(handler, text)
-        name = ORDERED.get(text[:2])
-        done = request(tag) if name is None else self.signals.order(name, tag, request)
-        status, lines = ("00", list[bytes]()) if done is None else done
-        reply = build_reply(line, status, lines)
-        return reply.replace(b"\nFIRM", b"\n\nFIRM") if text == "VV" and self._seri_quirk else reply
 
     def _version(self) -> dict[str, str]:
         return {
             "VEND": "Hokuyo Automatic Co.,Ltd.",
-            "PROD": "SOKUIKI Sensor URG-04LX",
+            "PROD": self._model.product,
             "FIRM": self._identity["FIRM"],
-            "PROT": "SCIP 2.0" if self._scip2 else "SCIP 1.1",
+            "PROT": self._model.protocol if self._scip2 else "SCIP 1.1",
             "SERI": self._identity["SERI"],
         }
 
@@ -484,24 +510,24 @@ class HokuyoEmulator:
         return "00", lines
 
     def _pp(self, _text: str, _tag: str) -> tuple[str, list[bytes]]:
-        first, last = self._steps
+        (first, last), model = self._steps, self._model
         fields: dict[str, str | int] = {
-            "MODL": "URG-04LX(Hokuyo Automatic Co.,Ltd.)",
-            "DMIN": LEAST_MM,
-            "DMAX": GREATEST_MM,
-            "ARES": STEPS,
+            "MODL": model.model,
+            "DMIN": model.least_mm,
+            "DMAX": model.greatest_mm,
+            "ARES": model.steps_per_turn,
             "AMIN": first,
             "AMAX": last,
-            "AFRT": FRONT_STEP,
-            "SCAN": 600,
+            "AFRT": model.front_step,
+            "SCAN": model.rpm,
         }
         return "00", build_fields(fields)
 
     def _ii(self, _text: str, _tag: str) -> tuple[str, list[bytes]]:
         fields: dict[str, str | int] = {
-            "MODL": "URG-04LX(Hokuyo Automatic Co.,Ltd.)",
+            "MODL": self._model.model,
             "LASR": "ON" if self._laser else "OFF",
-            "SCSP": "Initial(600[rpm])<-Default setting by user",
+            "SCSP": f"Initial({self._model.rpm}[rpm])<-Default setting by user",
             "MESM": "CLASSIC" if self._laser else "IDLE",
             "SBPS": f"{self._baud}[bps]" + ("<-Default setting by user" if self._baud == DEFAULT_BAUD else ""),
             "TIME": f"{self._counter(self._time()):06X}",
@@ -561,7 +587,7 @@ class HokuyoEmulator:
         return "00", []
 
     def _single(self, text: str, tag: str) -> tuple[str, list[bytes]]:
-        order = parse_order(text, tag)
+        order = parse_order(text, tag, self._model.greatest_step)
         if isinstance(order, str):
             return order, []
         if not self._laser:
@@ -569,7 +595,7 @@ class HokuyoEmulator:
         return "00", self._data(order, self._latest_revolution())
 
     def _multi(self, text: str, tag: str) -> tuple[str, list[bytes]]:
-        order = parse_order(text, tag)
+        order = parse_order(text, tag, self._model.greatest_step)
         if isinstance(order, str):
             return order, []
         if self._order is not None:
@@ -582,14 +608,6 @@ class HokuyoEmulator:
 
 def _switch(word: str) -> bool:
     return {"on": True, "off": False}[word]
-
-
-def _steps_between(begin: str, end: str) -> slice:
-    """Steps between two directions, degrees from straight ahead, left positive."""
-    first, last = (FRONT_STEP + round(float(degrees) * STEPS / 360) for degrees in (begin, end))
-    if not 0 <= first < last <= LAST_STEP:
-        raise ValueError(f"{begin}..{end} degrees")
-    return slice(first, last + 1)
 
 
 def emulated(setup: EmulatorSetup) -> HokuyoEmulator:

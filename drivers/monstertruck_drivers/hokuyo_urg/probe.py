@@ -4,15 +4,14 @@ from dataclasses import asdict
 
 import numpy as np
 
-from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig
-from monstertruck_drivers.hokuyo_urg.driver import Dialect, ScipSession, Sensor
+from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig, HokuyoLxConfig, ScipConfig
+from monstertruck_drivers.hokuyo_urg.driver import Dialect, ScipSession, Sensor, split
 from monstertruck_drivers.hokuyo_urg.protocol import (
     Parameters,
     ScanBlock,
     decode_scan,
     scan_command,
     scip1_scan_command,
-    split_ranges,
 )
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import Clock
@@ -27,21 +26,30 @@ async def probe(port: Port, clock: Clock, settings: HokuyoConfig | None = None) 
     Raises:
         DeviceError: as the driver's ``run``.
     """
+    return await _probe(port, clock, settings or HokuyoConfig())
+
+
+async def probe_lx(port: Port, clock: Clock, settings: HokuyoLxConfig | None = None) -> dict[str, object]:
+    """As ``probe``, of a UST or UTM."""
+    return await _probe(port, clock, settings or HokuyoLxConfig())
+
+
+async def _probe(port: Port, clock: Clock, settings: HokuyoConfig | HokuyoLxConfig) -> dict[str, object]:
     async with await port.open() as link:
-        session = ScipSession(link, clock, settings or HokuyoConfig())
+        session = ScipSession(link, clock, settings)
         sensor = await session.handshake()
         try:
             block = await _one_scan(session, sensor)
         finally:
             await session.stop()
     return {
-        "device": "hokuyo_urg",
+        "device": settings.kind,
         "port": port.name,
         "dialect": sensor.dialect.value,
         "identity": asdict(sensor.identity),
         "parameters": asdict(sensor.parameters),
         "state": None if sensor.state is None else asdict(sensor.state),
-        "scan": _summary(block, sensor.parameters),
+        "scan": _summary(block, sensor.parameters, settings),
     }
 
 
@@ -56,8 +64,8 @@ async def _one_scan(session: ScipSession, sensor: Sensor) -> ScanBlock:
     return decode_scan(reply, *shape)
 
 
-def _summary(block: ScanBlock, parameters: Parameters) -> dict[str, object]:
-    ranges, codes = split_ranges(block.values, parameters.least_mm)
+def _summary(block: ScanBlock, parameters: Parameters, settings: ScipConfig) -> dict[str, object]:
+    ranges, codes = split(block.values, parameters, settings)
     valid = ranges[np.isfinite(ranges)]
     kinds, counts = np.unique(codes[~np.isfinite(ranges)], return_counts=True)
     return {

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_runtime.errors import ProtocolError
-from monstertruck_schemas.sensor import VALID_BEAM
+from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM
 
 ScanFormat = Literal["MD", "MS"]
 """Three characters a range (up to 262143 mm) or two (up to 4095 mm)."""
 
-RANGE_WIDTH: Final[dict[str, int]] = {"MD": 3, "GD": 3, "MS": 2, "GS": 2, "G": 2}
-"""Characters of one range by command."""
+RANGE_WIDTH: Final[dict[str, int]] = {"MD": 3, "GD": 3, "ME": 3, "GE": 3, "MS": 2, "GS": 2, "G": 2}
+"""Characters of one range, and of one intensity, by command."""
 COUNTER_BITS: Final = 24
 COUNTER_MASK: Final = (1 << COUNTER_BITS) - 1
 """The millisecond counter wraps after 4 h 39 min 37.2 s."""
@@ -31,7 +31,7 @@ LINE_PAYLOAD: Final = 64
 TAG_LIMIT: Final = 16
 """Most characters of the echoed string after ``;``."""
 MAX_REPLY: Final = 8192
-"""Bytes kept while waiting for the end of a reply; the longest real one (769 ranges) has under 2500."""
+"""Bytes kept while waiting for the end of a reply; the longest real one (1081 ranges with intensities) has 6700."""
 
 
 # Sums and numbers
@@ -197,7 +197,7 @@ def build_reply(echo: str, status: str, lines: list[bytes] | None = None) -> byt
     return b"\n".join([echo.encode("latin-1"), head, *(lines or []), b"", b""])
 
 
-_ECHO = rb"(?:VV|PP|II|BM|QT|RS|TM[012]|SS\d{6}|SCIP2\.0|G[DS]\d{10}|M[DS]\d{13}|V|L[01]|G\d{8})"
+_ECHO = rb"(?:VV|PP|II|BM|QT|RS|TM[012]|SS\d{6}|SCIP2\.0|G[DES]\d{10}|M[DES]\d{13}|V|L[01]|G\d{8})"
 # Not tied to the start of a line: it may be glued to one that was cut.
 _HEADER = re.compile(_ECHO + rb"\n(?:[0-9A-Z]{2}[0-o]|[0-9A-Z])\n")
 _FIRST_LINES = re.compile(rb"([\x20-\x7e]{1,64})\n(?:([0-9A-Z]{2})([0-o])|([0-9A-Z]))\n")
@@ -277,10 +277,12 @@ class StatusMeaning(Enum):
     LASER_OFF = auto()
     BUSY = auto()
     """0B: drain and retry once."""
+    UNSTABLE = auto()
+    """0M: this revolution has no data."""
     UPDATE_MODE = auto()
     """0I: firmware update mode; leave it with RS."""
     FAULT = auto()
-    """50-97, 0A, or a laser that failed to light."""
+    """50-97, 0A, 0L, or a laser that failed to light."""
     BAD_REQUEST = auto()
     """Our own mistake: retrying cannot help."""
 
@@ -294,6 +296,8 @@ def classify(command: str, status: str) -> StatusMeaning:
         "0A": StatusMeaning.FAULT,
         "0B": StatusMeaning.BUSY,
         "0I": StatusMeaning.UPDATE_MODE,
+        "0L": StatusMeaning.FAULT,
+        "0M": StatusMeaning.UNSTABLE,
     }
     if status in shared:
         return shared[status]
@@ -303,7 +307,7 @@ def classify(command: str, status: str) -> StatusMeaning:
         return StatusMeaning.ALREADY if status in ("02", "03") else StatusMeaning.BAD_REQUEST
     if command.startswith("SS"):
         return StatusMeaning.ALREADY if status == "03" else StatusMeaning.BAD_REQUEST
-    if status.isdigit() and command[:2] in ("MD", "MS", "GD", "GS"):
+    if status.isdigit() and command[:2] in RANGE_WIDTH:
         code = int(status)
         if code == 99:
             return StatusMeaning.DATA
@@ -375,6 +379,28 @@ def split_ranges(values: NDArray[np.int32], least: int) -> tuple[NDArray[np.floa
     valid = values >= least
     ranges = np.where(valid, values / 1000.0, np.inf)
     codes = np.where(valid, VALID_BEAM, np.minimum(values, VALID_BEAM - 1)).astype(np.uint8)
+    ranges.flags.writeable = codes.flags.writeable = False
+    return ranges, codes
+
+
+def split_lx_ranges(
+    values: NDArray[np.int32], least: int, greatest: int, *, free: bool
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """As ``split_ranges``, of the series UST and UTM, whose values outside their range are errors.
+
+    A UTM reports 1 where nothing is in range (table 4 of the SCIP 2.0 specification), a UST a value beyond its range.
+    Their other errors say nothing.
+
+    Args:
+        values: shape (n,), mm or errors.
+        least: mm (``DMIN``).
+        greatest: mm (``DMAX``).
+        free: whether a beam that nothing returned is free as far as the scanner reaches.
+    """
+    valid = (values >= least) & (values <= greatest)
+    ranges = np.where(valid, values / 1000.0, np.inf)
+    unreturned = (values > greatest) | (values == 1)
+    codes = np.where(valid, VALID_BEAM, np.where(unreturned & free, NO_ECHO, NO_ECHO + 1)).astype(np.uint8)
     ranges.flags.writeable = codes.flags.writeable = False
     return ranges, codes
 

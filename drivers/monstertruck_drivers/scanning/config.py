@@ -7,14 +7,19 @@ from pydantic import Field
 from monstertruck_schemas.base import FrameId, Schema
 
 
-class TurningHeadConfig(Schema):
+class ReturnsConfig(Schema):
+    """A scanner that reports a covered window and open ground alike."""
+
+    no_return: Literal["unknown", "free"] = "unknown"
+    """What a beam without a return says: nothing, or that the way is free as far as the scanner reaches. The scanner
+    reports a covered window and open ground alike"""
+
+
+class TurningHeadConfig(ReturnsConfig):
     """A scanner that streams its beams while its head turns."""
 
     frame: FrameId = "lidar"
     """Frame of the published scans."""
-    no_return: Literal["unknown", "free"] = "unknown"
-    """What a beam without a return says: nothing, or that the way is free as far as the scanner reaches. The scanner
-    reports a covered window and open ground alike"""
     silence: Annotated[float, Field(gt=0, le=10)] = 0.5
     """Seconds without a byte that end the session"""
     first_scan: Annotated[float, Field(gt=0, le=60)] = 6.0

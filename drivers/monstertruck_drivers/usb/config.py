@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from monstertruck_drivers.catalog import start_order, started_apart
 from monstertruck_drivers.computer import Sysfs
 from monstertruck_drivers.link import Framing
-from monstertruck_drivers.usb.tree import at_present, device_name, parent_of, port_of
+from monstertruck_drivers.usb.tree import at_present, device_name, parent_of, place, port_of
 from monstertruck_schemas.base import Schema
 
 Seconds = Annotated[float, Field(ge=0, le=60)]
@@ -45,6 +45,11 @@ its kernel's name, which may change with the next boot: "1-1", or "usb1" for a r
     def device(self) -> str:
         """Kernel's name of whatever is plugged in there."""
         return device_name(self.hub, self.port)
+
+    @property
+    def label(self) -> str:
+        """Hub and port in words."""
+        return place(self.device)
 
     def at_present(self, sysfs: Sysfs) -> Self:
         """The same place by the kernel's names of this moment; itself if its controller is not there."""

@@ -44,9 +44,12 @@ def emulate(
         Path | None,
         typer.Option("--link", "-l", help="Symlink to create for the pty; default: where the emulated truck has it."),
     ] = None,
+    tcp: Annotated[
+        str | None, typer.Option("--tcp", help="Serve at an address of this computer instead, e.g. 127.0.0.1:10940.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the device's noise.")] = 0,
 ) -> None:
-    """Emulate one device, byte for byte, alone on a pty: for third-party clients and bench work.
+    """Emulate one device, byte for byte, alone on a pty or a network socket: for third-party clients and bench work.
 
     Faults are read from standard input, one per line: `unplug`, `plug`, `power-cycle`,
     `line stalled|deaf|delay|chunk|flip_rate|drop_rate|garbage VALUE`, `signal NAME FAULT [VALUE]` for a false
@@ -54,16 +57,22 @@ def emulate(
     word lists them).
     """
     from monstertruck_drivers.catalog import DEVICES
+    from monstertruck_drivers.tcp import parse_address
     from monstertruck_runtime.endpoints import emulated_ports
+    from monstertruck_runtime.errors import InputError
     from monstertruck_sim.console import CommandedGroup, FaultConsole
     from monstertruckd.config.truck import ROBOT
     from monstertruckd.tools.simulation.emulate import emulate_device
 
-    port = link or emulated_ports(ROBOT) / DEVICES.named(device).role.name
+    port: Path | tuple[str, int] = link or emulated_ports(ROBOT) / DEVICES.named(device).role.name
+    if tcp is not None:
+        if link is not None or (address := parse_address(tcp)) is None:
+            raise InputError(f"--tcp {tcp}: expected an address such as 127.0.0.1:10940, and no --link")
+        port = address
 
     async def main(clock: "Clock") -> None:
         async with emulate_device(device, port, clock, seed) as emulated:
-            remark(f"{device} on {port}; faults on standard input, Ctrl-C ends")
+            remark(f"{device} on {tcp or port}; faults on standard input, Ctrl-C ends")
             if (limits := OWN_CLIENTS.get(DEVICES.named(device).opens)) is not None:
                 remark(f"{device}: {limits}")
             await FaultConsole(CommandedGroup("device", {device: emulated}), sys.stdin, print_words).run()
@@ -76,7 +85,7 @@ def probe(
     device: DeviceArgument,
     port: Annotated[
         Path | None,
-        typer.Option("--port", "-p", help="Device node, e.g. /dev/truck/lidar; of a camera also a pattern."),
+        typer.Option("--port", "-p", help="Device node or ADDRESS:PORT on the network; of a camera also a pattern."),
     ] = None,
     baud: Annotated[int | None, typer.Option(min=1, help="Bits per second; default: the device's own.")] = None,
     json_output: JsonOption = False,
@@ -85,6 +94,7 @@ def probe(
     from monstertruck_drivers.catalog import DEVICES
     from monstertruck_drivers.computer import ROOT, Computer
     from monstertruck_drivers.link import BAUD
+    from monstertruck_drivers.tcp import TcpPort, parse_address
     from monstertruck_drivers.tty import SerialPort
     from monstertruck_runtime.clock import run_wall
     from monstertruck_runtime.errors import InputError, NotFoundError
@@ -99,6 +109,8 @@ def probe(
         where: Any = Computer.at(ROOT, clock)
         if kind.opens == "video":
             where = str(port or "/dev/video*")
+        elif port is not None and (address := parse_address(str(port))) is not None:
+            where = TcpPort(*address)
         elif port is not None:
             where = SerialPort(port, baud or kind.baud or BAUD, framing=kind.framing or "8N1")
         return await kind.probe_function()(where, clock, None)

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from monstertruck_drivers.catalog import DeviceKind
-from monstertruck_drivers.config import AnyPort, Device
-from monstertruck_drivers.link import BAUD
+from monstertruck_drivers.config import AnyPort, Device, TcpPortConfig
+from monstertruck_drivers.link import BAUD, Port
+from monstertruck_drivers.tcp import TcpPort
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.port import HubPort, why_no_node
 from monstertruck_drivers.usb.tree import DEVICES, Node, TreeSnapshot, UsbDevice, ancestors, place, read_tree
@@ -32,6 +33,8 @@ def wiring(context: HostContext) -> Iterator[Finding]:
     for role, device in devices.items():
         if isinstance(device.port, UsbPortConfig):
             yield from _by_hub(context, tree, role, device, taken)
+        elif isinstance(device.port, TcpPortConfig):
+            yield fine(role, f"at {device.port.label} on the network")
         else:
             yield _by_path(context, role, device.port)
     for name, count in tree.over_current.items():
@@ -115,43 +118,55 @@ async def handshakes(context: HostContext) -> AsyncIterator[Finding]:
         yield fine("handshakes", seen, context.command("status", "--once"))
         return
     plugged = {
-        role: (device, node)
+        role: (device, place)
         for role, device in context.config.devices.at_present(context.computer.machine.sysfs).present().items()
-        if (node := context.node(device.port, camera=device.kind.opens == "video")) is not None
+        if (place := _reached(context, device)) is not None
     }
     for found in await asyncio.gather(*(_handshake(context, role, *ends) for role, ends in plugged.items())):
         yield found
 
 
-async def _handshake(context: HostContext, role: str, device: Device[Schema], node: Path) -> Finding:
+def _reached(context: HostContext, device: Device[Schema]) -> str | None:
+    """Where a device is asked: its node, or its address; None if it is not plugged in."""
+    if isinstance(device.port, TcpPortConfig):
+        return device.port.label
+    node = context.node(device.port, camera=device.kind.opens == "video")
+    return None if node is None else str(node)
+
+
+async def _handshake(context: HostContext, role: str, device: Device[Schema], place: str) -> Finding:
     check, kind = f"{role} handshake", device.kind
-    again = context.command("probe", role, "--port", str(node))
+    again = context.command("probe", role, "--port", place)
     timeout = 15.0  # seconds for one device's whole answer; a scanner that measures has to be stopped first
     try:
         async with context.computer.machine.clock.deadline(timeout):
-            answer = await _probe(context, role, device, kind, node)
+            answer = await _probe(context, role, device, kind, place)
     except TimeoutError:
         return fail(check, Reason.DEVICE_TIMEOUT, f"no complete answer within {timeout:g} s", again)
     except PortBusyError as error:
-        return fail(check, error.reason, str(error), f"sudo fuser -v {node}")
+        return fail(check, error.reason, str(error), f"sudo fuser -v {place}")
     except WrongDeviceError as error:
         return fail(check, error.reason, str(error), context.find_port_command(role))
     except DeviceError as error:
         return fail(check, error.reason, str(error), again)
     if kind.opens == "video" and not any(one.get("mjpg_modes") for one in answer["nodes"]):
-        return warn(check, Reason.DEVICE_WRONG, f"{node} offers no motion JPEG", again)
+        return warn(check, Reason.DEVICE_WRONG, f"{place} offers no motion JPEG", again)
     return fine(check, f"{kind.doc} answers")
 
 
 async def _probe(
-    context: HostContext, role: str, device: Device[Schema], kind: DeviceKind, node: Path
+    context: HostContext, role: str, device: Device[Schema], kind: DeviceKind, place: str
 ) -> dict[str, Any]:
     port, machine = device.port, context.computer.machine
     if kind.opens == "video":
-        return await kind.probe_function()(str(node), machine.clock, device.driver)
-    line = (
-        HubPort(port, machine, lambda *_, **__: None, role=role)
-        if isinstance(port, UsbPortConfig)
-        else machine.serial(node, port.baud or BAUD, dtr=port.dtr, rts=port.rts, framing=port.framing or "8N1")
-    )
+        return await kind.probe_function()(place, machine.clock, device.driver)
+    line: Port
+    match port:
+        case UsbPortConfig():
+            line = HubPort(port, machine, lambda *_, **__: None, role=role)
+        case TcpPortConfig():
+            line = TcpPort(port.address, port.tcp)
+        case _:
+            framing = port.framing or "8N1"
+            line = machine.serial(Path(place), port.baud or BAUD, dtr=port.dtr, rts=port.rts, framing=framing)
     return await kind.probe_function()(line, machine.clock, device.driver)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
+from monstertruck_drivers.config import PortConfig
+from monstertruck_drivers.usb.config import CycleMethod
 from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
 from monstertruck_runtime.map_files import files_of
 from monstertruck_runtime.map_folders import MANIFEST, SAVES, numbered_saves
@@ -181,7 +182,7 @@ def _notes(config: TruckConfig) -> list[str]:
     notes = [
         f"devices.{role}.port: {device.port.path} is made by no rule; name hub and port: monstertruckd find-port {role}"
         for role, device in config.devices.present().items()
-        if not isinstance(device.port, UsbPortConfig) and device.port.path.is_relative_to(LINKS)
+        if isinstance(device.port, PortConfig) and device.port.path.is_relative_to(LINKS)
     ]
     if config.usb.power.method is CycleMethod.UHUBCTL:
         notes.append("usb.power.method: uhubctl needs the raw hubs, which the service may not open; use port")

@@ -2,10 +2,10 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Iterator
-from contextlib import ExitStack, asynccontextmanager, contextmanager
+from contextlib import ExitStack, asynccontextmanager, closing, contextmanager
 from pathlib import Path
 
-from monstertruck_drivers.cable import PtyPort, reserved
+from monstertruck_drivers.cable import EmulatedPort, PtyPort, SocketPort, reserved
 from monstertruck_drivers.catalog import DEVICES, DeviceKind
 from monstertruck_drivers.emulation import EmulatorSetup
 from monstertruck_runtime.clock import Clock
@@ -45,8 +45,8 @@ def claimed(*links: Path) -> Iterator[None]:
 
 
 @asynccontextmanager
-async def emulate_device(device: str, link: Path, clock: Clock, seed: int) -> AsyncIterator[Emulated]:
-    """Serve ``device`` (kind or role) behind the symlink ``link`` while the context lasts.
+async def emulate_device(device: str, link: Path | tuple[str, int], clock: Clock, seed: int) -> AsyncIterator[Emulated]:
+    """Serve ``device`` (kind or role) behind a symlink, or at an address and TCP port, while the context lasts.
 
     Raises:
         InputError: unknown device, one without a port, or something that is no link has the name.
@@ -57,6 +57,13 @@ async def emulate_device(device: str, link: Path, clock: Clock, seed: int) -> As
     kind = DEVICES.named(device)
     if kind.opens == "computer":
         raise InputError(f"{device}: the computer's own files, no device on a port; simulate emulates them")
+    if isinstance(link, tuple):
+        if kind.opens != "serial":
+            raise InputError(f"{device}: no device on a network socket")
+        with closing(SocketPort(*link)) as socket:
+            async with _served(kind, device, socket, clock, seed) as emulated:
+                yield emulated
+        return
     with claimed(link):
         port = PtyPort(link)
         async with _served(kind, device, port, clock, seed) as emulated:
@@ -64,7 +71,9 @@ async def emulate_device(device: str, link: Path, clock: Clock, seed: int) -> As
 
 
 @asynccontextmanager
-async def _served(kind: DeviceKind, device: str, port: PtyPort, clock: Clock, seed: int) -> AsyncIterator[Emulated]:
+async def _served(
+    kind: DeviceKind, device: str, port: EmulatedPort, clock: Clock, seed: int
+) -> AsyncIterator[Emulated]:
     setup = EmulatorSetup(kind.role.name, None, clock, World(WorldConfig(), seed), seed, port)
     emulator = kind.emulator_factory()(setup)
     task = asyncio.create_task(emulator.run(port.device), name=f"emulator {device}")

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from monstertruck_drivers.config import PortConfig
+from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.world import make_scene
@@ -49,8 +49,9 @@ def shared_scene(configs: Sequence[SimulatedTruckConfig]) -> Surroundings:
     return make_scene(first.world, first.seed, [other.world for other in others])
 
 
-def _ports(config: SimulatedTruckConfig) -> Iterator[Path]:
-    return (it.port.path for it in config.devices.present().values() if isinstance(it.port, PortConfig))
+def _ports(config: SimulatedTruckConfig) -> Iterator[str]:
+    ports = (device.port for device in config.devices.present().values())
+    return (port.label for port in ports if not isinstance(port, UsbPortConfig))
 
 
 def _machines(config: SimulatedTruckConfig) -> Iterator[Path]:

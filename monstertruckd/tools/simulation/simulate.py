@@ -12,8 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from monstertruck_drivers.cable import EmulatedPort, PtyPort
-from monstertruck_drivers.config import PortConfig
+from monstertruck_drivers.cable import EmulatedPort, PtyPort, SocketPort
+from monstertruck_drivers.config import PortConfig, TcpPortConfig
 from monstertruck_drivers.hokuyo_urg.recording import RecordedHokuyoEmulator
 from monstertruck_drivers.webcam.emulator import WebcamEmulator
 from monstertruck_kinematics.elementary import Array
@@ -162,6 +162,9 @@ class ServedRobot:
         devices = config.devices.present()
         cables: dict[str, EmulatedPort] = {}
         for role, device in devices.items():
+            if isinstance(device.port, TcpPortConfig):
+                cables[role] = SocketPort(device.port.address, device.port.tcp)
+                continue
             path = device.port.path if isinstance(device.port, PortConfig) else folder / "cables" / role
             path.parent.mkdir(parents=True, exist_ok=True)
             cables[role] = PtyPort(path)

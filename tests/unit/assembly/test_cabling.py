@@ -1,5 +1,7 @@
 """Ports of devices, as configured."""
 
+import asyncio
+import contextlib
 import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from monstertruck_drivers.cable import MemoryPort
-from monstertruck_drivers.config import PortConfig
+from monstertruck_drivers.cable import MemoryPort, SocketPort
+from monstertruck_drivers.config import PortConfig, TcpPortConfig
 from monstertruck_drivers.link import Framing, Port
 from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
-from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.clock import VirtualClock, WallClock, run_virtual
 from monstertruckd.assembly import devices
 from monstertruckd.assembly.devices import Cabling
 from monstertruckd.bus.local import Bus
@@ -62,3 +64,16 @@ def test_the_control_lines_of_a_port_are_those_of_its_settings(
 
     run_virtual(opened)
     assert made == [(dtr, rts, framing or "8N1")]
+
+
+async def test_a_sensor_on_the_network_is_reached_by_its_address():
+    with contextlib.closing(SocketPort("127.0.0.1", 0)) as cable:
+        cable.plug()
+        lidar = SimpleNamespace(port=TcpPortConfig(address=cable.address[0], tcp=cable.address[1]))
+        config: Any = SimpleNamespace(devices=SimpleNamespace(present=lambda: {"lidar": lidar}), usb=UsbConfig())
+        computer: Any = SimpleNamespace(machine=SimpleNamespace(clock=WallClock()))
+        async with await Cabling(config, computer, Bus(WallClock()), {}).port("lidar").open() as link:
+            cable.device.write(b"there")
+            await asyncio.sleep(0.05)
+            cable.device.write(b"there")
+            assert (await link.read(2.0)).startswith(b"there")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_drivers.config import PortConfig
+from monstertruck_drivers.config import PortConfig, TcpPortConfig
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.errors import ConfigError
 from monstertruckd.config.load import load_config
@@ -42,6 +42,11 @@ def test_both_ways_to_name_a_port(tmp_path: Path):
         ('{hub: "1-1", port: 1, path: /dev/x}', "devices.lidar.port.path: unknown key"),
         ("{path: /dev/x, speed: 5}", "devices.lidar.port.speed: unknown key"),
         ("{path: /dev/x, baud: 1}", "devices.lidar.port.baud: input should be greater than or equal to 4800"),
+        ("{address: scanner, tcp: 10940}", "devices.lidar.port.address: "),
+        ("{address: 192.168.0.300, tcp: 10940}", "devices.lidar.port.address: "),
+        ("{address: 192.168.0.10}", "devices.lidar.port.tcp: missing"),
+        ("{address: 192.168.0.10, tcp: 0}", "devices.lidar.port.tcp: input should be greater than or equal to 1"),
+        ("{address: 192.168.0.10, tcp: 1, baud: 9600}", "devices.lidar.port.baud: unknown key"),
         ("7", "devices.lidar.port: "),
     ],
 )
@@ -52,6 +57,33 @@ def test_a_mistake_is_one_line_that_names_its_key(port: str, expected: str, tmp_
     assert expected in said
     assert len(said.splitlines()) == 1
     assert f"{tmp_path / 'truck.yaml'}:4" in said
+
+
+def test_a_sensor_on_the_network(tmp_path: Path):
+    found = truck(
+        tmp_path, lidar("{address: 192.168.0.10, tcp: 10940}").replace("hokuyo_urg", "hokuyo_lx")
+    ).devices.lidar
+    assert found is not None
+    assert found.port == TcpPortConfig(address="192.168.0.10", tcp=10940)
+    assert not found.port.is_local
+    assert found.port.label == "192.168.0.10:10940"
+
+
+def test_motor_controllers_and_cameras_are_refused_on_the_network(tmp_path: Path):
+    at = "{port: {address: 192.168.0.10, tcp: 10940}, driver: {kind: %s}}"
+    for role, kind, expected in (
+        ("drive", "epos", "drive: the stop script cannot stop it over the network"),
+        ("steering", "maestro", "steering: the stop script cannot stop it over the network"),
+        ("camera", "webcam", "camera: a webcam has no network address"),
+    ):
+        with pytest.raises(ConfigError, match=expected):
+            truck(tmp_path, f"devices:\n  {role}: {at % kind}\n")
+
+
+def test_no_two_devices_share_an_address(tmp_path: Path):
+    port = "{address: 192.168.0.10, tcp: 10940}"
+    with pytest.raises(ConfigError, match=r"lidar and compass share the port 192\.168\.0\.10:10940"):
+        truck(tmp_path, lidar(port) + f"  compass: {{port: {port}, driver: {{kind: os4000}}}}\n")
 
 
 def test_no_two_devices_share_a_port(tmp_path: Path):

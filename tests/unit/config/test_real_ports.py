@@ -30,6 +30,8 @@ def lidar_at(port: dict, **more: object) -> TruckConfig:
         ({"path": "/dev/shm/ports/lidar"}, "/", False),
         ({"path": "/run/user/1000/monstertruckd/ports/truck/lidar"}, "/", False),
         ({"path": "/run/../dev/ttyACM0"}, "/", True),
+        ({"address": "192.168.0.10", "tcp": 10940}, "/", True),
+        ({"address": "127.0.0.2", "tcp": 10940}, "/", False),
     ],
 )
 def test_which_ports_are_real(port: dict, machine: str, real: bool):

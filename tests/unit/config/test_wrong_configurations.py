@@ -53,11 +53,11 @@ WRONG = (
     ),
     (
         "devices: {lidar: {driver: {kind: sick}}}",
-        "devices.lidar: no kind 'sick'; expected one of 'hokuyo_urg', 'ld19', 'rplidar'",
+        "devices.lidar: no kind 'sick'; expected one of 'hokuyo_urg', 'hokuyo_lx', 'ld19', 'rplidar'",
     ),
     (
         "devices: {lidar: {driver: {kind: epos}}}",
-        "devices.lidar: no kind 'epos'; expected one of 'hokuyo_urg', 'ld19', 'rplidar'",
+        "devices.lidar: no kind 'epos'; expected one of 'hokuyo_urg', 'hokuyo_lx', 'ld19', 'rplidar'",
     ),
     ("devices: {lidar: {mount: {x: far}}}", "devices.lidar.mount.x: input should be a valid number, found 'far'"),
     ("devices: {lidar: {mount: {x: .inf}}}", "devices.lidar.mount.x: input should be a finite number, found inf"),

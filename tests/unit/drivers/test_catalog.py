@@ -59,7 +59,7 @@ def test_kinds_are_found_by_name_and_by_role():
     assert DEVICES.named("epos") is DEVICES.named("drive_3") is DEVICES["epos"]
     with pytest.raises(
         InputError,
-        match=r"unknown device 'wheel'; known: hokuyo_urg \(lidar\), ld19 \(lidar\), rplidar",
+        match=r"unknown device 'wheel'; known: hokuyo_urg \(lidar\), hokuyo_lx \(lidar\), ld19 \(lidar\), rplidar",
     ):
         DEVICES.named("wheel")
 

@@ -2,27 +2,32 @@
 
 import asyncio
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import AsyncMock, Mock
 
 import pytest
 
-from monstertruck_drivers.cable import MemoryPort
-from monstertruck_drivers.config import PortConfig
-from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_drivers.cable import MemoryPort, SocketPort
+from monstertruck_drivers.computer import Computer
+from monstertruck_drivers.config import PortConfig, TcpPortConfig
+from monstertruck_drivers.hokuyo_urg.lx_emulator import LxEmulator
+from monstertruck_drivers.hokuyo_urg.models import LX
+from monstertruck_runtime.clock import VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import DeviceError, DeviceWedgedError, PortBusyError
 from monstertruck_runtime.threads import inline
 from monstertruck_schemas.reasons import Reason
 from monstertruck_sim.computer import EmulatedComputer
 from monstertruck_sim.robot import SimulatedRobot
-from monstertruckd.config.load import load_config
+from monstertruckd.config.load import load_config, load_truck
 from monstertruckd.tools.doctor import devices as module
 from monstertruckd.tools.doctor.context import Finding, HostContext, Level
-from monstertruckd.tools.doctor.devices import handshakes
+from monstertruckd.tools.doctor.devices import handshakes, wiring
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from tests.unit.drivers.scanning.kit import Room
 from tests.unit.tools.doctor.kit import EmulatedHost, see
-from tests.unit.tools.install.kit import PROGRAM, ROOT
+from tests.unit.tools.install.kit import PROGRAM, ROOT, TRUCK
 
 FULL = ROOT / "configs" / "full.yaml"
 
@@ -149,5 +154,31 @@ async def test_a_port_is_probed_with_the_control_lines_of_its_settings():
     context = Mock(computer=Mock(machine=Mock(serial=serial)))
     kind = Mock(opens="serial", probe_function=lambda: AsyncMock())
     device = Mock(port=PortConfig(path=node, baud=9600, dtr=False, rts=False))
-    await module._probe(context, "lidar", device, kind, node)
+    await module._probe(context, "lidar", device, kind, str(node))
     serial.assert_called_once_with(node, 9600, dtr=False, rts=False, framing="8N1")
+
+
+async def test_a_sensor_on_the_network_is_asked_at_its_address(tmp_path: Path):
+    clock = WallClock()
+    with closing(SocketPort("127.0.0.1", 0)) as cable:
+        port = TcpPortConfig(address=cable.address[0], tcp=cable.address[1])
+        config = load_truck(TRUCK)[0]
+        lidar = {"port": port.model_dump(), "driver": {"kind": "hokuyo_lx"}}
+        config = type(config).model_validate({"version": 2, "devices": {"lidar": lidar}}, strict=False)
+        emulator = LxEmulator(clock, Room(), LX["ust_10lx"])
+        serving = asyncio.create_task(emulator.run(cable.device))
+        await asyncio.sleep(0)
+        computer = Computer.at(tmp_path, clock)
+        context = HostContext(tmp_path, computer, PROGRAM, TRUCK, config, None, None)
+        assert [(found.level, found.seen) for found in wiring(context)] == [
+            (Level.OK, f"at {port.label} on the network")
+        ]
+        cable.plug()
+        (answers,) = [finding async for finding in handshakes(context)]
+        serving.cancel()
+        await asyncio.wait([serving])
+    (silent,) = [finding async for finding in handshakes(context)]
+    assert (answers.level, answers.check) == (Level.OK, "lidar handshake")
+    assert silent.reason is Reason.DEVICE_LOST
+    assert silent.fix is not None
+    assert silent.fix.endswith(f"probe lidar --port {port.label}")

@@ -1,0 +1,83 @@
+"""Devices with a network socket of their own, reached over TCP."""
+
+import asyncio
+import os
+import re
+import socket
+from typing import Final, cast
+
+from monstertruck_drivers.link import Link
+from monstertruck_runtime.errors import DeviceLostError
+
+PATIENCE: Final = 2.0
+"""Seconds within which a device must accept the connection."""
+MAX_AGE: Final = 0.5
+"""Seconds after which unacknowledged bytes end the connection: more than two retransmissions on a local network."""
+
+
+def parse_address(text: str) -> tuple[str, int] | None:
+    """Address and TCP port of ``192.168.0.10:10940``; None if the text is none."""
+    found = re.fullmatch(r"(\d{1,3}(?:\.\d{1,3}){3}):(\d{1,5})", text)
+    return None if found is None else (found[1], int(found[2]))
+
+
+class TcpPort:
+    """A socket by its address. Nothing of it blocks: an address needs no name server.
+
+    Args:
+        address: IPv4 address.
+        number: TCP port.
+    """
+
+    def __init__(self, address: str, number: int) -> None:
+        self.name = f"{address}:{number}"
+        self._address, self._number = address, number
+
+    async def open(self) -> Link:
+        """Connect.
+
+        Raises:
+            DeviceLostError: no route, no answer, or refused.
+        """
+        try:
+            async with asyncio.timeout(PATIENCE):
+                _, protocol = await asyncio.get_running_loop().create_connection(
+                    lambda: _TcpProtocol(self.name), self._address, self._number
+                )
+        except TimeoutError as error:
+            raise DeviceLostError(f"{self.name}: no answer within {PATIENCE:g} s") from error
+        except ConnectionRefusedError as error:
+            raise DeviceLostError(f"{self.name}: refused, or another program is connected") from error
+        except OSError as error:
+            raise DeviceLostError(f"{self.name}: {_why(error)}") from error
+        return protocol.link
+
+
+class _TcpProtocol(asyncio.Protocol):
+    """Feeds a ``Link`` from a connection.
+
+    Args:
+        name: for error messages.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Connected."""
+        line: socket.socket = transport.get_extra_info("socket")
+        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(MAX_AGE * 1000))
+        stream = cast("asyncio.Transport", transport)
+        self.link = Link(self._name, stream.write, stream.abort)
+
+    def data_received(self, data: bytes) -> None:
+        """Bytes came."""
+        self.link.feed(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The connection is gone."""
+        self.link.lose(f"connection lost ({_why(exc)})" if isinstance(exc, OSError) else "the device hung up")
+
+
+def _why(error: OSError) -> str:
+    return str(error) if error.errno is None else os.strerror(error.errno)
