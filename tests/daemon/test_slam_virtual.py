@@ -57,3 +57,13 @@ def test_health_tiles_and_the_saved_map(drive: Drive, folder: Path):
     assert all((tile.width, tile.height) == (64, 64) for tile in tiles)
     with opened(folder) as save:
         assert {path.name for path in save.folder.iterdir()} == {"map.yaml", "map.png", "graph.npz", "manifest.json"}
+
+
+def test_a_robot_without_a_compass_maps_as_well():
+    without = {"devices": {"compass": None}, "gate": {"attitude": None}}
+    drive = driven("slam.yaml", lap(SECONDS), topics.MAP, topics.COMPASS, **without)
+    assert drive.said["sensor/compass"] == []
+    assert np.hypot(*(drive.truth[-1, 1:3] - drive.truth[0, 1:3])) > 2.0
+    assert drive.off().max() < 0.08
+    assert drive.health[-1].left_out == 0
+    assert share_beside_walls(drive.said["state/map"][-1], "loop") < 0.03
