@@ -53,6 +53,7 @@ class ExportFormat(StrEnum):
     ROSBAG2 = "rosbag2"
     TUM = "tum"
     KITTI = "kitti"
+    LEROBOT = "lerobot"
 
 
 LogArgument = Annotated[Path, typer.Argument(help="MCAP file, finished or not.", show_default=False)]
@@ -231,12 +232,12 @@ def export_command(
     end: EndOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Write a log as tables (csv, npz, parquet), ROS 2 bag, MCAP with dates, or trajectories (tum, kitti)."""
+    """Write a log as tables (csv, npz, parquet), bag, MCAP with dates, trajectories or data set (lerobot)."""
     from monstertruckd.recorder.reader import open_log
     from monstertruckd.tools.logs.messages import Selection
 
     selection = Selection(tuple(topics or ()), start, math.inf if end is None else end)
-    with needs_extra("tables" if form is ExportFormat.PARQUET else "logs"):
+    with needs_extra({ExportFormat.PARQUET: "tables", ExportFormat.LEROBOT: "lerobot"}.get(form, "logs")):
         export = _exporter(form)
     reader = open_log(log)
     with reading_log("export", log) as done:
@@ -346,4 +347,6 @@ def _exporter(form: ExportFormat) -> "Callable[[LogReader, Path, Selection, Prog
             from monstertruckd.tools.logs.pose_files import export_tum as export
         case ExportFormat.KITTI:
             from monstertruckd.tools.logs.pose_files import export_kitti as export
+        case ExportFormat.LEROBOT:
+            from monstertruckd.tools.logs.lerobot import export_lerobot as export
     return export

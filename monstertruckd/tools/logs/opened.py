@@ -6,7 +6,6 @@ or go through ``batches``.
 
 import warnings
 from collections.abc import Iterator, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
-from monstertruck_runtime.outside import MOST_PIXELS, reading
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.state import Grid
@@ -25,6 +23,7 @@ from monstertruckd.recorder.reader import LogReader
 from monstertruckd.tools.logs import arrow
 from monstertruckd.tools.logs.export import LOG_TIME
 from monstertruckd.tools.logs.messages import Selection, require_topics
+from monstertruckd.tools.logs.pixels import pixels_of
 from monstertruckd.tools.logs.summary import info
 
 TIME: Final = "time"
@@ -159,16 +158,11 @@ class OpenedLog:
         Raises:
             InputError: a picture is damaged or has too many pixels.
         """
-        from PIL import Image  # noqa: PLC0415 - only for pictures
-
         for time, message in self.messages(topic, start, end):
             where = f"{self._reader.path}: {topic} at {time:.3f} s"
             if not isinstance(data := getattr(message, "data", None), bytes):
                 raise InputError(f"{topic} has no pictures")
-            with reading(Path(where), "a picture"), Image.open(BytesIO(data), formats=["JPEG"]) as image:
-                if image.width * image.height > MOST_PIXELS:
-                    raise InputError(f"{where}: {image.width} x {image.height} pixels: expected at most {MOST_PIXELS}")
-                yield time, np.asarray(image.convert("RGB"))
+            yield time, pixels_of(data, where)
 
     def maps(self, start: float = 0.0, end: float = np.inf) -> Iterator[tuple[float, Grid, NDArray[np.int8]]]:
         """Time (s), map and its cells, shape (height, width), row 0 at the lowest y."""

@@ -1,0 +1,27 @@
+"""Recorded pictures as arrays."""
+
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.outside import MOST_PIXELS, reading
+
+
+def pixels_of(data: bytes, where: str) -> NDArray[np.uint8]:
+    """Decode a JPEG to RGB, shape (height, width, 3).
+
+    Args:
+        data: the file.
+        where: it is from, for the refusal.
+
+    Raises:
+        InputError: it is damaged or has too many pixels.
+    """
+    with reading(Path(where), "a picture"), Image.open(BytesIO(data), formats=["JPEG"]) as image:
+        if image.width * image.height > MOST_PIXELS:
+            raise InputError(f"{where}: {image.width} x {image.height} pixels: expected at most {MOST_PIXELS}")
+        return np.asarray(image.convert("RGB"))
