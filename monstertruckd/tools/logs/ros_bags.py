@@ -74,11 +74,11 @@ def ros_messages(path: Path, version: int) -> Iterator[RawMessage]:
 
 
 def _require_stored(database: Path) -> None:
-    """Check that the database stores its rows.
+    """Check that reading the database gives no more than it stores.
 
     Raises:
-        InputError: it computes rows or columns when it is read, which may never end.
-        sqlite3.DatabaseError: it is damaged.
+        InputError: it computes rows or columns when it is read, or repeats the id of a topic.
+        sqlite3.DatabaseError: it is damaged, e.g. holds pages that are read more than once.
     """
     with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as bag:
         for kind, name, declared in bag.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
@@ -86,6 +86,12 @@ def _require_stored(database: Path) -> None:
                 raise InputError(f"{database}: {name} is computed when it is read: expected stored tables")
             if kind == "table" and any(row[-1] for row in bag.execute("SELECT * FROM pragma_table_xinfo(?)", (name,))):
                 raise InputError(f"{database}: table {name} has computed columns: expected stored ones")
+        ((fault,),) = bag.execute("PRAGMA quick_check(1)").fetchall()
+        if fault != "ok":
+            raise sqlite3.DatabaseError(str(fault).removeprefix("*** in database main ***").strip())
+        repeated = bag.execute("SELECT id FROM topics GROUP BY id HAVING count(*) > 1").fetchone()
+        if repeated is not None:
+            raise InputError(f"{database}: several topics have the id {repeated[0]}: expected an id for each")
 
 
 def _mcap_parts(folder: Path) -> list[Path] | None:

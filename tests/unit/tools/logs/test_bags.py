@@ -255,6 +255,37 @@ def test_a_database_that_computes_its_messages_is_refused(tmp_path: Path, change
             read_scans(path)
 
 
+def test_a_database_whose_messages_belong_to_several_topics_is_refused(tmp_path: Path):
+    """Each message would be read once per topic with its id: the number of rows grows as the square of the file."""
+    bag = write_ros2(tmp_path / "bag", drive(RosMessages(ROS2)))
+    (file,) = bag.glob("*.db3")
+    with closing(sqlite3.connect(file)) as database, database:
+        database.execute("CREATE TABLE repeated AS SELECT * FROM topics UNION ALL SELECT * FROM topics")
+        database.execute("DROP TABLE topics")
+        database.execute("ALTER TABLE repeated RENAME TO topics")
+    with pytest.raises(InputError, match=rf"{file.name}: several topics have the id 1: expected an id for each"):
+        read_scans(bag)
+
+
+def test_a_database_that_uses_its_pages_twice_is_refused(tmp_path: Path):
+    """Pages of a tree that share their children multiply rows at each level."""
+    bag = write_ros2(
+        tmp_path / "bag", [*drive(RosMessages(ROS2)), *(("/scan", stamp(k), b"0" * 900) for k in range(99))]
+    )
+    (file,) = bag.glob("*.db3")
+    with closing(sqlite3.connect(file)) as database:
+        ((root,),) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'")
+        ((size,),) = database.execute("PRAGMA page_size")
+    pages = bytearray(file.read_bytes())
+    page = (root - 1) * size
+    assert pages[page] == 5, "an interior page of a table"
+    first, second = (int.from_bytes(pages[page + 12 + 2 * k : page + 14 + 2 * k]) for k in range(2))
+    pages[page + second : page + second + 4] = pages[page + first : page + first + 4]
+    file.write_bytes(pages)
+    with pytest.raises(InputError, match=r"Rowid \d+ out of order"):
+        read_scans(bag)
+
+
 @contextmanager
 def named(file: Path) -> Iterator[None]:
     try:
