@@ -1,7 +1,7 @@
-"""LeRobot data sets (version 3.0) of a log: one episode at a constant rate, the gate's commands as its actions.
+"""LeRobot data sets (version 3.0) from a log: one episode at a constant frame rate.
 
-Each frame holds what was newest at its time: pose and velocity of the odometry as ``observation.state``, the picture as
-``observation.images.camera`` (H.264), and what the gate sent to drive and steering as ``action``.
+A frame holds the latest messages: odometry (pose and velocity) as ``observation.state``, the camera picture as
+``observation.images.camera`` (H.264), and the gate's drive and steering commands as ``action``.
 """
 
 import json
@@ -44,7 +44,7 @@ _INDICES: Final = ("frame_index", "episode_index", "index", "task_index")
 
 
 class _Statistics:
-    """Running figures of vectors, shape (n,)."""
+    """Running minimum, maximum, mean and standard deviation of vectors, shape (n,)."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -74,11 +74,11 @@ def export_lerobot(
     """Write a data set into a new folder.
 
     Returns:
-        The folder by topic of the log; it is not made if no frame has all the topics.
+        The folder by topic; empty, and no folder, if no frame has all topics.
 
     Raises:
         NotFoundError: no such log.
-        InputError: not a log, it lacks odometry or commands, topics are selected, or the folder cannot be written.
+        InputError: not a log, no odometry or commands, topics selected, or the folder cannot be written.
     """
     if selection.topics:
         raise InputError("a data set takes the topics that it needs: leave the option --topic out")
@@ -112,7 +112,7 @@ def _write(
     actions: Mapping[str, tuple[str, ...]],
     progress: Progress | None,
 ) -> int:
-    """Write all files; returns the number of frames."""
+    """Write all files and return the number of frames."""
     names = tuple(name for row in actions.values() for name in row)
     statistics = {key: _Statistics() for key in ("observation.state", "action", "timestamp", *_INDICES)}
     schema = pa.schema(
@@ -160,7 +160,7 @@ def _write(
 
 
 def _frames(reader: LogReader, selection: Selection, progress: Progress | None) -> Iterator[dict[str, Message]]:
-    """The newest message of each topic at each frame, from when all topics are there."""
+    """Yield the latest message of each topic, frame by frame, once all topics have one."""
     newest: dict[str, Message] = {}
     due: int | None = None
     for entry, message in selection.of(reader, progress):
@@ -187,13 +187,13 @@ def _action(newest: Mapping[str, Message]) -> list[float]:
 
 
 def _made(file: Path) -> Path:
-    """The file's name, with its folder made."""
+    """Make the file's folder and return the file."""
     file.parent.mkdir(parents=True, exist_ok=True)
     return file
 
 
 class _Video:
-    """An H.264 file of pictures of one size, a key frame every second picture: readers seek to single frames."""
+    """H.264 encoder for pictures of one size; a key frame every second picture lets readers seek to single frames."""
 
     def __init__(self, file: Path, log: Path) -> None:
         import av  # noqa: PLC0415 - only where there is a camera
@@ -214,10 +214,10 @@ class _Video:
         self._container.close()
 
     def add(self, message: Message) -> None:
-        """Add a picture; an odd last row or column, which the format cannot hold, is left out.
+        """Encode a picture without an odd last row or column, which the format cannot hold.
 
         Raises:
-            InputError: the picture is damaged, too large, or of another size than the first.
+            InputError: the picture is damaged, too large, or differs in size from the first.
         """
         assert isinstance(message, CompressedImage)
         pixels = pixels_of(message.data, str(self._log))

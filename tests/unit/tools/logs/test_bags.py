@@ -269,9 +269,8 @@ def test_a_database_whose_messages_belong_to_several_topics_is_refused(tmp_path:
 
 def test_a_database_that_uses_its_pages_twice_is_refused(tmp_path: Path):
     """Pages of a tree that share their children multiply rows at each level."""
-    bag = write_ros2(
-        tmp_path / "bag", [*drive(RosMessages(ROS2)), *(("/scan", stamp(k), b"0" * 900) for k in range(99))]
-    )
+    ros = RosMessages(ROS2)
+    bag = write_ros2(tmp_path / "bag", [*drive(ros), *(("/scan", stamp(k), ros.scan(stamp(k))) for k in range(5, 99))])
     (file,) = bag.glob("*.db3")
     with closing(sqlite3.connect(file)) as database:
         ((root,),) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'")

@@ -7,6 +7,7 @@ import json
 import os
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from mcap.writer import Writer as McapWriter
 from typer.testing import CliRunner
@@ -88,6 +89,20 @@ def test_export_lists_what_it_wrote(tmp_path, form):
     assert Path(files["sensor/scan"]).exists()
 
 
+def test_a_data_set_is_one_folder_of_the_topics_that_it_needs(tmp_path):
+    target = tmp_path / "set"
+    done = run("export", GOLDEN, target, "--format", "lerobot", "--end", 10, "--json")
+    assert done.exit_code == 0, done.output
+    topics = ("state/odometry", "cmd/drive", "cmd/steering")
+    assert json.loads(done.stdout) == dict.fromkeys(topics, str(target))
+    frames = json.loads((target / "meta/info.json").read_text())["total_frames"]
+    assert frames == len(pd.read_parquet(target / "data"))
+    assert frames > 30
+    refused = run("export", GOLDEN, target, "--format", "lerobot", "--topic", "sensor/scan")
+    assert refused.exit_code == 3
+    assert "leave the option --topic out" in refused.output
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [
@@ -135,6 +150,7 @@ def damaged(tmp_path):
         ("export", "columns", "-f", "parquet"),
         ("export", "bag", "-f", "ros2"),
         ("export", "poses", "-f", "tum"),
+        ("export", "set", "-f", "lerobot"),
         ("export", "dated.mcap", "-f", "mcap"),
         ("view", "--save", "view.rrd"),
     ],
@@ -219,7 +235,7 @@ def test_info_knows_a_log_that_is_being_written(tmp_path):
     assert "`monstertruckd log recover` repairs it" in run("info", log).output
 
 
-@pytest.mark.parametrize("form", ["csv", "npz", "parquet", "ros2", "mcap", "tum", "kitti"])
+@pytest.mark.parametrize("form", ["csv", "npz", "parquet", "ros2", "mcap", "tum", "kitti", "lerobot"])
 def test_an_interrupted_export_leaves_nothing_that_looks_whole(tmp_path, monkeypatch, form):
     whole = Selection.of
 
@@ -237,7 +253,7 @@ def test_an_interrupted_export_leaves_nothing_that_looks_whole(tmp_path, monkeyp
     assert run("export", GOLDEN, target, "--format", form).exit_code == 6
     left = [path for path in target.rglob("*") if path.is_file() and path.suffix != ".jpeg"] if target.exists() else []
     assert [path.read_text() for path in left] == (["of an earlier run"] if form == "csv" else [])
-    assert form not in ("ros2", "mcap") or not target.exists()
+    assert form not in ("ros2", "mcap", "lerobot") or not target.exists()
 
 
 def test_tables_get_their_names_together(tmp_path, monkeypatch):
