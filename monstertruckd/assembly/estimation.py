@@ -26,7 +26,7 @@ from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_runtime.actors.actor import ActorFactory, Placement, WorkerActor
 from monstertruck_runtime.clock import Clock, VirtualClock
-from monstertruck_runtime.errors import NotInstalledError
+from monstertruck_runtime.extras import not_installed
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.service import Service
 from monstertruck_runtime.threads import in_thread, inline
@@ -209,10 +209,7 @@ def _build_points(
 ) -> PointService:
     camera, slam = config.devices.camera, config.slam
     if camera is not None and find_spec("cv2") is None:
-        raise NotInstalledError(
-            "points: opencv is not installed: it comes with the extra vision (pip install 'monstertruckd[vision]'; "
-            "in a checkout: python3 -m monstertruckd.bootstrap sync)"
-        )
+        raise not_installed("points: opencv", "vision")
     known = slam.map if slam is not None else None if config.planner is None else config.planner.map
     folder = _folder(known)
     mapping = slam is not None and slam.mode == "mapping"

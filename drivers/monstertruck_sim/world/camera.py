@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array, rotation
 from monstertruck_kinematics.se2 import Pose2
-from monstertruck_runtime.errors import NotInstalledError
+from monstertruck_runtime.extras import not_installed
 from monstertruck_sim.world.config import CameraConfig, TagConfig
 from monstertruck_sim.world.noise import CAMERA, generator
 from monstertruck_sim.world.plant import Caster, Plant
@@ -344,10 +344,7 @@ def opencv(key: str) -> Any:
     try:
         import cv2  # noqa: PLC0415  # the library of an extra
     except ModuleNotFoundError as error:
-        raise NotInstalledError(
-            f"{key}: opencv is not installed: it comes with the extra vision "
-            "(pip install 'monstertruckd[vision]'; in a checkout: python3 -m monstertruckd.bootstrap sync)"
-        ) from error
+        raise not_installed(f"{key}: opencv", "vision") from error
     return cv2
 
 

@@ -18,7 +18,8 @@ from monstertruck_drivers.emulation import (
     WheelSource,
 )
 from monstertruck_kinematics.se2 import Pose2
-from monstertruck_runtime.errors import InputError, NotInstalledError
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.extras import not_installed
 from monstertruck_runtime.map_files import load_map
 from monstertruck_sim.world.board import BoardHolder
 from monstertruck_sim.world.built_in import BUILT_IN, BuiltIn
@@ -226,10 +227,7 @@ def make_engine(config: WorldConfig, footprint: PlanOutline, start: Pose2, seed:
         try:
             from monstertruck_sim.world3d.engine import rigid  # noqa: PLC0415  # the library of an extra
         except ModuleNotFoundError as error:
-            raise NotInstalledError(
-                f"sim.world.engine mujoco: {error.name} is not installed: it comes with the extra sim3d "
-                "(pip install 'monstertruckd[sim3d]'; in a checkout: python3 -m monstertruckd.bootstrap sync)"
-            ) from error
+            raise not_installed(f"sim.world.engine mujoco: {error.name}", "sim3d") from error
         return rigid(config, footprint, start, lidar=lidar)
     return plane(config, footprint, start, seed)
 

@@ -12,7 +12,7 @@ import typer
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, robot_on_host
 from monstertruckd.config.wizards import WIZARDS, WizardKind, WizardOption, WizardRun
 from monstertruckd.tools.cli.connection import robot_config, with_robot
-from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_config, with_parameters
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption, bundled, complete_config, with_parameters
 from monstertruckd.tools.cli.output import (
     JsonOption,
     command_group,
@@ -49,7 +49,7 @@ FileOption = Annotated[
     Path | None,
     typer.Option(
         "--config", "-c", help="With --undo and show: this configuration's files, without a daemon.",
-        autocompletion=complete_config,
+        autocompletion=complete_config, callback=bundled,
     ),
 ]  # fmt: skip
 

@@ -86,8 +86,8 @@ async def not_ready(client: "TruckClient") -> str:
     return f"; not ready: {named}" if named else ""
 
 
-EXAMPLES = {"explorer": "configs/explore.yaml", "planner": "configs/goals.yaml", "points": "configs/points.yaml"}
-"""Shipped configurations that have a section."""
+EXAMPLES = {"explorer": "explore", "planner": "goals", "points": "points"}
+"""Bundled configurations that have a section."""
 
 
 async def require_section(client: "TruckClient", section: str, lacks: str) -> Any:
@@ -103,7 +103,7 @@ async def require_section(client: "TruckClient", section: str, lacks: str) -> An
     """
     found = (await client.call("config")).get(section)
     if not found:
-        example = f", as {EXAMPLES[section]} has" if section in EXAMPLES else ""
+        example = f", as the bundled `{EXAMPLES[section]}` has" if section in EXAMPLES else ""
         text = f"{lacks}: expected a section `{section}` in its configuration{example}"
         raise NotFoundError(f"robot {client.robot!r} {text}")
     return found

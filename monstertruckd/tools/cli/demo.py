@@ -22,7 +22,7 @@ from monstertruckd.tools.cli.output import (
     remark,
     until_stopped,
 )
-from monstertruckd.tools.shipped import shipped
+from monstertruckd.tools.shipped import configuration, shipped
 
 if TYPE_CHECKING:
     from monstertruck_runtime.clock import Clock
@@ -132,7 +132,7 @@ def simulate(
     names = [str(config)] if robots is None else robots.split(",")
     if "" in names:
         raise InputError(f"--robots {robots}: expected names of files with one comma between each two")
-    files = list(map(Path, names))
+    files = [configuration(Path(name)) for name in names]
     simulated = as_fleet([load_simulated(file) for file in files])
     code = 0
 

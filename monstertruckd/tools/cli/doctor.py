@@ -9,7 +9,7 @@ import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, robot_on_host
 from monstertruckd.tools.cli.connection import robot_config
-from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_config
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption, bundled, complete_config
 from monstertruckd.tools.cli.output import JsonOption, console, finish, print_json, remark
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ def doctor(
             "-c",
             help="Configuration of the robot; default: the installed service's.",
             autocompletion=complete_config,
+            callback=bundled,
         ),
     ] = None,
     root: Annotated[Path, typer.Option("--root", help="Check the system in this folder instead.")] = Path("/"),

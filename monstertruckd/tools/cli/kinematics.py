@@ -66,14 +66,16 @@ def figure(path: Path, across: str, up: str) -> Iterator[Any]:
     """Axes of a picture that is written when the block ends.
 
     Raises:
-        InputError: matplotlib is not installed, or the file cannot be written.
+        NotInstalledError: matplotlib is not installed.
+        InputError: the file cannot be written.
     """
     from monstertruck_runtime.errors import InputError
+    from monstertruck_runtime.extras import not_installed
 
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise InputError("--png needs matplotlib: install monstertruckd[plot]") from error
+        raise not_installed("--png: matplotlib", "plot") from error
     drawing = Figure(figsize=(7.0, 5.0), layout="constrained")
     axes = drawing.add_subplot()
     axes.set_xlabel(across)

@@ -261,7 +261,7 @@ def save(
             except TimeoutError:
                 text = f"{robot} published no map within {timeout:g} s"
                 if (await client.call("config")).get("slam") is None:
-                    text += ": its configuration has no section `slam`, as configs/slam.yaml has"
+                    text += ": its configuration has no section `slam`, as the bundled `slam` has"
                 raise NoAnswerError(text + await not_ready(client)) from None
 
     grid = with_robot(newest, robot, endpoint, named=False)

@@ -10,6 +10,7 @@ from monstertruck_runtime.errors import ConfigError, InputError, NotFoundError
 from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_end, print_json, print_table, print_words
+from monstertruckd.tools.shipped import shipped
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 app = command_group("Missions: steps that the robot does one after the other.")
 
 WITHOUT = "does no missions"
+MISSIONS = shipped("configs/missions")
 FileArgument = Annotated[Path, typer.Argument(help="Mission (YAML).", show_default=False)]
 
 
@@ -77,7 +79,7 @@ def check_command(file: FileArgument, json_output: JsonOption = False) -> None:
 
 @app.command("list")
 def list_command(
-    folder: Annotated[Path, typer.Argument(help="Folder with missions.")] = Path("configs/missions"),
+    folder: Annotated[Path, typer.Argument(help="Folder with missions.")] = MISSIONS,
     json_output: JsonOption = False,
 ) -> None:
     """Print the missions of a folder, and what is wrong with those that cannot be run."""

@@ -12,6 +12,7 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, is_endpoint, neares
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.output import WHICH_ROBOT
 from monstertruckd.tools.cli.places import only_robot
+from monstertruckd.tools.shipped import configuration, names
 
 ALWAYS: Final = "estop"
 """Command that is never refused because several robots answer: it goes to the default port at once."""
@@ -48,9 +49,14 @@ def complete_role(incomplete: str) -> list[str]:
 
 
 def complete_config(incomplete: str) -> list[str]:
-    """Configurations of the folder ``configs``; for anything else the shell completes file names itself."""
+    """Bundled configurations, and those of the folder ``configs``; the shell completes other file names itself."""
     files = (*Path("configs").glob("*.yaml"), *Path("configs", "robots").glob("*.yaml"))
-    return sorted(str(file) for file in files if str(file).startswith(incomplete))
+    return [word for word in (*names(), *sorted(map(str, files))) if word.startswith(incomplete)]
+
+
+def bundled(given: Path | None) -> Path | None:
+    """The file that an option or argument for a configuration means; see ``configuration``."""
+    return None if given is None else configuration(given)
 
 
 def _noted(context: typer.Context, option: typer.CallbackParam, value: str) -> str:
@@ -92,19 +98,29 @@ ConfigOption = Annotated[
     typer.Option(
         "--config",
         "-c",
-        help="Configuration of this robot or experiment (YAML).",
+        help="Configuration of this robot or experiment: a file (YAML), or a bundled one by name, such as goals.",
         show_default=False,
         autocompletion=complete_config,
+        callback=bundled,
     ),
 ]
 SimulatedOption = Annotated[
     Path,
-    typer.Option("--config", "-c", help="Configuration of a simulated robot.", autocompletion=complete_config),
+    typer.Option(
+        "--config",
+        "-c",
+        help="Configuration of a simulated robot: a file, or a bundled one by name, such as goals or mecanum.",
+        autocompletion=complete_config,
+        callback=bundled,
+    ),
 ]
 ConfigArgument = Annotated[
     Path,
     typer.Argument(
-        help="Configuration (YAML), e.g. configs/demo.yaml.", show_default=False, autocompletion=complete_config
+        help="Configuration: a file (YAML), or a bundled one by name, such as demo.",
+        show_default=False,
+        autocompletion=complete_config,
+        callback=bundled,
     ),
 ]
 TopicArgument = Annotated[

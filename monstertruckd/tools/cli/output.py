@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol, TextIO, cast
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from monstertruck_runtime.errors import NotInstalledError, RequestRefusedError, TruckError, disk_reason
+from monstertruck_runtime.errors import RequestRefusedError, TruckError, disk_reason
+from monstertruck_runtime.extras import not_installed
 from monstertruck_schemas.reasons import Reason
 
 if TYPE_CHECKING:
@@ -214,9 +215,7 @@ def needs_extra(name: str) -> Iterator[None]:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("monstertruck"):
             raise
-        text = f"{error.name} is not installed: it comes with the extra {name!r} "
-        text += f"(pip install 'monstertruckd[{name}]'; in a checkout: python3 -m monstertruckd.bootstrap sync)"
-        raise NotInstalledError(text) from None
+        raise not_installed(error.name, name) from None
 
 
 REMEDIES: Final = {

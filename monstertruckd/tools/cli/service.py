@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from monstertruck_runtime.errors import NotPermittedError
-from monstertruckd.tools.cli.options import complete_config
+from monstertruckd.tools.cli.options import bundled, complete_config
 from monstertruckd.tools.cli.output import JsonOption, print_json, remark
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def install_service(
             "-c",
             help="Configuration of the robot, copied to /etc/monstertruckd; default: the one that is there.",
             autocompletion=complete_config,
+            callback=bundled,
         ),
     ] = None,
     user: Annotated[

@@ -1,14 +1,14 @@
 """Checks of Python, packages, configuration, the installed service and its rights."""
 
 import platform
-import re
 import sys
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 
 from monstertruck_estimation.consistency.config import SCAN_LIBRARIES
 from monstertruck_runtime.errors import TruckError
+from monstertruck_runtime.extras import DISTRIBUTION, Requirement, pip_command
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import COMPASS, SCAN
 from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine, warn
@@ -36,15 +36,19 @@ def python(context: HostContext, machine: str = platform.machine()) -> Iterator[
 def packages(context: HostContext, requirements: list[str] | None = None) -> Iterator[Finding]:
     """Packages of every extra; those that a robot needs must be installed."""
     if requirements is None:
-        requirements = metadata.requires("monstertruckd") or []
+        requirements = metadata.requires(DISTRIBUTION) or []
     missing = _missing(context, requirements)
     if lacking := [*missing.pop("", []), *missing.pop(NEEDED, [])]:
-        seen = f"missing: {', '.join(lacking)}"
-        yield fail("packages", Reason.NOT_INSTALLED, seen, _install_command(context))
+        seen = f"missing: {', '.join(row.name for row in lacking)}"
+        yield fail("packages", Reason.NOT_INSTALLED, seen, _install_command(context, lacking))
     else:
         yield fine("packages", f"all for a {NEEDED}")
-    whole = sorted(extra for extra, names in missing.items() if not names)
-    rest = [f"{extra} ({', '.join(names)})" for extra, names in sorted(missing.items()) if names and extra not in OURS]
+    whole = sorted(extra for extra, rows in missing.items() if not rows)
+    rest = [
+        f"{extra} ({', '.join(row.name for row in rows)})"
+        for extra, rows in sorted(missing.items())
+        if rows and extra not in OURS
+    ]
     ours = sorted(extra for extra in OURS if missing.get(extra))
     seen = f"installed: {', '.join(extra for extra in whole if extra not in OURS) or 'none'}"
     seen += f"; incomplete: {'; '.join(rest)}" if rest else ""
@@ -87,11 +91,13 @@ def motion(context: HostContext) -> Iterator[Finding]:
     yield fine("motion", seen)
     if scans == "kiss" and context.versions("kiss-icp") is None:
         text = "kiss-icp is not installed: this repository's own scan odometry measures the motion"
-        yield warn("scan odometry", Reason.NOT_INSTALLED, text, _install_command(context))
+        kiss = [Requirement.parse("kiss-icp")]
+        yield warn("scan odometry", Reason.NOT_INSTALLED, text, _install_command(context, kiss))
     missing = [name for name in SCAN_LIBRARIES if context.versions(name) is None]
     if scans is not None and missing:
         text = f"{', '.join(missing)} not installed: the motion by scans is not measured"
-        yield warn("scan odometry", Reason.NOT_INSTALLED, text, _install_command(context))
+        lacking = [Requirement.parse(name) for name in missing]
+        yield warn("scan odometry", Reason.NOT_INSTALLED, text, _install_command(context, lacking))
 
 
 def sensors(context: HostContext) -> Iterator[Finding]:
@@ -108,25 +114,23 @@ def sensors(context: HostContext) -> Iterator[Finding]:
         yield fail("scan", Reason.SCAN_STALE, seen)
 
 
-def _missing(context: HostContext, requirements: list[str]) -> dict[str, list[str]]:
+def _missing(context: HostContext, requirements: list[str]) -> dict[str, list[Requirement]]:
     """Absent distributions by extra; "" = needed always."""
-    missing: dict[str, list[str]] = {}
-    for requirement in requirements:
-        name = re.match(r"[\w.-]+", requirement)
-        extra = re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
-        if name is None or name[0] == "monstertruckd":
+    missing: dict[str, list[Requirement]] = {}
+    for row in map(Requirement.parse, requirements):
+        if row.name == DISTRIBUTION:
             continue
-        absent = missing.setdefault(extra[1] if extra is not None else "", [])
-        if context.versions(name[0]) is None:
-            absent.append(name[0])
+        absent = missing.setdefault(row.extra, [])
+        if context.versions(row.name) is None:
+            absent.append(row)
     return missing
 
 
-def _install_command(context: HostContext) -> str:
-    checkout = context.program.neutral.parents[1]
-    if (checkout / "pyproject.toml").is_file():
-        return f"cd {checkout} && python3 -m monstertruckd.bootstrap sync"
-    return f"{context.program.python} -m pip install 'monstertruckd[{NEEDED}]'"
+def _install_command(context: HostContext, lacking: Sequence[Requirement]) -> str:
+    folder = context.program.neutral.parents[1]
+    if (folder / "pyproject.toml").is_file():
+        return f"cd {folder} && python3 -m monstertruckd.bootstrap sync"
+    return pip_command(str(context.program.python), lacking)
 
 
 async def service(context: HostContext) -> AsyncIterator[Finding]:

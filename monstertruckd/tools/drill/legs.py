@@ -16,6 +16,7 @@ from typing import Any, Final, Generic, TypeVar
 from pydantic import TypeAdapter
 
 from monstertruck_runtime.errors import InputError, NoAnswerError, WorkerError
+from monstertruck_runtime.extras import not_installed
 from monstertruck_runtime.outside import MEGABYTE, contents, reading
 from monstertruckd import __version__
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
@@ -240,7 +241,7 @@ def on_cluster(address: str, step: Callable[[T], U], inputs: Sequence[T]) -> Ite
         inputs: one each.
 
     Raises:
-        InputError: dask.distributed is not installed.
+        NotInstalledError: dask.distributed is not installed.
         NoAnswerError: no scheduler answers.
         WorkerError: workers died of one input three times in a row.
         Exception: what ``step`` raised.
@@ -248,7 +249,7 @@ def on_cluster(address: str, step: Callable[[T], U], inputs: Sequence[T]) -> Ite
     try:
         from distributed import Client, KilledWorker  # noqa: PLC0415  # an extra
     except ImportError as error:
-        raise InputError("--cluster needs dask.distributed: install monstertruckd[cluster]") from error
+        raise not_installed("--cluster: dask.distributed", "cluster") from error
     try:
         client = Client(address, timeout=CONNECT)
     except (OSError, ValueError) as error:

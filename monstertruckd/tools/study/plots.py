@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.extras import not_installed
 from monstertruckd.tools.study.analysis import Circle, centre_track, velocities
 from monstertruckd.tools.study.log import Run
 from monstertruckd.tools.study.report import Result
@@ -70,12 +71,13 @@ def draw(results: Sequence[Result], folder: Path) -> list[Path]:
     """Draw the figures of which there are runs; returns the files, ``figure_06.png`` and so on.
 
     Raises:
-        InputError: matplotlib is not installed, or a file cannot be written.
+        NotInstalledError: matplotlib is not installed.
+        InputError: a file cannot be written.
     """
     try:
         from matplotlib.figure import Figure  # noqa: PLC0415  # optional
     except ImportError as error:
-        raise InputError("the figures need matplotlib: install monstertruckd[plot]") from error
+        raise not_installed("figures: matplotlib", "plot") from error
     written = []
     for number, title, ratio, what in FIGURES:
         chosen = [(run, found) for run, found in results if _belongs(run, ratio)]

@@ -184,9 +184,9 @@ FOREIGN = {
     "python3 -m monstertruckd.bootstrap sync": "sets up .venv; tests/unit/test_bootstrap.py checks what it runs",
     "python docs/site/build.py": "test_site.py builds it into another folder",
     "python -m benchmarks.thesis --only 5.1 5.5": "drives for minutes; slowness and scores have their tests",
-    "pip install 'monstertruckd[ros2]'": "needs a package index; the extra is looked up",
-    "pip install 'monstertruckd[tables]'": "needs a package index; the extra is looked up",
-    "pip install 'monstertruckd[view]'": "needs a package index; the extra is looked up",
+    "pip install '.[ros2]'": "needs a package index; the extra is looked up",
+    "pip install '.[tables]'": "needs a package index; the extra is looked up",
+    "pip install '.[view]'": "needs a package index; the extra is looked up",
     "systemctl status monstertruckd": "needs an installed service; the unit's name is looked up",
     "journalctl -u monstertruckd -f": "needs an installed service; the unit's name is looked up",
 }

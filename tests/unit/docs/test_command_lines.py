@@ -63,7 +63,7 @@ def test_the_pages_have_command_lines():
 @pytest.mark.parametrize("line", [line for line in lines() if not is_ours(line)], ids=lambda line: line.text)
 def test_lines_of_other_programs_are_known(line: Line):
     assert line.text in FOREIGN, f"{line.place}: say in FOREIGN why {line.text!r} is not run"
-    if extra := re.search(r"monstertruckd\[(\w+)\]", line.text):
+    if extra := re.search(r"'\.\[(\w+)\]'", line.text):
         project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
         assert extra[1] in project["optional-dependencies"]
     if "ctl " in line.text:

@@ -7,10 +7,13 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
+from typer.testing import CliRunner
 
+from monstertruck_runtime.errors import ConfigError
 from monstertruckd.config.load import load_config
 from monstertruckd.tools import shipped as places
 from monstertruckd.tools.cli.demo import DEMO_CONFIG
+from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -24,6 +27,46 @@ def test_a_file_is_looked_for_in_the_package_and_in_the_checkout(tmp_path: Path,
         (folder / "configs").mkdir(parents=True)
         (folder / "configs" / "a.yaml").touch()
         assert places.shipped("configs/a.yaml") == folder / "configs" / "a.yaml"
+
+
+def test_a_bundled_configuration_is_found_by_name_in_every_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    goals, mecanum = ROOT / "configs/goals.yaml", ROOT / "configs/robots/mecanum.yaml"
+    assert {places.configuration(Path(name)) for name in ("goals", "configs/goals.yaml")} == {goals}
+    found = {places.configuration(Path(name)) for name in ("mecanum", "robots/mecanum", "configs/robots/mecanum.yaml")}
+    assert found == {mecanum}
+    assert places.configuration(Path("truck")) == ROOT / "configs/truck.yaml", "before that of robots"
+    assert {"goals", "robots/mecanum"} <= {*places.names()}
+    for name in places.names():
+        assert places.configuration(Path(name)).is_file()
+
+
+def test_a_file_comes_before_a_bundled_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    own = Path("configs/goals.yaml")
+    own.parent.mkdir()
+    own.touch()
+    assert places.configuration(own) == own
+    Path("goals").mkdir()
+    assert places.configuration(Path("goals")) == ROOT / "configs/goals.yaml", "a folder is no configuration"
+
+
+def test_an_unknown_name_is_refused_with_the_nearest_or_with_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"^gaols: no file and no bundled configuration; did you mean 'goals'\?$"):
+        places.configuration(Path("gaols"))
+    with pytest.raises(ConfigError, match=r"expected a file or one of .*explore, .*robots/mecanum"):
+        places.configuration(Path("zzz"))
+    assert places.configuration(Path("mine.yaml")) == Path("mine.yaml"), "the reader says that it is missing"
+    assert places.configuration(tmp_path / "goals.yaml") == tmp_path / "goals.yaml", "an absolute name is a file's"
+
+
+def test_commands_take_a_bundled_configuration_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    shown = CliRunner().invoke(app, ["config", "show", "mecanum", "--key", "robot"])
+    assert (shown.exit_code, "mecanum" in shown.stdout) == (0, True), shown.output
+    refused = CliRunner().invoke(app, ["simulate", "--robots", "mecanum,gaols"])
+    assert "gaols: no file and no bundled configuration" in refused.output
 
 
 def test_the_demos_configuration_is_there():

@@ -23,6 +23,8 @@ def test_configurations_of_the_folder(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(ROOT)
     assert complete_config("configs/d") == ["configs/demo.yaml"]
     assert "configs/robots/omni.yaml" in complete_config("")
+    assert complete_config("go") == ["goals"], "a bundled one"
+    assert "robots/omni" in complete_config("robots/")
     assert complete_config("elsewhere/") == [], "the shell completes files itself"
 
 

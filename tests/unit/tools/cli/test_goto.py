@@ -47,7 +47,7 @@ def test_a_robot_without_a_planner_is_reported(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("monstertruck_runtime.client.TruckClient", Unplanned)
     done = CliRunner().invoke(app, ["goto", "1", "0", "0"])
     assert done.exit_code == Reason.NOT_FOUND.exit_code
-    text = "expected a section `planner` in its configuration, as configs/goals.yaml has"
+    text = "expected a section `planner` in its configuration, as the bundled `goals` has"
     assert done.output.splitlines()[1:] == [f"robot 'truck' has no planner: {text}"]
 
 

@@ -48,7 +48,7 @@ WRONG = (
     (
         "simulate -c configs/truck.yaml",
         2,
-        "configs/truck.yaml: describes a real robot: it has no section `sim`, as conf",
+        "configs/truck.yaml: describes a real robot: it has no section `sim`, as the b",
     ),
     ("simulate --robots configs/demo.yaml,", 3, "--robots configs/demo.yaml,: expected names of files with one comma"),
     ("set gate.speed nan", 3, "gate.speed nan: expected a finite number"),
@@ -64,7 +64,7 @@ WRONG = (
     (
         "demo -c configs/truck.yaml --fast",
         2,
-        "configs/truck.yaml: describes a real robot: it has no section `sim`, as conf",
+        "configs/truck.yaml: describes a real robot: it has no section `sim`, as the b",
     ),
     ("drill --nope", 2, "Error: No such option: --nope"),
     ("drill x y", 2, "Error: Got unexpected extra argument(s) (x y)"),
@@ -85,7 +85,11 @@ WRONG = (
         3,
         "configs/goals.yaml: no map: expected the folder of a saved map, or a map_server",
     ),
-    ("config show", 2, "Error: Missing argument 'config'. Configuration (YAML), e.g. configs/demo.yaml. Try '"),
+    (
+        "config show",
+        2,
+        "Error: Missing argument 'config'. Configuration: a file (YAML), or a bundled one by n",
+    ),
     ("map show", 2, "Error: Missing argument 'place'."),
     ("map localise", 2, "Error: Missing argument 'log'."),
     ("config show configs/truck.yaml extra", 2, "Error: Got unexpected extra argument(s) (extra)"),

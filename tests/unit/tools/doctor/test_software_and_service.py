@@ -45,7 +45,7 @@ def test_packages_of_a_robot_must_be_there_others_may(tmp_path: Path):
     lacking = see(tmp_path / "b", check, without("mcap", "numpy"))["packages"]
     assert lacking.reason is Reason.NOT_INSTALLED
     assert lacking.seen == "missing: numpy, mcap"
-    assert lacking.fix == "/opt/monstertruckd/.venv/bin/python -m pip install 'monstertruckd[robot]'"
+    assert lacking.fix == "/opt/monstertruckd/.venv/bin/python -m pip install 'numpy>=2' 'mcap>=1.3'"
 
     def in_a_checkout(emulated: EmulatedHost) -> None:
         without("mcap")(emulated)

@@ -1,0 +1,94 @@
+"""Extras of the distribution: what they bring, and the command that installs what is missing.
+
+The distribution itself is in no package index, so a command names the packages that an extra brings.
+"""
+
+import json
+import re
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from importlib import metadata
+from typing import Final, NamedTuple
+from urllib.parse import unquote, urlparse
+
+from monstertruck_runtime.errors import NotInstalledError
+
+DISTRIBUTION: Final = "monstertruckd"
+
+
+class Requirement(NamedTuple):
+    """One line of a distribution's metadata."""
+
+    name: str
+    inner: tuple[str, ...]
+    """Extras of the required distribution."""
+    versions: str
+    """Such as ``>=1.3``; empty if every version will do."""
+    extra: str
+    """Extra that requires it; empty if it is always required."""
+
+    @classmethod
+    def parse(cls, line: str) -> "Requirement":
+        """Parse a requirement (PEP 508, without a URL).
+
+        Raises:
+            ValueError: it begins with no name.
+        """
+        found = re.match(r"\s*([\w.-]+)\s*(?:\[([^]]*)\])?\s*\(?([^;()]*)\)?", line)
+        if found is None:
+            raise ValueError(f"requirement {line!r}: expected a name")
+        extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", line)
+        inner = tuple(part.strip() for part in (found[2] or "").split(",") if part.strip())
+        return cls(found[1], inner, found[3].strip(), "" if extra is None else extra[1])
+
+
+def required(extra: str, lines: Sequence[str]) -> Iterator[Requirement]:
+    """Requirements of an extra in a distribution's metadata, including those of the extras that it names itself."""
+    for line in lines:
+        requirement = Requirement.parse(line)
+        if requirement.extra != extra:
+            continue
+        if requirement.name == DISTRIBUTION:
+            for inner in requirement.inner:
+                yield from required(inner, lines)
+        else:
+            yield requirement
+
+
+def lacking(extra: str) -> list[Requirement]:
+    """Requirements of an extra of which no version is installed."""
+    return [row for row in required(extra, metadata.requires(DISTRIBUTION) or ()) if not _installed(row.name)]
+
+
+def _installed(name: str) -> bool:
+    try:
+        metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def pip_command(python: str, requirements: Sequence[Requirement]) -> str:
+    """The command that installs packages from an index."""
+    return shlex.join([python, "-m", "pip", "install", *(row.name + row.versions for row in requirements)])
+
+
+def checkout() -> str | None:
+    """Folder of the checkout from which the program runs; None if it runs from an installed wheel."""
+    try:
+        origin = metadata.distribution(DISTRIBUTION).read_text("direct_url.json")
+    except metadata.PackageNotFoundError:
+        return None
+    facts = json.loads(origin or "{}")
+    return unquote(urlparse(facts["url"]).path) if facts.get("dir_info", {}).get("editable") else None
+
+
+def not_installed(what: str, extra: str) -> NotInstalledError:
+    """The error of a missing library: what it is, the extra that brings it, and the command that installs that."""
+    folder = checkout()
+    if folder is not None:
+        command = f"cd {shlex.quote(folder)} && python3 -m monstertruckd.bootstrap sync"
+    else:
+        command = pip_command(sys.executable, lacking(extra))
+    return NotInstalledError(f"{what} is not installed; the extra {extra!r} contains it: {command}")
