@@ -1,39 +1,36 @@
-"""The action ``navigate_to_pose`` of Nav2, driven by the robot's own planner.
+"""Action servers of ROS 2 for what the robot can do, whichever action it is.
 
-Feedback goes out in two editions, for Lyrical has another hash of it than Jazzy and Kilted. A goal that the robot
-refuses is accepted first and then aborted: only a result can say why.
+An action has one edition for each set of fields that the distributions know. All editions of the node's distributions
+are served at once: where their hashes differ, they are different services and topics on the wire. A goal that the robot
+refuses is accepted first and then aborted: only a result has room for the reason.
 """
 
 import asyncio
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Final
+from functools import partial
+from typing import Any, ClassVar, Final, Generic, TypeVar
 
 from monstertruck_runtime.client import TruckClient
-from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.drives import run_task
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, RequestRefusedError, TruckError
-from monstertruck_schemas.plan import GoalState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import GoalOrder
-from monstertruck_schemas.roles import ServiceName
-from monstertruck_schemas.topics import GOAL, POSE
 from monstertruckd.ros2 import convert
 from monstertruckd.ros2.cdr import RosMessage
+from monstertruckd.ros2.convert import RosValues
+from monstertruckd.ros2.interfaces import action_edition, interfaces, type_hash
 from monstertruckd.ros2.node import RosNode, RosSender
 from monstertruckd.ros2.operators import Operators, stamp_of
 from monstertruckd.ros2.rmw import LATCHED, RELIABLE
 
-NAME: Final = "navigate_to_pose"
-ACTION: Final = "nav2_msgs/action/NavigateToPose"
 KEPT: Final = 32
-"""Goals whose result can still be asked for."""
+"""Number of goals whose result can still be requested."""
 FAILED: Final = 9000
-"""``error_code`` of a goal that failed; ``error_msg`` says why."""
+"""``error_code`` of a goal that failed; ``error_msg`` gives the reason."""
 
-GoalPose = tuple[tuple[float, float, float], str]
-"""x, y (m), yaw (rad), and the frame as the robot calls it."""
+W = TypeVar("W")
 
 
 class GoalStatus(IntEnum):
@@ -63,28 +60,61 @@ class CancelCode(IntEnum):
 
 
 @dataclass(slots=True)
-class ActionGoal:
+class ActionGoal(Generic[W]):
     """One goal."""
 
     number: bytes
     """Its UUID."""
     stamp: int
     """When it was accepted, real time, ns."""
+    work: W
+    """What the robot has to do."""
     status: GoalStatus = GoalStatus.ACCEPTED
     text: str = ""
     """Why it failed."""
     ended: asyncio.Event = field(default_factory=asyncio.Event)
-    driver: TruckClient | None = None
-    """Session of the node that sent it."""
     task: asyncio.Task[None] | None = None
 
-    def result(self) -> Mapping[str, Any]:
-        """``nav2_msgs/action/NavigateToPose_GetResult_Response``."""
-        code = 0 if self.status is GoalStatus.SUCCEEDED else FAILED
-        return {"status": int(self.status), "result": {"error_code": code, "error_msg": self.text}}
+
+class RobotAction(ABC, Generic[W]):
+    """What the robot does for the goals of one action; ``W`` is a goal as the robot understands it."""
+
+    name: ClassVar[str]
+    interface: ClassVar[str]
+
+    @abstractmethod
+    def read(self, goal: RosMessage) -> W:
+        """Return what a goal asks for.
+
+        Raises:
+            InputError: the robot could misunderstand it.
+        """
+
+    @abstractmethod
+    async def drive(self, driver: TruckClient, work: W, show: Callable[[RosValues], None]) -> tuple[Reason, str]:
+        """Have the robot do it; returns the outcome and its text. Cancelled, it stops what it has begun.
+
+        Args:
+            driver: session of the node that sent the goal.
+            work: of ``read``.
+            show: gets feedback, with the fields of all editions.
+
+        Raises:
+            TruckError: refused, or no answer.
+        """
+
+    def result(self, work: W, status: GoalStatus) -> RosValues:
+        """Return fields of the result besides ``error_code`` and ``error_msg``."""
+        return {}
 
 
-def chosen(goals: Mapping[bytes, ActionGoal], number: bytes, stamp: int) -> tuple[CancelCode, list[ActionGoal]]:
+def within(interface: str, values: Mapping[str, Any]) -> RosValues:
+    """Values of the fields that an edition has."""
+    names = {own.name for own in interfaces()[interface]}
+    return {name: value for name, value in values.items() if name in names}
+
+
+def chosen(goals: Mapping[bytes, ActionGoal[W]], number: bytes, stamp: int) -> tuple[CancelCode, list[ActionGoal[W]]]:
     """Goals that a request to cancel means: one, all until a time, or all.
 
     Args:
@@ -106,48 +136,48 @@ def chosen(goals: Mapping[bytes, ActionGoal], number: bytes, stamp: int) -> tupl
     return (CancelCode.NONE if found else CancelCode.REJECTED), found
 
 
-class NavigateToPose:
-    """The action server.
+class ActionServer(Generic[W]):
+    """Serves one action.
 
     Args:
+        action: what the robot does.
         node: of ROS 2.
         operators: sessions of the nodes that send goals.
-        client: follows the robot's pose.
-        pose_in: reads a ``geometry_msgs/msg/PoseStamped``; raises ``InputError`` for another frame.
-        names: stamps and frames, as they are now.
+        active: whether goals are accepted at present.
         clock: time.
     """
 
     def __init__(
-        self,
-        node: RosNode,
-        operators: Operators,
-        client: TruckClient,
-        pose_in: Callable[[RosMessage], GoalPose],
-        names: Callable[[], convert.RosNames],
-        clock: Clock,
+        self, action: RobotAction[W], node: RosNode, operators: Operators, active: Callable[[], bool], clock: Clock
     ) -> None:
+        self._action = action
         self._operators = operators
-        self._pose_in = pose_in
-        self._names = names
+        self._active = active
         self._clock = clock
-        self._pose = client.watch(POSE)
-        self._goals: dict[bytes, ActionGoal] = {}
-        action = f"{NAME}/_action"
+        self._goals: dict[bytes, ActionGoal[W]] = {}
+        place = f"{action.name}/_action"
+        editions = [action_edition(action.interface, name) for name in node.distributions]
         self._feedback = [
-            node.publisher(f"{action}/feedback", f"{ACTION}{edition}_FeedbackMessage", RELIABLE)
-            for edition in ("", "@lyrical")
+            (f"{edition}_Feedback", node.publisher(f"{place}/feedback", f"{edition}_FeedbackMessage", RELIABLE))
+            for edition in _distinct(editions, "_FeedbackMessage")
         ]
-        self._statuses = node.publisher(f"{action}/status", "action_msgs/msg/GoalStatusArray", LATCHED)
-        node.serve(f"{action}/send_goal", f"{ACTION}_SendGoal", self._send_goal)
-        node.serve(f"{action}/cancel_goal", "action_msgs/srv/CancelGoal", self._cancel_goal)
-        node.serve(f"{action}/get_result", f"{ACTION}_GetResult", self._get_result)
+        self._statuses = node.publisher(f"{place}/status", "action_msgs/msg/GoalStatusArray", LATCHED)
+        node.serve(f"{place}/cancel_goal", "action_msgs/srv/CancelGoal", self._cancel_goal)
+        for edition in _distinct(editions, "_SendGoal"):
+            node.serve(f"{place}/send_goal", f"{edition}_SendGoal", self._send_goal)
+        for edition in _distinct(editions, "_GetResult"):
+            answer = partial(self._get_result, f"{edition}_Result")
+            node.serve(f"{place}/get_result", f"{edition}_GetResult", answer)
 
     def close(self) -> None:
         """Give up all goals."""
         for goal in self._goals.values():
             if goal.task is not None:
                 goal.task.cancel()
+
+    def cancel_all(self) -> None:
+        """Cancel all goals as a client does."""
+        self._cancel(goal for goal in self._goals.values() if not goal.status.ended)
 
     def _real_time(self) -> int:
         return self._clock.now() + self._clock.real_offset()
@@ -156,22 +186,23 @@ class NavigateToPose:
         number, now = bytes(request["goal_id"]["uuid"]), self._real_time()
         stamp = convert.RosNames().time(now)
         refused = {"accepted": False, "stamp": stamp}
+        name = self._action.name
         if sender is None:
-            self._operators.refuse("an unknown client", NAME, "the graph has no client with its identity")
+            self._operators.refuse("an unknown client", name, "the graph has no client with its identity")
             return refused
         try:
-            if request["goal"]["behavior_tree"]:
-                raise InputError("behavior_tree: expected none, the robot plans itself")
-            pose, frame = self._pose_in(request["goal"]["pose"])
+            if not self._active():
+                raise InputError("navigation is paused: resume it by lifecycle_manager_navigation")
+            work = self._action.read(request["goal"])
             if number in self._goals:
                 raise InputError("its UUID is that of another goal")
         except InputError as error:
-            self._operators.refuse(sender.node, NAME, str(error))
+            self._operators.refuse(sender.node, name, str(error))
             return refused
-        goal = self._goals[number] = ActionGoal(number, now)
+        goal = self._goals[number] = ActionGoal(number, now, work)
         self._forget_oldest()
         self._publish_status()
-        goal.task = asyncio.create_task(self._pursue(goal, sender, pose, frame))
+        goal.task = asyncio.create_task(self._pursue(goal, sender))
         return {"accepted": True, "stamp": stamp}
 
     def _forget_oldest(self) -> None:
@@ -179,37 +210,31 @@ class NavigateToPose:
         for number in ended[: max(len(self._goals) - KEPT, 0)]:
             del self._goals[number]
 
-    async def _pursue(self, goal: ActionGoal, sender: RosSender, pose: tuple[float, float, float], frame: str) -> None:
+    async def _pursue(self, goal: ActionGoal[W], sender: RosSender) -> None:
         status, text = GoalStatus.ABORTED, "given up"
         try:
-            driver = goal.driver = await self._operators.session(sender)
+            driver = await self._operators.session(sender)
             self._change(goal, GoalStatus.EXECUTING)
-            end = await run_task(
-                driver,
-                GOAL,
-                ServiceName.GOALS,
-                lambda: driver.goal(pose, frame),
-                lambda: driver.goal_control(GoalOrder.CANCEL, own=True),
-                lambda state: self._publish_feedback(goal, state),
-                arm=False,
-                waits=True,
-                clock=self._clock,
-            )
-            text = f"{end.reason.value}: {end.text or end.reason.text}"
-            if end.reason is Reason.GOAL_REACHED:
+            reason, words = await self._action.drive(driver, goal.work, partial(self._show, goal))
+            text = f"{reason.value}: {words or reason.text}"
+            if reason is Reason.GOAL_REACHED:
                 status, text = GoalStatus.SUCCEEDED, ""
-            elif end.reason is Reason.CANCELLED and goal.status is GoalStatus.CANCELING:
+            elif reason is Reason.CANCELLED and goal.status is GoalStatus.CANCELING:
                 status = GoalStatus.CANCELED
         except TruckError as error:
             reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
             text = f"{reason.value}: {error}"
-            self._operators.refuse(sender.node, NAME, text)
+            self._operators.refuse(sender.node, self._action.name, text)
+        except asyncio.CancelledError:
+            if goal.status is not GoalStatus.CANCELING:
+                raise
+            status, text = GoalStatus.CANCELED, f"{Reason.CANCELLED.value}: {Reason.CANCELLED.text}"
         finally:
             goal.text = text
             self._change(goal, status)
             goal.ended.set()
 
-    def _change(self, goal: ActionGoal, status: GoalStatus) -> None:
+    def _change(self, goal: ActionGoal[W], status: GoalStatus) -> None:
         goal.status = status
         self._publish_status()
 
@@ -218,37 +243,38 @@ class NavigateToPose:
         self._statuses({"status_list": rows})
 
     @staticmethod
-    def _info(goal: ActionGoal) -> dict[str, Any]:
+    def _info(goal: ActionGoal[W]) -> RosValues:
         return {"goal_id": {"uuid": goal.number}, "stamp": convert.RosNames().time(goal.stamp)}
 
-    def _publish_feedback(self, goal: ActionGoal, state: GoalState) -> None:
-        pose, names = self._pose.latest, self._names()
-        seconds, rest = divmod(state.elapsed, 1.0)
-        values: dict[str, Any] = {
-            "navigation_time": {"sec": int(seconds), "nanosec": int(rest * SECOND)},
-            "number_of_recoveries": state.recoveries,
-            "distance_remaining": state.remaining,
-        }
-        if pose is not None:
-            values["current_pose"] = {"header": names.header(pose), "pose": convert.pose_of(pose.pose)}
-        for publish in self._feedback:
-            publish({"goal_id": {"uuid": goal.number}, "feedback": values})
+    def _show(self, goal: ActionGoal[W], values: RosValues) -> None:
+        for interface, publish in self._feedback:
+            publish({"goal_id": {"uuid": goal.number}, "feedback": within(interface, values)})
+
+    def _cancel(self, goals: Iterable[ActionGoal[W]]) -> None:
+        for goal in goals:
+            if goal.task is not None and goal.status is not GoalStatus.CANCELING:
+                self._change(goal, GoalStatus.CANCELING)
+                goal.task.cancel()
 
     async def _cancel_goal(self, request: RosMessage, _: RosSender | None) -> Mapping[str, Any]:
         info = request["goal_info"]
         code, goals = chosen(self._goals, bytes(info["goal_id"]["uuid"]), stamp_of(info["stamp"]))
-        for goal in goals:
-            self._change(goal, GoalStatus.CANCELING)
-            if goal.driver is not None:
-                try:
-                    await goal.driver.goal_control(GoalOrder.CANCEL, own=True)
-                except TruckError as error:
-                    self._operators.refuse("a client", f"{NAME}, cancel", str(error))
+        self._cancel(goals)
         return {"return_code": int(code), "goals_canceling": [self._info(goal) for goal in goals]}
 
-    async def _get_result(self, request: RosMessage, _: RosSender | None) -> Mapping[str, Any]:
+    async def _get_result(self, interface: str, request: RosMessage, _: RosSender | None) -> Mapping[str, Any]:
         goal = self._goals.get(bytes(request["goal_id"]["uuid"]))
         if goal is None:
             return {"status": int(GoalStatus.UNKNOWN)}
         await goal.ended.wait()
-        return goal.result()
+        code = 0 if goal.status is GoalStatus.SUCCEEDED else FAILED
+        values = {"error_code": code, "error_msg": goal.text} | self._action.result(goal.work, goal.status)
+        return {"status": int(goal.status), "result": within(interface, values)}
+
+
+def _distinct(editions: Iterable[str], part: str) -> Iterable[str]:
+    """Editions without those that equal another one on the wire."""
+    found: dict[str, str] = {}
+    for edition in editions:
+        found.setdefault(type_hash(f"{edition}{part}"), edition)
+    return found.values()

@@ -31,9 +31,9 @@ from monstertruck_schemas.sensor import (
 from monstertruck_schemas.state import ClockOffset, Grid, Odometry, Transforms
 from monstertruck_schemas.topics import Topic
 from monstertruckd.ros2 import convert
-from monstertruckd.ros2.actions import GoalPose, NavigateToPose
 from monstertruckd.ros2.cdr import RosMessage
 from monstertruckd.ros2.facts import RobotFacts, renamed_links
+from monstertruckd.ros2.navigation import GoalPose, Navigation
 from monstertruckd.ros2.node import RosArrival, RosNode, RosSender
 from monstertruckd.ros2.operators import LEASE, Operators, check_age, check_header, frame_in, planar_twist
 from monstertruckd.ros2.parameters import RosParameters
@@ -117,7 +117,7 @@ class RosFace:
         self._describe()
         self._listen()
         if self._options.drives:
-            navigation = NavigateToPose(
+            navigation = Navigation(
                 self._node, self._operators, self._client, self._goal_in, lambda: self._names, self._clock
             )
             RosParameters(self._node, self._operators, self._client)

@@ -1,6 +1,6 @@
 """What a face needs of ROS 2: publishers, subscriptions and services of one node, by whatever middleware."""
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -43,6 +43,9 @@ Answer = Callable[[RosMessage, RosSender | None], Awaitable[Mapping[str, Any]]]
 
 class RosNode(Protocol):
     """One node of the ROS 2 graph. All callbacks are called on the event loop."""
+
+    distributions: Sequence[str]
+    """Those of ``interfaces.DISTRIBUTIONS`` whose nodes it meets."""
 
     def publisher(self, topic: str, interface: str, qos: RosQos) -> Publish:
         """Offer a topic; ``topic`` is absolute, or relative to the node's namespace."""

@@ -10,8 +10,9 @@ out. ``rclpy`` says of a message neither its publisher nor, of a request, its cl
 
 import asyncio
 import importlib
+import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Final, Self
@@ -26,7 +27,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from monstertruck_runtime.errors import BusyError, InputError
 from monstertruck_runtime.threads import in_daemon_thread, in_thread
 from monstertruckd.ros2.cdr import decode, encode
-from monstertruckd.ros2.interfaces import wire_name
+from monstertruckd.ros2.interfaces import DISTRIBUTIONS, wire_name
 from monstertruckd.ros2.node import Answer, Publish, RosArrival, RosSender, Take
 from monstertruckd.ros2.rmw import RosQos
 
@@ -34,8 +35,9 @@ CLIENTS: Final = RosSender("/service_clients", "clients")
 """All clients of services."""
 ANSWER_TIMEOUT: Final = 3600.0
 """Seconds that a request may wait for its answer: the result of an action comes at its end."""
-THREADS: Final = 8
-"""Requests that are answered at once, and one thread for messages."""
+THREADS: Final = 64
+"""Maximum number of requests that are answered at once, and one thread for messages: a result of an action occupies one
+until the action ends."""
 
 
 def rclpy_interface(name: str) -> Any:
@@ -45,6 +47,13 @@ def rclpy_interface(name: str) -> Any:
         return getattr(importlib.import_module(f"{package}.{group}"), own, None)
     except ModuleNotFoundError:
         return None
+
+
+def distribution_here() -> str:
+    """Return the one of ``interfaces.DISTRIBUTIONS`` whose interfaces are installed, by ``ROS_DISTRO``."""
+    named = os.environ.get("ROS_DISTRO", "jazzy")
+    others = {"iron": "jazzy"}
+    return named if named in DISTRIBUTIONS else others.get(named, DISTRIBUTIONS[-1])
 
 
 def _profile(qos: RosQos) -> QoSProfile:
@@ -91,6 +100,7 @@ class RclpyNode:
         self._name, self._namespace = name
         self._domain = domain
         self.malformed = 0
+        self.distributions: Sequence[str] = (distribution_here(),)
         self.missing: set[str] = set()
         """Interfaces that are not installed."""
 
@@ -167,7 +177,7 @@ class RclpyNode:
 
     def publisher(self, topic: str, interface: str, qos: RosQos) -> Publish:
         """Offer a topic; see ``RosNode``."""
-        kind = None if "@" in interface else self._interface(interface)  # one edition is that of this distribution
+        kind = self._interface(interface)
         if kind is None:
             return lambda _: None
         publisher = self._node_for(topic, interface).create_publisher(kind, topic, _profile(qos))

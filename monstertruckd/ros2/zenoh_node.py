@@ -4,7 +4,7 @@ import asyncio
 import json
 import socket
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, Final, Self
 
@@ -17,7 +17,7 @@ from monstertruck_runtime.endpoints import endpoint_of, host_of, port_of, protoc
 from monstertruck_runtime.errors import BusyError, InputError, NotFoundError
 from monstertruck_runtime.threads import ThreadHop, in_daemon_thread, in_thread
 from monstertruckd.ros2.cdr import decode, encode
-from monstertruckd.ros2.interfaces import type_hash
+from monstertruckd.ros2.interfaces import DISTRIBUTIONS, type_hash
 from monstertruckd.ros2.node import Answer, Publish, RosArrival, RosSender, Take
 from monstertruckd.ros2.rmw import (
     LIVELINESS,
@@ -100,6 +100,7 @@ class ZenohNode:
         self._settings = settings
         self._clock = clock
         self._hashed = hashed
+        self.distributions: Sequence[str] = DISTRIBUTIONS[1:] if hashed else DISTRIBUTIONS[:1]
         self._entities = 0
         self._graph: dict[str, RosEntity] = {}
         """Entities by their token."""

@@ -3,165 +3,30 @@
 import asyncio
 import json
 import math
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 import pytest
 import zenoh
-from zenoh import ext
 
 from monstertruck_estimation.transforms import FIXED, mount, planar
-from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, WallClock
-from monstertruck_runtime.errors import BusyError, InputError, RequestRefusedError
-from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.errors import BusyError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.plan import GoalPhase, GoalState
-from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order, Role
-from monstertruck_schemas.roles import AccessRole
+from monstertruck_schemas.req import Role
 from monstertruck_schemas.sensor import LaserScan
-from monstertruck_schemas.state import ClockOffset, Grid, Transforms
+from monstertruck_schemas.state import Grid, Transforms
 from monstertruckd.ros2.actions import ActionGoal, CancelCode, GoalStatus, chosen
 from monstertruckd.ros2.cdr import decode, encode
-from monstertruckd.ros2.face import FaceOptions, RosFace
-from monstertruckd.ros2.facts import RobotFacts
-from monstertruckd.ros2.operators import Operators
+from monstertruckd.ros2.face import FaceOptions
 from monstertruckd.ros2.rmw import RELIABLE, Attachment, data_key
 from monstertruckd.ros2.zenoh_node import ZenohNode, session_settings
 from monstertruckd.ros2.zenoh_node import free_endpoint as next_endpoint
-from tests.bus_kit import free_endpoint, gate_state, odometry, running_robot
-from tests.ros2_kit import ServiceClient
+from tests.bus_kit import odometry
+from tests.ros2_kit import Reader, ServiceClient, asking, pose, scene
 
-OFFSET = 1_000_000 * SECOND
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
-
-
-@dataclass
-class Scene:
-    robot: object
-    ros: str
-    """Endpoint of the face's router."""
-    requests: object
-    operators: Operators
-    texts: list[str] = field(default_factory=list)
-
-    async def until(self, condition, seconds=5.0):
-        async with asyncio.timeout(seconds):
-            while not condition():
-                await asyncio.sleep(0.01)
-
-    @asynccontextmanager
-    async def node(self, name="teleop"):
-        async with ZenohNode((name, "/"), 0, session_settings(self.ros, ""), WallClock()) as node:
-            yield node
-
-
-FACTS = RobotFacts(0.4, 0.3, description='<robot><link name="base" /></robot>')
-
-
-def answering(robot, clock):
-    """Remote calls of a robot that has a planner and one live setting; returns what was asked."""
-    outcomes = []
-
-    async def carry_out(payload):
-        outcomes.append(payload)
-        return json.loads(gate_state(1).model_dump_json())
-
-    for order in Order:
-        robot.rpc.register(order.value, carry_out, AccessRole.OBSERVER)
-    goals = robot.bus.publisher(t.GOAL, t.Writer.PLANNER)
-    settings = {"gate.limits.speed": 0.25}
-
-    def goal_state(**fields):
-        now = clock.now()
-        goals.put(GoalState(stamp=now, received=now, seq=goals.next_seq(), number=1, frame="map", **fields))
-
-    async def goal(payload):
-        outcomes.append(payload)
-        if payload["goal"]["x"] > 100.0:
-            raise RequestRefusedError(Reason.NO_MAP, "a wall is in the way")
-        goal_state(phase=GoalPhase.DRIVING, outcome=Reason.DRIVING, remaining=2.5, recoveries=1)
-        if payload["goal"]["x"] < 50.0:
-            asyncio.get_running_loop().call_later(0.3, partial(goal_state, outcome=Reason.GOAL_REACHED))
-        return {"number": 1}
-
-    async def goal_control(payload):
-        outcomes.append(payload)
-        goal_state(outcome=Reason.CANCELLED, text="as asked")
-        return {}
-
-    async def list_settings(_):
-        row = {"meaning": "Speed, m/s", "above": 0.0, "at_least": None, "below": None, "at_most": 0.3}
-        return {"settings": [{"key": key, "value": value} | row for key, value in settings.items()]}
-
-    async def set_settings(payload):
-        outcomes.append(payload)
-        if payload["values"].get("gate.limits.speed", 0.0) > 0.3:
-            raise InputError("gate.limits.speed: expected at most 0.3")
-        settings.update(payload["values"])
-        return {}
-
-    for name, serve in {
-        "goal": goal,
-        "goal_control": goal_control,
-        "settings": list_settings,
-        "set": set_settings,
-    }.items():
-        robot.rpc.register(name, serve, AccessRole.OBSERVER)
-    return outcomes
-
-
-@asynccontextmanager
-async def scene(options=None):
-    options = options or FaceOptions()
-    async with running_robot() as robot:
-        clock, ros = WallClock(), free_endpoint()
-        outcomes = answering(robot, clock)
-        gate = robot.bus.publisher(t.GATE, t.Writer.GATE)
-        offset = robot.bus.publisher(t.CLOCK, t.Writer.DAEMON)
-
-        async def live():
-            while True:
-                now = clock.now()
-                gate.put(_gate(gate, now))
-                offset.put(ClockOffset(stamp=now, received=now, seq=offset.next_seq(), offset=OFFSET))
-                await asyncio.sleep(0.1)
-
-        texts = []
-        async with asyncio.TaskGroup() as tasks:
-            running = [tasks.create_task(live())]
-            async with (
-                TruckClient("truck", robot.endpoint, source="face", clock=clock) as client,
-                ZenohNode(("truck", "/"), 0, session_settings(None, ros), clock) as node,
-            ):
-                operators = Operators(
-                    lambda source: TruckClient("truck", robot.endpoint, source=source, clock=clock),
-                    None,
-                    clock,
-                    lambda _, text: texts.append(text),
-                )
-                ready = asyncio.Event()
-                face = RosFace(client, node, operators, FACTS, options, clock)
-                running.append(tasks.create_task(face.run(ready.set)))
-                await asyncio.wait_for(ready.wait(), 10)
-                requests = robot.bus.subscribe(t.REQ_DRIVE, fifo(1000))
-                found = Scene(robot, ros, requests, operators, texts)
-                found.outcomes = outcomes
-                try:
-                    yield found
-                finally:
-                    for task in running:
-                        task.cancel()
-                    await asyncio.wait(running)
-                    await operators.close()
-
-
-def _gate(gate, now):
-    return gate_state(1).model_copy(update={"stamp": now, "received": now, "seq": gate.next_seq()})
 
 
 async def drive(node, scene, values, interface=TWIST, times=1):
@@ -323,29 +188,6 @@ def scan(stamp):
     )
 
 
-class Reader:
-    """Newest message of topics, by an AdvancedSubscriber with the options of rmw_zenoh."""
-
-    def __init__(self, found):
-        self.messages = {}
-        self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(session_settings(found.ros, ""))))
-        self._kept = []
-
-    def follow(self, topic, interface):
-        def take(sample):
-            self.messages[topic] = decode(interface, sample.payload.to_bytes())
-
-        history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-        self._kept.append(
-            ext.declare_advanced_subscriber(
-                self._session, data_key(0, topic, interface), take, history=history, subscriber_detection=True
-            )
-        )
-
-    def close(self):
-        self._session.close()
-
-
 async def test_topics_have_ros_s_frames_stamps_and_values_and_reach_who_comes_late():
     async with scene(FaceOptions(prefix="t1/")) as found:
         put = {
@@ -433,11 +275,6 @@ def test_of_a_port_that_is_taken_the_next_one_is_listened_at():
 ACTION = "nav2_msgs/action/NavigateToPose"
 
 
-def pose(x, frame="map"):
-    header = {"frame_id": frame}
-    return {"header": header, "pose": {"position": {"x": x}, "orientation": {"w": 1.0}}}
-
-
 async def send(client, number, goal, tree=""):
     request = {"goal_id": {"uuid": bytes([number]) * 16}, "goal": {"pose": goal, "behavior_tree": tree}}
     return await client.ask("/navigate_to_pose/_action/send_goal", f"{ACTION}_SendGoal", request)
@@ -446,15 +283,6 @@ async def send(client, number, goal, tree=""):
 async def result_of(client, number):
     request = {"goal_id": {"uuid": bytes([number]) * 16}}
     return await client.ask("/navigate_to_pose/_action/get_result", f"{ACTION}_GetResult", request)
-
-
-@asynccontextmanager
-async def asking(found, name="nav"):
-    client = ServiceClient(found.ros, name)
-    try:
-        yield client
-    finally:
-        await asyncio.to_thread(client.close)
 
 
 async def test_a_goal_is_driven_with_feedback_for_jazzy_and_lyrical_and_a_result():
@@ -524,7 +352,7 @@ async def test_a_goal_that_means_something_else_is_not_accepted(goal, tree, why)
     ],
 )
 def test_a_cancel_request_means_one_goal_all_or_all_until_a_time(number, stamp, code, meant):
-    goals = {name * 16: ActionGoal(name * 16, at) for name, at in ((b"a", 10), (b"b", 20), (b"c", 30))}
+    goals = {name * 16: ActionGoal(name * 16, at, None) for name, at in ((b"a", 10), (b"b", 20), (b"c", 30))}
     goals[b"c" * 16].status = GoalStatus.SUCCEEDED
     found, chosen_goals = chosen(goals, number, stamp)
     assert (found, [goal.number[:1] for goal in chosen_goals]) == (code, meant)

@@ -36,6 +36,12 @@ def test_messages_have_one_hash_from_iron_to_lyrical(store):
         ("nav2_msgs/action/NavigateToPose_FeedbackMessage", "9d1f6fa2"),
         ("nav2_msgs/action/NavigateToPose@lyrical_FeedbackMessage", "2c1b4ec1"),
         ("nav2_msgs/action/NavigateToPose@lyrical_SendGoal", "a4fcb3be"),
+        ("nav2_msgs/action/NavigateThroughPoses_SendGoal", "5a590fa8e9a32b7b9c838fdf5939a2fb8858d6cfd25bdf2f"),
+        ("nav2_msgs/action/NavigateThroughPoses_GetResult", "fdc12773de81ce69f7eeb4366702ea757d792ab5068bc461"),
+        ("nav2_msgs/action/NavigateThroughPoses_FeedbackMessage", "073962415ad2a226b3de7245b142aeb414268a4d35ef1321"),
+        ("nav2_msgs/action/FollowPath_SendGoal", "5b662aee1159e1d7e7b5f8fef21f556b8bc67c818c730a68"),
+        ("nav2_msgs/action/FollowPath_GetResult", "8ab4c588c878f0e997316ec559f172bb56fc210b484c2f6b"),
+        ("nav2_msgs/action/FollowPath_FeedbackMessage", "3f4008700ba56ac4c82b01ef2b7fdd3fc18dc194399c48e5"),
     ],
 )
 def test_an_actions_hashes_are_those_of_public_builds_of_nav2(name, begins):
