@@ -145,7 +145,13 @@ def _build_tracker(
         # 5.0: seconds after which a tracker elsewhere is given up; the gate stops the truck long before
         actor = actors.actor(placement, TRACKING, STEPS[TRACKING], latency=0.0, deadline=5.0)
     return TrackerService(
-        TrackSetup(with_response(tracker, config.devices), body.chassis.bicycle, body.footprint, body.points.mount),
+        TrackSetup(
+            with_response(tracker, config.devices),
+            body.chassis.bicycle,
+            body.footprint,
+            body.points.mount,
+            located=config.slam is not None,
+        ),
         clock,
         inputs=inputs,
         drive=requests,

@@ -51,7 +51,7 @@ class Lqr(PathTracker[LqrConfig]):
         gains = self._gains.at(state.steering, float(state.speeds(self._soon).mean()), self.response.lag)
         onto = np.linalg.pinv(basis)
         axles = onto @ np.tan(state.angles)
-        asked = onto @ np.tan(self.axles.requested)
+        asked = onto @ np.tan(state.requested)
         offset = min(max(state.lateral_error, -gains.furthest), gains.furthest)
         error = np.concatenate(([offset, state.heading_error], axles, asked))
         change = gains.preview @ self._reference(state) - gains.feedback @ error

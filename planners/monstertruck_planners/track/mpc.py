@@ -107,7 +107,7 @@ class Mpc(PathTracker[MpcConfig]):
         modes = tuple(state.reference.steerings(state.distances(self._times)))
         modes = (state.steering, *modes[1:])
         layout = self._layout(modes)
-        last = layout.onto @ np.array(self.axles.requested)
+        last = layout.onto @ np.array(state.requested)
         fine = state.reference.at(state.distances(self._middles))
         nominal = self._nominal(state, modes, layout.bases)
         rollout = self._roll(state, fine, layout, nominal)

@@ -20,6 +20,7 @@ from monstertruck_estimation.transforms import wrap_angle
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2
 from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.track.axle_errors import AxleErrorEstimator, AxleErrors, AxleMotion
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.response import Response, ResponseEstimator, choose, rounded
 from monstertruck_planners.track.segments import (
@@ -35,6 +36,8 @@ from monstertruck_schemas.reasons import Reason
 
 Angles = tuple[float, float]
 
+EXACT: Final = AxleErrors()
+"""Axles as they are calibrated."""
 FORGET: Final = 1.0
 """Pause after which the state of the axles is not known, s; older requests no longer act."""
 
@@ -59,6 +62,8 @@ class AxleModel:
         self.angles: Angles = (0.0, 0.0)
         self.requested: Angles = (0.0, 0.0)
         """Axle angles of the newest request."""
+        self.swept: Angles = (0.0, 0.0)
+        """Integrals of the angles over time since the beginning, rad s."""
         self._due: deque[tuple[float, Angles]] = deque()
         self._requests: deque[tuple[float, Angles]] = deque()
         """Requests of the last second."""
@@ -97,21 +102,41 @@ class AxleModel:
             self._t = t
             return
         for _, until, target in self._pieces(self._t, t):
-            self.angles = self._turned(self.angles, target, until)
-            self._target = target
+            middle, end = (self._turned(self.angles, target, share * until) for share in (0.5, 1.0))
+            f, r = (until / 6 * (a + 4 * b + c) for a, b, c in zip(self.angles, middle, end, strict=True))
+            self.swept = self.swept[0] + f, self.swept[1] + r
+            self.angles, self._target = end, target
         while self._due and self._due[0][0] <= t:
             self._target = self._due.popleft()[1]
         self._t = t
 
-    def ahead(self, pose: Pose2, speed: float, geometry: FourWheelSteering, seconds: float) -> tuple[Pose2, Angles]:
-        """Pose and angles in ``seconds``, at a constant speed and if nothing else is requested."""
+    def ahead(
+        self,
+        pose: Pose2,
+        speed: float,
+        geometry: FourWheelSteering,
+        seconds: float,
+        errors: AxleErrors = EXACT,
+    ) -> tuple[Pose2, Angles]:
+        """Pose and angles in ``seconds``, at a constant speed and if nothing else is requested.
+
+        Args:
+            pose: m and rad.
+            speed: m/s.
+            geometry: the truck's.
+            seconds: ahead.
+            errors: how the axles act at these angles.
+        """
+        grip = speed * speed / geometry.wheelbase
         angles = self.angles
         begin = self._t or 0.0
         for _, duration, target in self._pieces(begin, begin + seconds):
             count = max(math.ceil(duration / 0.05), 1)  # greatest time step of the prediction, s
             for _ in range(count):
                 middle = self._turned(angles, target, 0.5 * duration / count)
-                pose = geometry.integrate(pose, *geometry.body_twist(speed, *middle), duration / count)
+                pose = geometry.integrate(
+                    pose, *geometry.body_twist(speed, *errors.wheels(middle, grip)), duration / count
+                )
                 angles = self._turned(angles, target, duration / count)
         return pose, angles
 
@@ -165,6 +190,8 @@ class TruckState(NamedTuple):
     heading: tuple[float, float] | None = None
     """Instant (s) and yaw (rad, in any frame) of a measurement that does not depend on the requests; None: there is no
     compass, and the pose's yaw shows how the truck turns."""
+    located: bool = True
+    """Whether the pose is measured, not computed from the requests."""
 
 
 @dataclass(slots=True)
@@ -247,7 +274,9 @@ class TrackingState(NamedTuple):
     pose: Pose2
     """x, y (m), yaw (rad)."""
     angles: Angles
-    """Of the axles, rad."""
+    """At which the axles act, as the way of steering sees them, rad."""
+    requested: Angles
+    """The same of the newest request."""
     speed: float
     """Forward, m/s; at least ``min_speed`` in size."""
     target_speed: float
@@ -265,7 +294,7 @@ class TrackingState(NamedTuple):
     target: ReferenceState
     """The reference at ``s``."""
     heading_error: float
-    """Yaw less the reference's, rad."""
+    """Yaw less the reference's and less what axles out of trim slip, rad."""
 
     def speeds(self, times: Array) -> Array:
         """Forward speed after ``times`` seconds: gained, never lost, as braking depends on what lies ahead."""
@@ -277,6 +306,21 @@ class TrackingState(NamedTuple):
         size, most = abs(self.speed), max(abs(self.target_speed), abs(self.speed))
         gaining = np.minimum(times, (most - size) / self.acceleration)
         return self.s + size * times + self.acceleration * gaining * (times - 0.5 * gaining)
+
+
+def as_steered(steering: Steering, angles: Angles) -> Angles:
+    """The angles of a way of steering that turn the truck as these do (crab: move it sideways), rad."""
+    front, rear = angles
+    match steering:
+        case "front":
+            return front - rear, 0.0
+        case "rear":
+            return 0.0, rear - front
+        case "counter":
+            return 0.5 * (front - rear), 0.5 * (rear - front)
+        case "crab":
+            return 0.5 * (front + rear), 0.5 * (front + rear)
+    return angles
 
 
 class PathTracker(ABC, Generic[C]):
@@ -298,6 +342,8 @@ class PathTracker(ABC, Generic[C]):
         self.response = self.configured or rounded(self.estimator.estimate)
         """Dead time and lag in use."""
         self.axles = AxleModel(*self.response, config.steering_rate)
+        """In angles as they are requested."""
+        self.axle_errors = AxleErrorEstimator(geometry)
         self.period = 1.0 / config.rate
         self._stop = min(config.min_speed**2 / (2 * config.deceleration), config.goal_tolerance)
         """Metres before the end at which the truck, then at its slowest, stops."""
@@ -306,6 +352,7 @@ class PathTracker(ABC, Generic[C]):
     def reset(self) -> None:
         """Forget the requests: they were not obeyed."""
         self.axles.reset()
+        self.axle_errors.restart()
         self.estimator.forget_requests()
         self._prepared.clear()
 
@@ -323,6 +370,7 @@ class PathTracker(ABC, Generic[C]):
         """Use another dead time and lag from here on."""
         self.response = response
         self.axles.respond(response)
+        self.axle_errors.restart()
 
     @abstractmethod
     def steer(self, state: TrackingState) -> Angles:
@@ -367,7 +415,8 @@ class PathTracker(ABC, Generic[C]):
         outcome = judged
         if math.hypot(truck.pose[0] - nearest.point[0], truck.pose[1] - nearest.point[1]) > config.lost_distance:
             outcome = Reason.PATH_LOST
-        angles = self.limited(state.steering, *self.steer(state))
+        wanted = self.limited(state.steering, *self.steer(state))
+        angles = self._request(state.steering, wanted, truck.speed)
         if ended and not last:
             angles = self.axles.requested  # coming to rest at a cusp
         speed = 0.0
@@ -429,11 +478,28 @@ class PathTracker(ABC, Generic[C]):
         front, rear = self.geometry.limit_keeping_curvature(front, rear, ahead, behind)
         return float(front), float(rear)
 
+    def _request(self, steering: Steering, wheels: Angles, speed: float) -> Angles:
+        """What to request so that the truck turns as axles at these angles would; an axle that is not steered stays."""
+        errors, grip, most = self.axle_errors.errors, speed * speed / self.geometry.wheelbase, self.config.angle
+        front, rear = errors.requests(wheels, grip)
+        turn = wheels[0] - wheels[1]
+        if steering == "front":
+            fixed = errors.wheels((front, 0.0), grip)[1]
+            front, rear = errors.requests((turn + fixed, fixed), grip)[0], 0.0
+        elif steering == "rear":
+            fixed = errors.wheels((0.0, rear), grip)[0]
+            front, rear = 0.0, errors.requests((fixed, fixed - turn), grip)[1]
+        return min(max(front, -most), most), min(max(rear, -most), most)
+
     def _observe(self, truck: TruckState, t: float) -> None:
-        """Learn from the truck's turn how the axles answer."""
+        """Learn from the truck's motion how the axles answer, and how they stand."""
         if not truck.obeyed:
             self.estimator.forget_requests()
+            self.axle_errors.restart()
             return
+        axles = self.axles
+        motion = AxleMotion(t, axles.swept, axles.angles, truck.pose, truck.speed, truck.heading, truck.located)
+        self.axle_errors.observe(motion, self.estimator.estimate.deviation)
         measured = truck.heading is not None
         at, yaw = truck.heading or (t, truck.pose[2])
         if self.estimator.observe(at, yaw, truck.speed, measured=measured):
@@ -459,25 +525,35 @@ class PathTracker(ABC, Generic[C]):
         reference, profile = self._prepare(segment)
         speed = truck.speed if truck.speed * segment.direction > self.config.min_speed else 0.0
         pose, angles = truck.pose, self.axles.angles
+        errors, grip = self.axle_errors.errors, speed * speed / self.geometry.wheelbase
         if self.prediction:
-            pose, angles = self.axles.ahead(pose, speed, self.geometry, self.prediction)
+            pose, angles = self.axles.ahead(pose, speed, self.geometry, self.prediction, errors)
         nearest = segment.project(pose[0], pose[1], s, s + self.config.reach)
-        target = reference.state(nearest.s)
+        target, steering = reference.state(nearest.s), reference.steering(nearest.s)
         dx, dy = pose[0] - nearest.point[0], pose[1] - nearest.point[1]
+        asked, wheels = self.axles.requested, errors.wheels(self.axles.requested, grip)
+        requested = as_steered(steering, wheels)
+        slip = self._slip_besides(steering, wheels) - self._slip_besides(steering, asked)
         return TrackingState(
             pose=pose,
-            angles=angles,
+            angles=as_steered(steering, errors.wheels(angles, grip)),
+            requested=requested,
             speed=speed or segment.direction * self.config.min_speed,
             target_speed=target_speed(self.config, truck, segment, profile, s, self.response.dead_time),
             acceleration=self.config.acceleration,
             segment=segment,
             reference=reference,
             s=nearest.s,
-            steering=reference.steering(nearest.s),
+            steering=steering,
             lateral_error=math.cos(target.heading) * dy - math.sin(target.heading) * dx,
             target=target,
-            heading_error=wrap_angle(pose[2] - target.yaw),
+            heading_error=wrap_angle(pose[2] - target.yaw + slip),
         )
+
+    def _slip_besides(self, steering: Steering, angles: Angles) -> float:
+        """Sideslip of axle angles that is not of the way of steering, rad."""
+        front, rear = as_steered(steering, angles)
+        return float(self.geometry.tan_sideslip(angles[0] - front, angles[1] - rear))
 
     def _turning_at_rest(self, truck: TruckState, angles: Angles) -> bool:
         """Whether the truck stands with its wheels still turning to where they are wanted."""

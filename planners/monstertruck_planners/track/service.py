@@ -49,6 +49,8 @@ class TrackSetup:
     footprint: Footprint
     lidar: Pose2
     """Pose of the lidar in base."""
+    located: bool = False
+    """Whether poses are measured, not computed from the requests."""
 
 
 class Newest(NamedTuple):
@@ -138,6 +140,7 @@ class TrackingStep:
         self._path_tracker = build_tracker(setup.config, setup.steering)
         self._footprint = setup.footprint
         self._points = points or ScanPoints(setup.lidar)
+        self._located = setup.located
         self._near = setup.footprint.circumscribed_radius + setup.config.slow_clearance
         self._terrain = TerrainEstimator(2.0)  # time constant of the roughness that slows the truck down, s
         self._acceleration = BodyAcceleration()
@@ -194,7 +197,7 @@ class TrackingStep:
         tilt, roughness = self._terrain_at(newest.attitude, now)
         obeyed = gate.mode is GateMode.DRIVING and gate.holder == SOURCE
         heading = _heading(newest.attitude, now)
-        state = TruckState(at, pose.twist.vx, clearance, tilt, roughness, obeyed, heading)
+        state = TruckState(at, pose.twist.vx, clearance, tilt, roughness, obeyed, heading, self._located)
         try:
             command = self._path_tracker.control(state, path, self._progress, now / SECOND)
         except KinematicsError as error:

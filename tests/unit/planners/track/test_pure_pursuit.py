@@ -162,5 +162,5 @@ def test_crabbing_keeps_the_heading(direction):
     truck = Follower(path(route, [direction] * len(route)), steering="crab", dead_time=0.0)
     assert truck.run() is Reason.GOAL_REACHED
     assert truck.cross_track().max() < 0.05
-    assert truck.pose[2] == 0.0
-    assert all(c.front == c.rear for c in truck.log)
+    assert truck.pose[2] == pytest.approx(0.0, abs=1e-12)
+    assert all(c.front == pytest.approx(c.rear, abs=1e-12) for c in truck.log)

@@ -1,0 +1,273 @@
+"""Steering that is not as calibrated: gain, trim and compliance of each axle, estimated from how the truck moves.
+
+An axle that is asked for an angle q points, when it has turned, at
+
+    angle = gain q + trim - compliance a        a = v^2 (front - rear) / L, the lateral acceleration
+
+A wrong servo or linkage shows in gain and trim at every speed, slip of the tyres only as the square of the speed. Over
+short intervals the turn, and the sideways motion where the position is measured too, are linear in these six numbers to
+first order (eqs. 2.34 and 2.37), so an extended Kalman filter estimates them with their covariance. Outliers count less
+(Student's t), and the noise is that of the residuals.
+"""
+
+import math
+from collections import deque
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+
+from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.truck import FourWheelSteering
+
+Angles = tuple[float, float]
+
+BASE: Final = 0.25
+"""Least time between two poses that are compared, s: noise of single poses hardly counts any more."""
+KEPT: Final = 32
+"""Control steps for which a late heading is still placed."""
+FREEDOM: Final = 4.0
+"""Degrees of freedom of Student's t by which residuals count."""
+BELIEVED: Final = 5.0
+"""Intervals that the assumed noise is worth."""
+FADE: Final = 1.0 - 1.0 / 150.0
+"""Share of the residuals' sums that remains after each interval."""
+FORGET: Final = 200.0
+"""Distance after which what was learnt counts for a third, m: parts wear."""
+NOISE: Final = (0.003, 0.002)
+"""Standard deviation of a turn (rad) and of a sideways motion (m) before any was compared."""
+
+GAIN: Final = 0.15
+"""Standard deviation of the gain of a truck that was not driven: hobby servos differ so much in pulse per angle."""
+TOOTH: Final = 0.047
+"""Standard deviation of the trim, rad: a servo horn put on up to half of a tooth of 25 off, uniformly, at 0.64 rad of
+the axle per rad of the servo."""
+COMPLIANCE: Final = 0.03
+"""Standard deviation of the compliance, rad s^2/m: rubber tyres under a light truck."""
+DEAD_BAND: Final = 0.0012
+"""Standard deviation of where a servo stops, rad of the axle: a dead band of 2 us to either side, uniformly."""
+
+
+class AxleError(NamedTuple):
+    """One axle against its calibration."""
+
+    gain: float = 1.0
+    trim: float = 0.0
+    """Rad, left positive."""
+    compliance: float = 0.0
+    """Angle lost by slip for each m/s^2 of lateral acceleration, rad s^2/m."""
+
+
+class AxleErrors(NamedTuple):
+    """Both axles against their calibration."""
+
+    front: AxleError = AxleError()
+    rear: AxleError = AxleError()
+
+    @classmethod
+    def of(cls, state: Array) -> Self:
+        """From the filter's state: gain less 1, trim, compliance, front then rear."""
+        f_gain, f_trim, f_slip, r_gain, r_trim, r_slip = state.tolist()
+        return cls(AxleError(1.0 + f_gain, f_trim, f_slip), AxleError(1.0 + r_gain, r_trim, r_slip))
+
+    def wheels(self, requested: Angles, grip: float) -> Angles:
+        """Angles at which axles that have turned to ``requested`` act, rad; ``grip``: speed^2 / wheelbase, m/s^2."""
+        front = self.front.gain * requested[0] + self.front.trim
+        rear = self.rear.gain * requested[1] + self.rear.trim
+        # 0.5: no slip doubles a turn
+        acceleration = grip * (front - rear) / max(1.0 + grip * (self.front.compliance - self.rear.compliance), 0.5)
+        return front - self.front.compliance * acceleration, rear - self.rear.compliance * acceleration
+
+    def requests(self, wheels: Angles, grip: float) -> Angles:
+        """Angles to request so that the axles act at ``wheels``, rad: inverse of ``wheels``."""
+        acceleration = grip * (wheels[0] - wheels[1])
+        front, rear = (
+            (angle + axle.compliance * acceleration - axle.trim) / axle.gain
+            for angle, axle in zip(wheels, self, strict=True)
+        )
+        return front, rear
+
+
+class AxleMotion(NamedTuple):
+    """What is known at one control step."""
+
+    t: float
+    """S."""
+    swept: Angles
+    """Integrals of the requested angles of both axles, after dead time and lag, rad s."""
+    angles: Angles
+    """These angles now, rad."""
+    pose: tuple[float, float, float]
+    """M and rad."""
+    speed: float
+    """Forward, m/s."""
+    heading: tuple[float, float] | None
+    """Instant (s) and measured yaw (rad); None: that of the pose, if it is located."""
+    located: bool
+    """The pose is measured, not computed from the requests."""
+
+
+class _Sums(NamedTuple):
+    """Sums up to a control step, or between two."""
+
+    motion: AxleMotion
+    """At the step, or at the next one."""
+    values: Array
+    """Shape (2, 7): turn (rad) and sideways motion (m), as a constant and their change by the six numbers."""
+    distance: float
+    """M."""
+    sideways: float
+    """Measured sideways motion, m."""
+
+
+class _Mark(NamedTuple):
+    """Beginning of an interval."""
+
+    t: float
+    yaw: float
+    measured: bool
+    """The yaw is a heading's."""
+    sums: _Sums
+
+
+class AxleErrorEstimator:
+    """See the module.
+
+    Args:
+        geometry: the truck's.
+    """
+
+    def __init__(self, geometry: FourWheelSteering) -> None:
+        self._geometry = geometry
+        self.state: Array = np.zeros(6)
+        self._prior = np.diag(np.square((GAIN, TOOTH, COMPLIANCE) * 2))
+        self.covariance: Array = self._prior.copy()
+        self.errors = AxleErrors()
+        self.metres = 0.0
+        """Distance over which motion was compared."""
+        self._squares, self._counts = [0.0, 0.0], [0.0, 0.0]
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new interval: the axles are not where the requests say, or were computed anew."""
+        self._sums: deque[_Sums] = deque(maxlen=KEPT)
+        self._begin: _Mark | None = None
+
+    def curvature_deviation(self, angles: Angles) -> float:
+        """Standard deviation of the curvature when the axles are asked for ``angles``, 1/m."""
+        by = np.array((angles[0], 1.0, 0.0, -angles[1], -1.0, 0.0)) / self._geometry.wheelbase
+        return math.sqrt(float(by @ self.covariance @ by))
+
+    def observe(self, motion: AxleMotion, delay_deviation: float) -> bool:
+        """Compare the motion since the last interval with the requests; whether the estimate has changed.
+
+        Args:
+            motion: now.
+            delay_deviation: standard deviation of the axles' delay, s.
+        """
+        self._add(motion)
+        if not motion.located and motion.heading is None:
+            return False
+        at, yaw = motion.heading or (motion.t, motion.pose[2])
+        sums = self._at(at)
+        if sums is None:
+            return False
+        begin, mark = self._begin, _Mark(at, yaw, motion.heading is not None, sums)
+        # 4.0: intervals this many times as long as meant were interrupted
+        usable = begin is not None and begin.measured is mark.measured and at - begin.t <= 4.0 * BASE
+        if begin is None or not usable:
+            self._begin = mark
+            return False
+        if at - begin.t < BASE:
+            return False
+        self._begin = mark
+        return self._compare(begin, mark, delay_deviation)
+
+    def _compare(self, begin: _Mark, end: _Mark, delay_deviation: float) -> bool:
+        """Learn from one interval; whether the truck moved."""
+        way = end.sums.distance - begin.sums.distance
+        if abs(way) < 0.001:  # a truck at rest, m
+            return False
+        self._forget(abs(way))
+        wheelbase = self._geometry.wheelbase
+        steered = [b - a for a, b in zip(begin.sums.motion.angles, end.sums.motion.angles, strict=True)]
+        late = abs(way) / (end.t - begin.t) * delay_deviation * abs(steered[0] - steered[1]) / wheelbase
+        stopped = abs(way) * DEAD_BAND * math.sqrt(2.0) / wheelbase
+        turn, aside = end.sums.values - begin.sums.values
+        self._update(0, turn, wrap_angle(end.yaw - begin.yaw), late**2 + stopped**2)
+        if end.sums.motion.located:
+            known = (way * DEAD_BAND) ** 2 + (late * way) ** 2
+            self._update(1, aside, end.sums.sideways - begin.sums.sideways, known)
+        self.errors = AxleErrors.of(self.state)
+        return True
+
+    def _add(self, motion: AxleMotion) -> None:
+        """Extend the sums by the motion since the last step."""
+        last = self._sums[-1] if self._sums else None
+        # 0.5: steps further apart than this are not joined, s
+        if last is None or not 0.0 < motion.t - last.motion.t <= 0.5:
+            self.restart()
+            self._sums.append(_Sums(motion, np.zeros((2, 7)), 0.0, 0.0))
+            return
+        before = last.motion
+        dt = motion.t - before.t
+        speed = 0.5 * (before.speed + motion.speed)
+        asked = tuple((b - a) / dt for a, b in zip(before.swept, motion.swept, strict=True))
+        rows = self._rows((asked[0], asked[1]), speed)
+        dx, dy = motion.pose[0] - before.pose[0], motion.pose[1] - before.pose[1]
+        middle = before.pose[2] + 0.5 * wrap_angle(motion.pose[2] - before.pose[2])
+        aside = math.cos(middle) * dy - math.sin(middle) * dx
+        values = last.values + speed * dt * rows
+        self._sums.append(_Sums(motion, values, last.distance + speed * dt, last.sideways + aside))
+
+    def _rows(self, asked: Angles, speed: float) -> Array:
+        """Turn and sideways motion per metre, each as a constant and its change by the six numbers; (2, 7)."""
+        geometry, grip = self._geometry, speed * speed / self._geometry.wheelbase
+        acceleration = grip * (asked[0] - asked[1])
+        tangents, by_axle = [], []
+        for q, angle in zip(asked, self.errors.wheels(asked, grip), strict=True):
+            tangents.append(math.tan(min(max(angle, -1.4), 1.4)))  # 1.4: angles are cut to this, rad
+            # As of exact axles: with the estimate's own noise in the changes the filter would believe to learn from it.
+            slope = 1.0 + math.tan(min(max(q, -1.4), 1.4)) ** 2
+            by_axle.append(slope * np.array((q, 1.0, -acceleration)))
+        shares = ((1.0 / geometry.wheelbase, -1.0 / geometry.wheelbase), (1.0 - geometry.cg_split, geometry.cg_split))
+        rows = np.empty((2, 7))
+        for row, (front, rear) in zip(rows, shares, strict=True):
+            row[1:4], row[4:] = front * by_axle[0], rear * by_axle[1]
+            row[0] = front * tangents[0] + rear * tangents[1] - row[1:] @ self.state
+        return rows
+
+    def _at(self, t: float) -> _Sums | None:
+        """The sums at an instant between two steps; None if no step is as old."""
+        for after, before in zip(reversed(self._sums), list(reversed(self._sums))[1:], strict=False):
+            if before.motion.t <= t <= after.motion.t:
+                share = (t - before.motion.t) / (after.motion.t - before.motion.t)
+                return _Sums(
+                    after.motion,
+                    before.values + share * (after.values - before.values),
+                    before.distance + share * (after.distance - before.distance),
+                    before.sideways + share * (after.sideways - before.sideways),
+                )
+        return None
+
+    def _forget(self, way: float) -> None:
+        """Let the covariance grow back towards what was known before any drive."""
+        keep = math.exp(-way / FORGET)
+        self.covariance = keep * self.covariance + (1.0 - keep) * self._prior
+        self.metres += way
+
+    def _update(self, kind: int, row: Array, measured: float, known: float) -> None:
+        """One measurement: turn (0) or sideways motion (1); ``known`` is the variance of what has a name."""
+        by = row[1:]
+        residual = measured - float(row[0] + by @ self.state)
+        noise = (self._squares[kind] + BELIEVED * NOISE[kind] ** 2) / (self._counts[kind] + BELIEVED) + known
+        spread = self.covariance @ by
+        predicted = float(by @ spread)
+        weight = (FREEDOM + 1.0) / (FREEDOM + residual**2 / (predicted + noise))
+        unexplained = weight * residual**2 * noise / (predicted + noise) - known
+        self._squares[kind] = FADE * self._squares[kind] + max(unexplained, 0.0)
+        self._counts[kind] = FADE * self._counts[kind] + 1.0
+        # Student's t with this scale has a variance that is larger by FREEDOM / (FREEDOM - 2).
+        gain = spread / (predicted + noise * FREEDOM / (FREEDOM - 2.0) / min(weight, 1.0))
+        self.state = self.state + gain * residual
+        self.covariance = self.covariance - np.outer(gain, spread)
