@@ -151,6 +151,7 @@ def _build_tracker(
             body.footprint,
             body.points.mount,
             located=config.slam is not None,
+            freedom=body.chassis.freedom if body.chassis.steered else None,
         ),
         clock,
         inputs=inputs,

@@ -12,11 +12,14 @@ first order (eqs. 2.34 and 2.37), so an extended Kalman filter estimates them wi
 
 import math
 from collections import deque
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Final, NamedTuple, Self
 
 import numpy as np
 
 from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_kinematics.chassis import Freedom
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
 
@@ -46,6 +49,12 @@ COMPLIANCE: Final = 0.03
 """Standard deviation of the compliance, rad s^2/m: rubber tyres under a light truck."""
 DEAD_BAND: Final = 0.0012
 """Standard deviation of where a servo stops, rad of the axle: a dead band of 2 us to either side, uniformly."""
+
+
+INDEPENDENT: Final[Mapping[Freedom | None, tuple[Angles, ...]]] = MappingProxyType(
+    {"both": ((1.0, 0.0), (0.0, 1.0)), "front": ((1.0, 0.0),), "parallel": ((1.0, 1.0),), None: ()}
+)
+"""Axles that err independently, by the body's freedom: one servo that turns both errs on both alike."""
 
 
 class AxleError(NamedTuple):
@@ -135,12 +144,14 @@ class AxleErrorEstimator:
 
     Args:
         geometry: the truck's.
+        freedom: angles that the axles can take; None: nothing is steered, so nothing is learnt.
     """
 
-    def __init__(self, geometry: FourWheelSteering) -> None:
+    def __init__(self, geometry: FourWheelSteering, freedom: Freedom | None = "both") -> None:
         self._geometry = geometry
         self.state: Array = np.zeros(6)
-        self._prior = np.diag(np.square((GAIN, TOOTH, COMPLIANCE) * 2))
+        alone = np.diag(np.square((GAIN, TOOTH, COMPLIANCE)))
+        self._prior: Array = sum((np.kron(np.outer(e, e), alone) for e in INDEPENDENT[freedom]), np.zeros((6, 6)))
         self.covariance: Array = self._prior.copy()
         self.errors = AxleErrors()
         self.metres = 0.0
@@ -165,9 +176,9 @@ class AxleErrorEstimator:
             motion: now.
             delay_deviation: standard deviation of the axles' delay, s.
         """
-        self._add(motion)
-        if not motion.located and motion.heading is None:
+        if not self._prior.any() or (not motion.located and motion.heading is None):
             return False
+        self._add(motion)
         at, yaw = motion.heading or (motion.t, motion.pose[2])
         sums = self._at(at)
         if sums is None:

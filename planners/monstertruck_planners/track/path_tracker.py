@@ -17,6 +17,7 @@ from typing import Final, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from monstertruck_estimation.transforms import wrap_angle
+from monstertruck_kinematics.chassis import Freedom
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2
 from monstertruck_kinematics.truck import FourWheelSteering
@@ -355,6 +356,10 @@ class PathTracker(ABC, Generic[C]):
         self.axle_errors.restart()
         self.estimator.forget_requests()
         self._prepared.clear()
+
+    def limit_learning(self, freedom: Freedom | None) -> None:
+        """Learn only errors that a body of this freedom can have; None: its axles are not steered."""
+        self.axle_errors = AxleErrorEstimator(self.geometry, freedom)
 
     @property
     def prediction(self) -> float:

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 
 from monstertruck_estimation.body_tilt import BodyAcceleration
 from monstertruck_estimation.ground.terrain import TerrainEstimator
+from monstertruck_kinematics.chassis import Freedom
 from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.se2 import Pose2, poses_relative
 from monstertruck_kinematics.truck import FourWheelSteering
@@ -51,6 +52,8 @@ class TrackSetup:
     """Pose of the lidar in base."""
     located: bool = False
     """Whether poses are measured, not computed from the requests."""
+    freedom: Freedom | None = "both"
+    """Angles that the axles can take; None: they are not steered."""
 
 
 class Newest(NamedTuple):
@@ -138,6 +141,7 @@ class TrackingStep:
     def __init__(self, setup: TrackSetup, points: ScanPoints | None = None) -> None:
         self._config = setup.config
         self._path_tracker = build_tracker(setup.config, setup.steering)
+        self._path_tracker.limit_learning(setup.freedom)
         self._footprint = setup.footprint
         self._points = points or ScanPoints(setup.lidar)
         self._located = setup.located

@@ -13,9 +13,20 @@ from tests.unit.planners.kit import STEERING, Follower, figure_eight, path
 STEP = 0.05
 
 
-def driven(errors, speeds, seconds=60.0, noise=0.0, steering=(1.0, -0.6), *, located=True, compass=False, seed=1):
+def driven(
+    errors,
+    speeds,
+    seconds=60.0,
+    noise=0.0,
+    steering=(1.0, -0.6),
+    *,
+    located=True,
+    compass=False,
+    seed=1,
+    freedom="both",
+):
     """Random requests to axles that obey at once, at each of some speeds in turn."""
-    estimator, rng = AxleErrorEstimator(STEERING), np.random.default_rng(seed)
+    estimator, rng = AxleErrorEstimator(STEERING, freedom), np.random.default_rng(seed)
     pose, swept, angle = (0.0, 0.0, 0.0), (0.0, 0.0), 0.0
     for k in range(round(seconds / STEP)):
         t, speed = k * STEP, speeds[k // 200 % len(speeds)]
@@ -72,6 +83,26 @@ def test_a_compass_alone_shows_the_turn_and_leaves_the_axles_uncertain():
 
 def test_poses_that_come_from_the_requests_teach_nothing():
     found = driven(AxleErrors(AxleError(0.8)), [0.18], located=False)
+    assert not found.state.any()
+    assert found.metres == 0.0
+
+
+def test_axles_on_one_servo_err_alike_and_are_requested_alike():
+    wrong = AxleErrors(AxleError(0.9, 0.05), AxleError(0.9, 0.05))
+    found = driven(wrong, [0.18], steering=(1.0, 1.0), freedom="parallel", noise=0.001)
+    assert found.state[[1, 4]] == pytest.approx(0.05, abs=0.005)
+    front, rear = found.errors.requests((0.2, 0.2), 0.1)
+    assert front == pytest.approx(rear, abs=1e-9)
+
+
+def test_an_axle_that_is_not_steered_has_no_error():
+    found = driven(AxleErrors(AxleError(0.9, 0.05)), [0.18], steering=(1.0, 0.0), freedom="front")
+    assert found.state[:2] == pytest.approx((-0.1, 0.05), abs=0.01)
+    assert not found.state[3:].any()
+
+
+def test_a_body_that_steers_nothing_learns_nothing():
+    found = driven(AxleErrors(AxleError(0.9, 0.05)), [0.18], freedom=None)
     assert not found.state.any()
     assert found.metres == 0.0
 
