@@ -232,10 +232,6 @@ class MemoryPort:
         self.device.connect(None)
 
 
-FRAME: Final = 0.001
-"""Seconds of a USB frame: what a device says within one reaches the host together."""
-
-
 @contextlib.contextmanager
 def reserved(*links: Path) -> Iterator[None]:
     """Keep the names of ptys for this program while the context lasts: nobody else's are replaced.
@@ -330,7 +326,8 @@ class PtyPort:
     def _send(self, data: bytes) -> None:
         self._frame += data
         if self._timer is None:
-            self._timer = asyncio.get_running_loop().call_later(FRAME, self._end_frame)
+            frame = 0.001  # seconds of a USB frame: what a device says within one reaches the host together
+            self._timer = asyncio.get_running_loop().call_later(frame, self._end_frame)
 
     def _end_frame(self) -> None:
         assert self._fds is not None

@@ -16,8 +16,6 @@ Framing = Literal["8N1", "8E2"]
 """Bits of a byte on a serial line: data bits, parity, stop bits."""
 BUFFER_LIMIT = 1 << 16
 """Unread bytes kept; beyond that the oldest are dropped, as a tty's buffer would."""
-TIMER_STEP = 0.001
-"""Seconds; the loop's timers count in these, and ring up to one and a half too early."""
 
 
 class Link:
@@ -199,7 +197,8 @@ class Link:
         self._alarm = None
         if self._due is None or self._waiting is None:
             return
-        if self._due - loop.time() > TIMER_STEP / 2:
+        timer_step = 0.001  # seconds; the loop's timers count in these, and ring up to one and a half too early
+        if self._due - loop.time() > timer_step / 2:
             self._set_alarm(loop, self._due)
         else:
             self._waiting.on_timeout()

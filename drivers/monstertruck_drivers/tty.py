@@ -32,8 +32,6 @@ PATIENCE: Final = 2.0
 MAX_AGE: Final = 0.25
 """Seconds without progress after which unsent bytes are outdated, and their device is wedged: more than a hub takes
 to resume, about as long as the gate drives without feedback."""
-LAST_WORDS: Final = 1.0
-"""Seconds that the end of the program waits for ports to be closed: a closing port sends what was written last."""
 
 _PTY_MAJORS: Final = range(136, 144)
 """Device numbers of pseudo terminals."""
@@ -123,7 +121,9 @@ _closing: set[Future[None]] = set()
 @atexit.register
 def _await_last_words() -> None:
     """Let closing ports send what was written last. The end of the process kills the threads of wedged ones."""
-    futures.wait(_closing, LAST_WORDS)
+    # Seconds that the end of the program waits for ports to be closed: a closing port sends what was written last.
+    last_words = 1.0
+    futures.wait(_closing, last_words)
 
 
 class _PortNode:

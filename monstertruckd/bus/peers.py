@@ -1,7 +1,5 @@
 """Other robots: their poses are received over their own Zenoh endpoints, and published on ``state/peers``."""
 
-from typing import Final
-
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock, Schedule
 from monstertruck_runtime.errors import NoAnswerError
@@ -51,10 +49,6 @@ class PeerService:
             self._out.put(message)
 
 
-SILENT: Final = 5.0
-"""Seconds without a pose after which another robot counts as lost."""
-
-
 class PeerSubscriber:
     """Receives the poses of one other robot; ready with the first one.
 
@@ -74,13 +68,14 @@ class PeerSubscriber:
 
         Raises:
             NotFoundError: nobody is there, or no robot of this name.
-            NoAnswerError: it has published no pose for ``SILENT`` s.
+            NoAnswerError: it has published no pose for 5 s.
         """
         endpoint = self._config.endpoint
         async with TruckClient(self._robot, endpoint, clock=self._clock) as client:
+            silent = 5.0  # seconds without a pose after which another robot counts as lost
             with client.subscribe(POSE, latest()) as poses:
-                while (pose := await poses.next_within(SILENT)) is not None:
+                while (pose := await poses.next_within(silent)) is not None:
                     ready()
                     self._peers.hear(self._robot, pose)
             await client.get_retained(GATE)  # says who is there instead
-            raise NoAnswerError(f"robot {self._robot!r} at {endpoint} has published no pose for {SILENT:g} s")
+            raise NoAnswerError(f"robot {self._robot!r} at {endpoint} has published no pose for {silent:g} s")

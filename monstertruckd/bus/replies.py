@@ -25,8 +25,6 @@ log = logging.getLogger(__name__)
 
 THREADS: Final = 8
 """Replies under way at once, each to another owner; as many further ones to orders."""
-REPLY_QUEUE: Final = 4096
-"""Queries that may wait for their reply; beyond that no further query is taken until one has left."""
 
 Reply = Callable[[zenoh.Query], object]
 """Sends replies to a query."""
@@ -44,9 +42,11 @@ class Replies:
         """By owner, orders apart; the first of each is under way."""
 
     def wait_for_room(self) -> None:
-        """Wait until fewer than ``REPLY_QUEUE`` replies wait; not for the event loop."""
+        """Wait until there is room for one more reply; not for the event loop."""
         with self._change:
-            self._change.wait_for(lambda: self._waiting < REPLY_QUEUE)
+            # Queries that may wait for their reply; beyond that no further query is taken until one has left.
+            reply_queue = 4096
+            self._change.wait_for(lambda: self._waiting < reply_queue)
 
     def end(
         self, query: zenoh.Query, reply: Reply | None = None, source: str | None = None, *, order: bool = False

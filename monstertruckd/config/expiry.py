@@ -40,8 +40,6 @@ from monstertruckd.config.wizards import WIZARDS
 
 DAY: Final = 86_400 * SECOND
 """ns."""
-DRIVE_CHECK_PERIOD: Final = 1.0
-"""Seconds between two checks of the drive's position: half of it at most is missing of every reversal."""
 
 
 _UNKNOWN: Final[Mapping[str, str]] = MappingProxyType({})
@@ -236,8 +234,10 @@ class CalibrationWatch:
         with self._bus.subscribe(DRIVE, latest()) as drive, self._bus.subscribe(USB, latest()) as usb:
             before: float | None = None
             try:
+                # Seconds between two checks of the drive's position: half of it at most is missing of every reversal.
+                drive_check_period = 1.0
                 for count in itertools.count(1):
-                    await self._clock.sleep(DRIVE_CHECK_PERIOD)
+                    await self._clock.sleep(drive_check_period)
                     if drive.latest is not None:
                         here = drive.latest.position
                         if before is not None:

@@ -37,15 +37,9 @@ PRIORITY: Final = {role: rank for rank, role in enumerate(reversed(Role))}
 
 Key = tuple[bool, str]
 
-MAX_KEYS: Final = 64
-"""Different events (reason and source) within one interval: sources may invent any number of names."""
 
 ASKING: Final = 20 * SECOND
 """An operator who asks for the drive is forgotten after this, ns."""
-MAX_ASKING: Final = 4
-"""Operators who ask at once; one more replaces the oldest."""
-HANDED: Final = 3 * SECOND
-"""Others wait so long for the operator to whom the drive was handed over, ns."""
 
 MODE_REASONS: Final = {GateMode.ESTOPPED: (Reason.ESTOPPED,), GateMode.DISARMED: (Reason.DISARMED,)}
 """Why the truck does not drive in these modes."""
@@ -195,7 +189,7 @@ class Sources:
     def ask(self, name: str, now: int) -> None:
         """An operator asks for the drive."""
         self._asking = {other: until for other, until in self._asking.items() if now <= until and other != name}
-        while len(self._asking) >= MAX_ASKING:
+        while len(self._asking) >= 4:  # operators who ask at once; one more replaces the oldest
             del self._asking[next(iter(self._asking))]
         self._asking[name] = now + ASKING
 
@@ -208,7 +202,8 @@ class Sources:
         # Since the tick that made it the holder it may have sent a newer request.
         self._drive.get(holder.key, holder).held = True
         self._asking.pop(to, None)
-        self._handed = to, now + HANDED, holder.rank
+        handed = 3 * SECOND  # others wait so long for the operator to whom the drive was handed over, ns
+        self._handed = to, now + handed, holder.rank
         self._min_rank = min(self._min_rank, PRIORITY[Role.STATION])
 
     def handed_to(self, now: int) -> str | None:
@@ -334,9 +329,11 @@ class EventLog:
             lasting: suppressed for as long as it repeats without a pause of the interval.
         """
         key = (reason, source)
-        if key not in self._emitted and len(self._emitted) >= MAX_KEYS:
+        # Different events (reason and source) within one interval: sources may invent any number of names.
+        max_keys = 64
+        if key not in self._emitted and len(self._emitted) >= max_keys:
             self._emitted = {other: at for other, at in self._emitted.items() if now - at[0] < self._interval}
-            if len(self._emitted) >= MAX_KEYS and not always:
+            if len(self._emitted) >= max_keys and not always:
                 return
         last, repeated = self._emitted.get(key, (now - self._interval, 0))
         if not always and now - last < self._interval:

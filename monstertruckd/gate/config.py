@@ -289,13 +289,10 @@ class InForce:
 SIGHT: Final = 4.0
 """Distance at which the scanner is sure to see an obstacle, m (URG-04LX, data sheet)."""
 
-GRAVITY: Final = 9.81
 GRIP: Final = 0.6
 """Friction of rubber wheels on a smooth floor, at most."""
 SLIPPING: Final = math.atan(GRIP)
 """Slope on which the wheels slip, rad."""
-
-ROUNDING: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,7 +313,8 @@ class BodyLimits:
     @property
     def acceleration(self) -> float:
         """Greatest change of speed that motors and wheels hold, m/s^2."""
-        return min(self.pull / self.mass, GRIP * GRAVITY)
+        gravity = 9.81
+        return min(self.pull / self.mass, GRIP * gravity)
 
 
 def impossible_settings(config: GateConfig, body: BodyLimits, times: Iterable[tuple[str, float]] = ()) -> Iterator[str]:
@@ -327,13 +325,14 @@ def impossible_settings(config: GateConfig, body: BodyLimits, times: Iterable[tu
         body: which.
         times: names and values (s) of other settings during which the truck may drive on unattended.
     """
+    rounding = 1e-9
     for name in ("acceleration", "deceleration", "quick_deceleration"):
-        if getattr(config, name) > body.acceleration + ROUNDING:
+        if getattr(config, name) > body.acceleration + rounding:
             yield (
                 f"gate.{name} {getattr(config, name):g} m/s^2: at most {body.acceleration:.2f}, what {body.pull:g} N "
                 f"and the grip of the wheels do to {body.mass:g} kg"
             )
-    if body.motor_speed is not None and config.speed > body.motor_speed + ROUNDING:
+    if body.motor_speed is not None and config.speed > body.motor_speed + rounding:
         yield f"gate.speed {config.speed:g} m/s: at most {body.motor_speed:.3f}, the speed at the motor's greatest rate"
     if config.reverse_speed > config.speed:
         yield f"gate.reverse_speed {config.reverse_speed:g} m/s: at most gate.speed, {config.speed:g}"

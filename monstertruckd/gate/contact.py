@@ -28,20 +28,6 @@ from monstertruckd.gate.motion import Course, scaled
 
 SETTLED: Final = SECOND // 10
 """Time for which a shaft must have reached its commanded speed before measures are compared, ns."""
-REACHED: Final = 0.8
-"""Share of the commanded speed at which a shaft has reached it; a drive that is switched on takes half a second."""
-STEADY: Final = 1e-3
-"""Commanded velocities that differ by less are the same motion, m/s and rad/s."""
-LEARNED: Final = 20
-"""Number of rolling currents kept for each motor."""
-ENOUGH: Final = 3
-"""Number of rolling currents whose median replaces ``ContactConfig.rolling``."""
-TURNING: Final = 0.1
-"""Minimum commanded yaw rate that is compared with the gyroscope, rad/s."""
-LEAST: Final = 1e-6
-"""Minimum pace of a request that is scaled, m/s."""
-PATIENCE: Final = 2.0
-"""The robot stops backing off after this multiple of the time that the distance takes at ``confirmed_speed``."""
 
 
 class ContactFinding(NamedTuple):
@@ -140,7 +126,8 @@ class ContactCheck(Check):
 
     def _follow(self, tick: Tick) -> None:
         twist = self.view.motion.twist
-        if max(abs(new - old) for new, old in zip(twist, self._steady, strict=True)) > STEADY:
+        steady = 1e-3  # commanded velocities that differ by less are the same motion, m/s and rad/s
+        if max(abs(new - old) for new, old in zip(twist, self._steady, strict=True)) > steady:
             self._steady = twist
             self._reached.clear()
             self._slow.clear()
@@ -158,7 +145,9 @@ class ContactCheck(Check):
     def _backing(self, now: int) -> bool:
         """Whether the robot still has to back off."""
         distance = self._config.back_off
-        longest = PATIENCE * distance / self.view.config.obstacle.confirmed_speed
+        # The robot stops backing off after this multiple of the time that the distance takes at ``confirmed_speed``.
+        patience = 2.0
+        longest = patience * distance / self.view.config.obstacle.confirmed_speed
         return self._backed < distance and now - self._began < longest * SECOND
 
     def _same_direction(self, request: DriveRequest, other: DriveRequest) -> bool:
@@ -173,7 +162,8 @@ class ContactCheck(Check):
         """Return the opposite of a request, at ``confirmed_speed``."""
         target = self.view.motion.target(request)
         pace = self.view.motion.pace(target.twist, target.shafts)
-        share = -self.view.config.obstacle.confirmed_speed / max(pace, LEAST)
+        least = 1e-6  # minimum pace of a request that is scaled, m/s
+        share = -self.view.config.obstacle.confirmed_speed / max(pace, least)
         if request.twist is not None:
             vx, vy, wz = scaled((request.twist.vx, request.twist.vy, request.twist.wz), share)
             return request.model_copy(update={"twist": request.twist.model_copy(update={"vx": vx, "vy": vy, "wz": wz})})
@@ -195,14 +185,17 @@ class ContactCheck(Check):
             return
         sign = math.copysign(1.0, commanded)
         measured = sign * self.view.chassis.drivetrain.speed(feedback.velocity)
-        if measured >= REACHED * abs(commanded):
+        # Share of the commanded speed at which a shaft has reached it; a drive that is switched on takes half a second.
+        reached = 0.8
+        if measured >= reached * abs(commanded):
             self._reached.setdefault(shaft, feedback.stamp)
         if feedback.stamp - self._reached.get(shaft, feedback.stamp) < SETTLED:
             return
         self._compare(f"shaft {shaft}", feedback, measured, abs(commanded))
         if feedback.current is not None:
-            known = self._rolling.setdefault(shaft, deque(maxlen=LEARNED))
-            usual = median(known) if len(known) >= ENOUGH else self._config.rolling
+            known = self._rolling.setdefault(shaft, deque(maxlen=20))  # number of rolling currents kept for each motor
+            enough = 3  # number of rolling currents whose median replaces ``ContactConfig.rolling``
+            usual = median(known) if len(known) >= enough else self._config.rolling
             limit, load = usual + self._config.current, sign * feedback.current
             if load > limit:
                 self._touch(ContactFinding("motor current", load, "A", limit), feedback.received)
@@ -221,7 +214,8 @@ class ContactCheck(Check):
 
     def _take_gyro(self, imu: Imu) -> None:
         expected = abs(self._steady[2])
-        if not self._driven(imu.stamp) or expected < TURNING:
+        turning = 0.1  # minimum commanded yaw rate that is compared with the gyroscope, rad/s
+        if not self._driven(imu.stamp) or expected < turning:
             self._slow.pop("body", None)
             return
         rate = imu.angular_velocity

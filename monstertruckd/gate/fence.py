@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,6 @@ from monstertruckd.gate.catalog import FenceConfig
 from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
 from monstertruckd.gate.motion import Course
 from monstertruckd.gate.obstacles import OUTLINE, at_poses
-
-FRESH: Final = 0.5
-"""Age up to which a pose counts, s."""
-STEP: Final = 0.02
-"""Distance between the poses of a sweep, m."""
 
 
 class FenceCheck(Check):
@@ -56,7 +51,7 @@ class FenceCheck(Check):
         if not courses:
             return
         age = math.inf if self._pose is None else (now - self._pose.stamp) / SECOND
-        if age > FRESH:
+        if age > 0.5:  # age up to which a pose counts, s
             self._free = None
             yield PaceLimit(Reason.OWN_CHECK, 0.0)
             return
@@ -72,7 +67,8 @@ class FenceCheck(Check):
         """Distance along a motion up to where more of the outline is outside than now, m; +inf beyond ``far``."""
         assert self._pose is not None
         pose = self._pose.pose
-        distances = np.arange(0.0, far + STEP, STEP)
+        step = 0.02  # distance between the poses of a sweep, m
+        distances = np.arange(0.0, far + step, step)
         poses = placed(swept_poses(twist, distances), (pose.x, pose.y, pose.yaw))
         outside = (~inside(at_poses(self._edges, poses), self._corners)).sum(axis=1)
         (further,) = (outside > outside[0]).nonzero()

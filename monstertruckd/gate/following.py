@@ -8,7 +8,7 @@ speed and commanded axle angles. ``ShaftCheck`` finds a shaft that is blocked.
 import math
 from collections import deque
 from collections.abc import Iterator
-from typing import Any, Final, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Message
@@ -18,15 +18,6 @@ from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode
 from monstertruck_schemas.topics import DRIVES, Topic
 from monstertruckd.gate.checks import Check, GateView, Tick
 from monstertruckd.gate.config import ShaftCheckConfig, SteeringCheckConfig
-
-ENABLED_WITHIN: Final = 1.5
-"""Seconds in which a drive controller that is commanded to turn its shaft is enabled: it takes 0.6."""
-
-JUMP: Final = 1.5
-"""A heading that changes faster than this, rad/s, is a disturbed compass, not a turn."""
-
-GAP: Final = SECOND // 2
-"""Headings further apart than this are not compared, ns."""
 
 
 class Comparison(Protocol):
@@ -153,13 +144,15 @@ class TurnComparison:
         if heading is None or speed is None or abs(speed) < self.config.speed:
             self._window.clear()
             return
-        if not self._window or stamp - self._window[-1][0] > GAP:
+        gap = SECOND // 2  # headings further apart than this are not compared, ns
+        if not self._window or stamp - self._window[-1][0] > gap:
             self._begin(stamp, heading)
             return
         before, commanded, measured = self._window[-1]
         dt = (stamp - before) / SECOND
         turned = -math.remainder(heading - self._heading, 2 * math.pi)
-        if abs(turned) > JUMP * dt:
+        jump = 1.5  # a heading that changes faster than this, rad/s, is a disturbed compass, not a turn
+        if abs(turned) > jump * dt:
             self._begin(stamp, heading)
             return
         commanded += rate * dt
@@ -231,7 +224,9 @@ class ShaftComparison:
             self._since.pop((shaft, enabled), None)
             return
         since = self._since.setdefault((shaft, enabled), feedback.received)
-        within = limits.within if enabled else ENABLED_WITHIN
+        # Seconds in which a drive controller that is commanded to turn its shaft is enabled: it takes 0.6.
+        enabled_within = 1.5
+        within = limits.within if enabled else enabled_within
         if self.blocked is None and feedback.received - since >= within * SECOND:
             self.blocked = shaft
 

@@ -24,12 +24,6 @@ from monstertruck_schemas.sensor import HandControls
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import Topic
 
-RATE: Final = 20.0
-"""Requests per second."""
-LEASE: Final = 0.25
-"""Seconds a request stands."""
-REPEAT: Final = SECOND // 5
-"""Between two orders to stop a robot that has not stopped yet, ns."""
 MOBILE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING})
 """Modes in which the robot moves, or may begin to."""
 
@@ -112,7 +106,8 @@ class HandPolicy:
 
     def _stop(self, mode: GateMode | None, now: int) -> tuple[Order, ...]:
         """Orders that bring a mobile robot to rest; repeated until it is."""
-        if mode not in MOBILE or (self._stopped_at is not None and now - self._stopped_at < REPEAT):
+        repeat = SECOND // 5  # between two orders to stop a robot that has not stopped yet, ns
+        if mode not in MOBILE or (self._stopped_at is not None and now - self._stopped_at < repeat):
             return ()
         self._stopped_at = now
         return Order.STOP, Order.DISARM
@@ -166,7 +161,7 @@ class HandService:
 
     async def run(self, ready: Ready) -> None:
         """Ask for what the hand wants until cancelled."""
-        schedule = Schedule(self._clock, RATE)
+        schedule = Schedule(self._clock, 20.0)  # requests per second
         while True:
             await schedule.next()
             now, gate, controls = self._clock.now(), self._gate.latest, self._hand.latest
@@ -199,7 +194,7 @@ class HandService:
             "seq": self._seq,
             "source": DeviceRole.HAND.value,
             "role": Role.HAND,
-            "lease": LEASE,
+            "lease": 0.25,  # seconds a request stands
             "nonce": gate.nonce,
             "gate_stamp": gate.stamp,
             "instance": self._instance,

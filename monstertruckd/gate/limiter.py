@@ -1,7 +1,7 @@
 """Moves the commanded motion towards the request of each tick, within the least of all limits."""
 
 from collections.abc import Iterator, Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from monstertruck_kinematics.chassis import STILL, Speeds
 from monstertruck_kinematics.se2 import Twist2
@@ -10,12 +10,6 @@ from monstertruck_schemas.req import DriveRequest
 from monstertruckd.gate.approach import stopping
 from monstertruckd.gate.checks import Check, GateView, PaceLimit
 from monstertruckd.gate.motion import ROUNDING, Course, Target, scaled
-
-FASTEST: Final = 1e6
-"""Measured speeds are clamped to this, m/s, so that their squares stay finite."""
-
-LEAST: Final = 1e-6
-"""A smaller pace counts as standstill, m/s: the direction of such a twist is rounding error."""
 
 
 class Aim(NamedTuple):
@@ -72,7 +66,8 @@ class CommandLimiter(Check):
         if pace == 0 and motion.standing:
             return ()
         courses = ((wanted, pace), (motion.twist, motion.present_pace))
-        return tuple((scaled(twist, 1.0 / pace), pace) for twist, pace in courses if twist != STILL and pace >= LEAST)
+        least = 1e-6  # a smaller pace counts as standstill, m/s: the direction of such a twist is rounding error
+        return tuple((scaled(twist, 1.0 / pace), pace) for twist, pace in courses if twist != STILL and pace >= least)
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
         """Servos that do not reach as far, and requests beyond the configured limits."""
@@ -103,4 +98,5 @@ class CommandLimiter(Check):
         """Distance travelled if stopped now, m, by the greater of measured and commanded speed."""
         config = self.view.config
         speed = max(abs(self.view.samples.speed(now) or 0.0), *map(abs, self.view.motion.shaft_speeds))
-        return stopping(min(speed, FASTEST), config.reaction, config.deceleration)
+        fastest = 1e6  # measured speeds are clamped to this, m/s, so that their squares stay finite
+        return stopping(min(speed, fastest), config.reaction, config.deceleration)

@@ -27,9 +27,6 @@ MAX_SPEED: Final = 1e3
 ROUNDING: Final = 1e-6
 """Relative difference up to which two motions are the same."""
 
-SATURATED: Final = 1e-4
-"""Difference between wanted and reachable steering angle from which on the gate reports it, rad."""
-
 
 class Target(NamedTuple):
     """The motion that a request means for this body."""
@@ -139,7 +136,9 @@ class Motion:
     def _reached(self, angles: Angles) -> tuple[Angles, bool]:
         """Steering angles that the servos reach, and whether these are others."""
         reached = self._chassis.reached(angles)
-        return reached, max(abs(asked - got) for asked, got in zip(angles, reached, strict=True)) > SATURATED
+        # Difference between wanted and reachable steering angle from which on the gate reports it, rad.
+        saturated = 1e-4
+        return reached, max(abs(asked - got) for asked, got in zip(angles, reached, strict=True)) > saturated
 
     def along(self, twist: Twist2, angles: Angles | None = None) -> Twist2:
         """The part of a twist that the body can do at steering angles, by default the commanded ones."""

@@ -44,25 +44,14 @@ TWIST_STEP: Final = 0.005
 GROUND_STEP: Final = 2
 """The ground is checked at every second pose."""
 
-FINER: Final = 4
-"""Parts of the distance between two of these in which the edge of seen ground is found."""
-
-SWEEPS: Final = 256
-"""Sweeps cached."""
 
 LEAVING: Final = 0.1
 """A body nearer to an obstacle than the side clearance may only drive motions that take it this much further away per
 metre, m/m: a translation of 0.33 rad away from a wall does (0.34 m/m), a straight line along it does not."""
 
-DEPTH: Final = 0.2
-"""Ground that no scan has seen, nearer than this to a measured point, is not turned onto, m: what stands there is seen
-from one side only. Somebody who stands is about as deep."""
 
 OUTLINE: Final = 12
 """Points on each edge of the footprint from which the directions of travel are found."""
-
-TOUCH: Final = 1e-6
-"""A point that enters the footprint by less is on its edge, m."""
 
 
 def ground_ahead(body: Footprint, edges: Array, poses: Array) -> Array:
@@ -77,7 +66,8 @@ def ground_ahead(body: Footprint, edges: Array, poses: Array) -> Array:
         Shape (m - 1, n, 2), m: the same points of the outline at all poses after the first.
     """
     (step,) = at_poses(edges, poses[1:2])
-    return at_poses(edges[~on_body(body, step, TOUCH)], poses[1:])
+    touch = 1e-6  # a point that enters the footprint by less is on its edge, m
+    return at_poses(edges[~on_body(body, step, touch)], poses[1:])
 
 
 def at_poses(points: Array, poses: Array) -> Array:
@@ -152,7 +142,7 @@ class ObstacleGuard:
         self._near = self._reach + self._footprint.circumscribed_radius + config.obstacle.side_clearance
         if self._near > before:
             self.memory.forget()
-        self._sweep = lru_cache(SWEEPS)(self._swept)
+        self._sweep = lru_cache(256)(self._swept)  # sweeps cached
         self._checked = None
 
     @property
@@ -263,18 +253,22 @@ class ObstacleGuard:
             self.known += min(map(self._further, reverse))
         self.known_aside = float(before[hidden & ~back].min(initial=math.inf))
         reached = hidden & turning & (before < self._free)
-        near = on_body(self._footprint, measured, self._reach + DEPTH) & ~on_body(self._footprint, measured, 0.0)
+        # Ground that no scan has seen, nearer than this to a measured point, is not turned onto, m: what stands there
+        # is seen from one side only. Somebody who stands is about as deep.
+        depth = 0.2
+        near = on_body(self._footprint, measured, self._reach + depth) & ~on_body(self._footprint, measured, 0.0)
         apart = ((ground[reached][:, None] - measured[near]) ** 2).sum(axis=2).min(axis=1, initial=math.inf)
-        self._free = float(before[reached][apart < DEPTH**2].min(initial=self._free))
+        self._free = float(before[reached][apart < depth**2].min(initial=self._free))
 
     def _further(self, twist: tuple[int, int, int]) -> float:
         """Distance beyond ``known`` for which a motion still stays on seen ground, below that between two poses, m."""
         x, y, turn = (part * TWIST_STEP for part in twist)
-        step = GROUND_STEP * float(self._sweep(*twist).distances[1]) / FINER
-        poses = swept_poses((x, y, turn), self.known + np.linspace(0.0, (FINER - 1) * step, FINER))
+        finer = 4  # parts of the distance between two of these in which the edge of seen ground is found
+        step = GROUND_STEP * float(self._sweep(*twist).distances[1]) / finer
+        poses = swept_poses((x, y, turn), self.known + np.linspace(0.0, (finer - 1) * step, finer))
         outline = at_poses(self._outline, poses[1:])
-        seen = self.memory.seen(outline.reshape(-1, 2)).reshape(FINER - 1, -1).all(axis=1)
-        return step * (FINER - 1 if seen.all() else int(np.argmin(seen)))
+        seen = self.memory.seen(outline.reshape(-1, 2)).reshape(finer - 1, -1).all(axis=1)
+        return step * (finer - 1 if seen.all() else int(np.argmin(seen)))
 
     def allowed_before_unseen(self, now: int) -> float:
         """Greatest pace from which the body stops comfortably on ground that was seen, m/s."""

@@ -2,9 +2,9 @@
 
 A lidar does not look behind the robot, and what it saw there is old: another robot may have come since. The outlines of
 the robots in section ``peers`` are obstacles where the lidar does not look, or all around a robot without one. Each is
-predicted from its newest pose and twist to now and to the times of ``HORIZON``. The clearance grows with the standard
-deviation of both poses. An outline whose newest pose is older than ``FRESH`` stays where it was for ``KEPT``; such a
-robot may be anywhere (``unknown``), and so may one whose pose is less certain than ``UNSURE``.
+predicted from its newest pose and twist to now and to the next second. The clearance grows with the standard
+deviation of both poses. An outline whose newest pose is older than ``FRESH`` stays where it was for 30 s; such a robot
+may be anywhere (``unknown``), and so may one whose pose is less certain than ``UNSURE``.
 """
 
 import math
@@ -30,20 +30,10 @@ from monstertruckd.gate.motion import AHEAD, Course
 from monstertruckd.gate.obstacles import ObstacleGuard
 from monstertruckd.gate.sonars import SonarGuard
 
-HORIZON: Final = (0.0, 0.5, 1.0)
-"""Times to which the motion of another robot is predicted, s."""
 FRESH: Final = 0.5
 """Age up to which a pose is used, s: at 0.2 m/s a robot travels 0.1 m meanwhile."""
-KEPT: Final = 30.0
-"""Seconds for which the last outline of a silent robot is an obstacle, as points of earlier scans are."""
-DEVIATIONS: Final = 2.0
-"""Standard deviations of the relative position that are added to the clearance."""
 UNSURE: Final = 0.3
 """Standard deviation above which a relative position is not used, m; the clearance grows no further."""
-SPACING: Final = 0.03
-"""Distance between the points of an outline, m."""
-STEP: Final = 0.02
-"""Distance between the poses of a sweep, m."""
 
 Place = tuple[float, float, float]
 Seen = Callable[[Array], NDArray[np.bool_]]
@@ -96,14 +86,16 @@ class PeerGuard:
         if (own := self._fresh(now)) is None:
             return free
         twists, place = tuple(twists), _moved(own.pose, own.twist, _age(own.stamp, now))
+        deviations = 2.0  # standard deviations of the relative position that are added to the clearance
         for peer in self._heard.values():
-            unsure = DEVIATIONS * min(_deviation(own, peer), UNSURE)
+            unsure = deviations * min(_deviation(own, peer), UNSURE)
             clearance = self._limits.config.obstacle.side_clearance + unsure
             points = self._outline(peer, place, now, reach, clearance)
             if seen is not None:
                 points = points[~seen(points)]
             if len(points):
-                swept = (free_distance(self._footprint, twist, points, reach, STEP, clearance) for twist in twists)
+                step = 0.02  # distance between the poses of a sweep, m
+                swept = (free_distance(self._footprint, twist, points, reach, step, clearance) for twist in twists)
                 free = min([free, *swept])
         return free
 
@@ -115,11 +107,14 @@ class PeerGuard:
         """Points of another robot's present and predicted outlines in base, shape (n, 2), m; none if it is far away."""
         edges, age = self._edges[peer.robot], _age(peer.heard, now)
         pose, twist = peer.pose, peer.twist
-        times = (0.0,) if age > FRESH else tuple(age + later for later in HORIZON)
+        horizon = (0.0, 0.5, 1.0)  # times to which the motion of another robot is predicted, s
+        times = (0.0,) if age > FRESH else tuple(age + later for later in horizon)
         radius, ahead = float(np.hypot(edges[:, 0], edges[:, 1]).max()), math.hypot(twist.vx, twist.vy) * times[-1]
         near = reach + self._footprint.circumscribed_radius + clearance
         found = [np.empty((0, 2))]
-        if age > KEPT or math.dist((pose.x, pose.y), own[:2]) > near + radius + ahead:
+        # Seconds for which the last outline of a silent robot is an obstacle, as points of earlier scans are.
+        kept = 30.0
+        if age > kept or math.dist((pose.x, pose.y), own[:2]) > near + radius + ahead:
             return found[0]
         for number, time in enumerate(times):
             at = _moved(pose, twist, time)
@@ -218,5 +213,6 @@ def _moved(pose: Pose2D, twist: Twist2D, seconds: float) -> Place:
 
 def _edges(body: Footprint) -> Array:
     """Points along the outline of a body in its base, shape (n, 2), m."""
-    along, across = (math.ceil(2 * half / SPACING) + 1 for half in (body.half_length, body.half_width))
+    spacing = 0.03  # distance between the points of an outline, m
+    along, across = (math.ceil(2 * half / spacing) + 1 for half in (body.half_length, body.half_width))
     return body.edge_points(along, across)

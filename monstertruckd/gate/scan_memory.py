@@ -17,36 +17,14 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import position_deviation
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 
-MEMORY_STEP: Final = 0.1
-"""Travelled distance between two remembered scans, m."""
-MEMORY_SCANS: Final = 20
-SPACING: Final = 0.02
-"""Distance between remembered points along the line of the beams, m: less than their drift."""
-VIEW_STEP: Final = 0.3
-"""Distance (m) plus turn (rad) between two of the scans that are kept to know which ground is free: each sees further
-than a truck's length in half of all directions."""
-VIEWS: Final = 32
-"""The most of them: at 0.21 m/s the truck takes 21 in 30 s."""
-SONAR_VIEWS: Final = 8
-"""Maximum number of views kept per sonar: 2.1 m of travel, longer than a cone needs to become as wide as the body."""
-ROUNDS: Final = 2
-"""Number of newest echoes per sonar that count as obstacles: a single one may be reflected away."""
 DRIFT: Final = 0.03
 """Ground this near to where the body stood counts as free, m: the error of dead reckoning; less by as much as the
 pose's standard deviation has grown since, beyond the padding of the footprint."""
-FIELD_EDGE: Final = 0.1
-"""Remembered points this near to the edge of the lidar's field are kept, rad: the error of the dead-reckoned yaw."""
-POSES_KEPT: Final = 64
-"""Ticks whose pose is kept, to place a scan where it was taken."""
 STANDING: Final = 0.001
 """Distance travelled between two scans by a body that stands, m: rounding of its velocity."""
-LEVER: Final = 1.0
-"""Distance at which an error of the heading displaces remembered ground, m: a truck's length and what it stops in."""
 MAP_SIZE: Final = 64
 MAP_CELL: Final = 0.05
 """Cells on each side of a survey, and their size, m: what a truck covers in reverse until it has seen more."""
-CHANGED: Final = 0.1
-"""Difference of a beam from that of an earlier scan that neither noise nor rounding makes, m."""
 ELSEWHERE: Final = 0.3
 """Share of the beams with a range that differ so once a robot was carried; people who pass change fewer."""
 
@@ -136,10 +114,11 @@ class ScanMemory:
         """Start again: it is not known how the body has moved."""
         self._pose: Pose2 = (0.0, 0.0, 0.0)
         self._travelled = 0.0
-        self._ticks: deque[tuple[int, Pose2, float]] = deque(maxlen=POSES_KEPT)
+        poses_kept = 64  # ticks whose pose is kept, to place a scan where it was taken
+        self._ticks: deque[tuple[int, Pose2, float]] = deque(maxlen=poses_kept)
         self._newest: _Taken | None = None
-        self._taken: deque[_Taken] = deque(maxlen=MEMORY_SCANS)
-        self._views: deque[_Taken] = deque(maxlen=VIEWS)
+        self._taken: deque[_Taken] = deque(maxlen=20)
+        self._views: deque[_Taken] = deque(maxlen=32)  # at 0.21 m/s the truck takes 21 in 30 s
         self._heard: dict[str, _Heard] = {}
 
     def move(self, now: int, twist: Twist2, dt: float) -> None:
@@ -151,7 +130,10 @@ class ScanMemory:
 
     def doubt(self, covariance: Array) -> None:
         """Take the covariance of the pose in odometry, row-major of (x, y, yaw), shape (9,), m^2, m rad, rad^2."""
-        self._variance = position_deviation(covariance) ** 2 + LEVER**2 * float(covariance[8])
+        # Distance at which an error of the heading displaces remembered ground, m: a truck's length and what it stops
+        # in.
+        lever = 1.0
+        self._variance = position_deviation(covariance) ** 2 + lever**2 * float(covariance[8])
 
     def rest(self, scan: LaserScan | None) -> None:
         """Take a scan of a robot whose wheels stand and that may be carried; forget everything once it was.
@@ -171,13 +153,15 @@ class ScanMemory:
             scan: the revolution.
             points: its returns near the body in base, shape (n, 2), m.
         """
-        self._newest = self._take(Beams.of(scan), spaced(points, SPACING), self._mount)
+        spacing = 0.02  # distance between remembered points along the line of the beams, m: less than their drift
+        self._newest = self._take(Beams.of(scan), spaced(points, spacing), self._mount)
         travelled = self._newest.travelled
         # What a body that stands sees does not age; what its first scan there saw may be out of sight since.
         stood = [travelled - scan.travelled < STANDING for scan in list(self._taken)[-2:]]
+        memory_step = 0.1  # travelled distance between two remembered scans, m
         if stood == [True, True]:
             self._taken[-1] = self._newest
-        elif stood[-1:] == [True] or not stood or travelled - self._taken[-1].travelled >= MEMORY_STEP:
+        elif stood[-1:] == [True] or not stood or travelled - self._taken[-1].travelled >= memory_step:
             self._taken.append(self._newest)
         _keep(self._views, self._newest)
 
@@ -190,7 +174,11 @@ class ScanMemory:
             beams: across its cone.
             arc: where the echo may come from, in base, shape (n, 2), m.
         """
-        heard = self._heard.setdefault(sonar, _Heard(deque(maxlen=SONAR_VIEWS), deque(maxlen=ROUNDS)))
+        # Maximum number of views kept per sonar: 2.1 m of travel, longer than a cone needs to become as wide as the
+        # body.
+        sonar_views = 8
+        rounds = 2  # number of newest echoes per sonar that count as obstacles: a single one may be reflected away
+        heard = self._heard.setdefault(sonar, _Heard(deque(maxlen=sonar_views), deque(maxlen=rounds)))
         taken = self._take(beams, arc, mount)
         heard.rounds.append(taken)
         if beams.free.any():
@@ -218,7 +206,10 @@ class ScanMemory:
         there = np.concatenate((newest.points[:0], *kept))
         beams = _beams((newest,), there)[0][0]
         count, step = len(newest.beams.free), newest.beams.step
-        edge = 0.0 if is_full_turn(count, step) else FIELD_EDGE / abs(step)
+        # Remembered points this near to the edge of the lidar's field are kept, rad: the error of the dead-reckoned
+        # yaw.
+        field_edge = 0.1
+        edge = 0.0 if is_full_turn(count, step) else field_edge / abs(step)
         looked = (beams >= edge) & (beams < count - edge)
         points = points_relative(there[~looked], newest.pose)
         return points[~on_body(self._footprint, points, 0.0)]
@@ -290,7 +281,8 @@ def elsewhere(before: LaserScan, now: LaserScan) -> bool:
     )
     known = [valid | (scan.codes <= NO_ECHO) for valid, scan in zip(measured, (before, now), strict=True)]
     compared = known[0] & known[1] & (measured[0] | measured[1])
-    differ = compared & (np.abs(first - second) > CHANGED)
+    changed = 0.1  # difference of a beam from that of an earlier scan that neither noise nor rounding makes, m
+    differ = compared & (np.abs(first - second) > changed)
     return bool(np.count_nonzero(differ) > ELSEWHERE * np.count_nonzero(compared))
 
 
@@ -314,9 +306,12 @@ def spaced(points: Array, spacing: float) -> Array:
 
 def _keep(views: deque[_Taken], taken: _Taken) -> None:
     """Add a scan to those kept to know which ground is free, or have it replace that of a body that stood."""
+    # Distance (m) plus turn (rad) between two of the scans that are kept to know which ground is free: each sees
+    # further than a truck's length in half of all directions.
+    view_step = 0.3
     if views and taken.travelled - views[-1].travelled < STANDING:
         views[-1] = taken
-    elif not views or _apart(taken.pose, views[-1].pose) >= VIEW_STEP:
+    elif not views or _apart(taken.pose, views[-1].pose) >= view_step:
         views.append(taken)
 
 

@@ -34,8 +34,6 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-STATE_PERIOD: Final = SECOND // 10
-"""``state/gate`` is published on every change and at least this often, ns."""
 
 SURVEY_PERIOD: Final = SECOND
 """``state/seen`` is published this often, or as soon as it is complete, ns."""
@@ -326,7 +324,8 @@ class GateService:
         asked = output.asking, output.handed_to
         whole = output.mode, output.stopping
         visible = (whole, output.holder, output.reasons, output.waiting, asked, self._latched)
-        if visible != self._published or now - self._published_at >= STATE_PERIOD:
+        state_period = SECOND // 10  # ``state/gate`` is published on every change and at least this often, ns
+        if visible != self._published or now - self._published_at >= state_period:
             self._published, self._published_at = visible, now
             self._outputs.state.put(self._state(output, now))
         if (output.mode is GateMode.ESTOPPED) != self._latched:

@@ -33,11 +33,6 @@ from monstertruckd.gate.motion import Course
 
 ALIGNED: Final = 0.3
 """Greatest angle between the axis of a sonar and the direction of travel for it to look ahead, rad."""
-SPACING: Final = 0.02
-"""Distance between the points of an arc, m."""
-STEP: Final = 0.02
-"""Distance between the poses of a sweep, m."""
-ROUNDS: Final = 2
 TURNING: Final = 0.3
 """A motion whose base travels less than this per metre of pace counts as a turn on the spot: no sonar looks ahead."""
 
@@ -68,7 +63,7 @@ class SonarGuard:
         self._limits = limits
         self._footprint = footprint
         self._mounts = mounts
-        self._rounds: deque[SonarRanges] = deque(maxlen=ROUNDS)
+        self._rounds: deque[SonarRanges] = deque(maxlen=2)
         self._answered: dict[str, int] = {}
         """When every sonar answered last, ns."""
         self.view = SonarView(math.inf, (), False)
@@ -97,7 +92,8 @@ class SonarGuard:
         oldest = now - round(self._limits.config.sonar.stale_after * SECOND)
         silent = [name for name in self._mounts if self._answered.get(name, -1) < oldest]
         points = self._points(ahead, now)
-        free = free_distance(self._footprint, twist, points, reach, STEP, self._limits.config.obstacle.side_clearance)
+        step = 0.02  # distance between the poses of a sweep, m
+        free = free_distance(self._footprint, twist, points, reach, step, self._limits.config.obstacle.side_clearance)
         dead = tuple(name for name in silent if name in ahead)
         unknown = len(silent) > len(dead) or (not ahead and math.hypot(twist[0], twist[1]) >= TURNING)
         self.view = SonarView(free, dead, unknown)
@@ -192,6 +188,6 @@ def is_late(ranges: SonarRanges, config: GateConfig) -> bool:
 def arc(place: Place, distance: float, half: float) -> Array:
     """Points at ``distance``, m, within ``half``, rad, of a sonar's axis, in base, (n, 2)."""
     x, y, yaw = place
-    count = max(3, math.ceil(2 * half * distance / SPACING) + 1)
+    count = max(3, math.ceil(2 * half * distance / 0.02) + 1)  # distance between the points of an arc, m
     angles = yaw + np.linspace(-half, half, count)
     return np.column_stack((x + distance * np.cos(angles), y + distance * np.sin(angles)))

@@ -23,9 +23,6 @@ HUB_WINDOW: Final = SECOND
 HUB_EVENTS: Final = frozenset({Reason.HUB_LOST, Reason.OVER_CURRENT})
 """Events that explain the loss of every device they name in ``roles``."""
 
-EXPLAINED_WITHIN: Final = 3 * SECOND
-"""So long after a stop later reports may still extend its causes, ns."""
-
 
 def lease_cause(source: Source, now: int) -> Cause:
     """The cause of a stop for the expired lease of ``source``."""
@@ -220,7 +217,8 @@ class StopLog:
         for cause in self._causes:
             if cause.reason in STALE_SENSORS and cause.reason not in present:
                 self._over.setdefault(cause.reason, now)
-        if newest is not None and not self._pending and now - newest.stamp <= EXPLAINED_WITHIN:
+        explained_within = 3 * SECOND  # so long after a stop later reports may still extend its causes, ns
+        if newest is not None and not self._pending and now - newest.stamp <= explained_within:
             causes = self._outages.explain(self._causes, self._over)
             if causes != newest.causes:
                 known = {"reason": causes[0].reason, "causes": causes, "text": _text(causes, newest.stamp)}

@@ -13,10 +13,6 @@ from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 SECTORS: Final = 36
 """Sectors around the lidar: 0.1 m wide at the end of the distance the gate checks, less than the width of the body."""
 SECTOR: Final = 2 * math.pi / SECTORS
-PRESENT: Final = 0.5
-"""Share of a sector's beams that a scan must have for the sector to be in the lidar's field."""
-MARGIN: Final = 0.005
-"""Ground this near to the body counts as under it, m."""
 
 Sectors = NDArray[np.intp]
 
@@ -56,7 +52,8 @@ class Visibility:
             start, increment, count = geometry
             self._sector_of_beam = _sector(start + increment * np.arange(count, dtype=np.float64))
             self._beams = np.bincount(self._sector_of_beam, minlength=SECTORS).astype(float)
-            self._field = self._beams * abs(increment) > PRESENT * SECTOR
+            present = 0.5  # share of a sector's beams that a scan must have for the sector to be in the lidar's field
+            self._field = self._beams * abs(increment) > present * SECTOR
         sees = scan.codes <= NO_ECHO
         sees[((scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)).nonzero()[0]] = ~on_body(
             self._footprint, points, 0.0
@@ -75,7 +72,8 @@ class Visibility:
 
     def travelled(self, ground: Array) -> Sectors:
         """Sectors of the points (n, 2) in base, m, that the body does not stand on."""
-        sectors = self.sectors_of(ground[~on_body(self._footprint, ground, MARGIN)])
+        margin = 0.005  # ground this near to the body counts as under it, m
+        sectors = self.sectors_of(ground[~on_body(self._footprint, ground, margin)])
         return np.bincount(sectors, minlength=SECTORS).nonzero()[0]
 
     def last_seen(self, sectors: Sectors) -> NDArray[np.int64]:

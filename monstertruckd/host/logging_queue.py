@@ -14,8 +14,6 @@ from typing import Final, TextIO
 
 LOG_QUEUE: Final = 1000
 """Records waiting for a stuck terminal or journal; beyond that they are lost and counted."""
-OUTPUT_TIMEOUT: Final = 1.0
-"""Seconds the end of the process waits for a stuck output."""
 PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 """Levels of syslog, which journald reads from a line's head."""
 
@@ -93,12 +91,13 @@ class LogOutputThread:
         self._thread.start()
 
     def stop(self) -> None:
-        """Write what still waits, as far as the output takes it within ``OUTPUT_TIMEOUT``."""
+        """Write what still waits, as far as the output takes it within 1 s."""
+        output_timeout = 1.0  # seconds the end of the process waits for a stuck output
         try:
-            self._handler.records.put(None, timeout=OUTPUT_TIMEOUT)
+            self._handler.records.put(None, timeout=output_timeout)
         except queue.Full:
             return
-        self._thread.join(OUTPUT_TIMEOUT)
+        self._thread.join(output_timeout)
 
     def _run(self) -> None:
         while (record := self._handler.records.get()) is not None:

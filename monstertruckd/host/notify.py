@@ -3,16 +3,13 @@
 import os
 import socket
 from collections.abc import Callable, Iterable, Mapping
-from typing import Final, Protocol
+from typing import Protocol
 
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.ports import Ready
 from monstertruck_schemas.health import ServiceHealth, ServiceState
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateMode
-
-UNWATCHED_PERIOD: Final = 1.0
-"""Seconds between two looks without a watchdog."""
 
 
 class Notify(Protocol):
@@ -71,7 +68,7 @@ class NotifyService:
     ) -> None:
         self._send = send
         self._ping = ("WATCHDOG=1",) if watchdog is not None else ()
-        self._period = UNWATCHED_PERIOD if watchdog is None else watchdog / 3
+        self._period = 1.0 if watchdog is None else watchdog / 3  # seconds between two looks without a watchdog
         self._clock = clock
         self._ticks = ticks
         # 0.5: part of the nominal ticks between two looks without which the tick counts as hanging

@@ -142,14 +142,6 @@ class BlackBoxFolder:
                 excess -= box.size
 
 
-BATCH: Final = 8
-"""Messages written without a pause: a fraction of a millisecond in which the control loop would have to wait."""
-
-
-LAST_SECONDS: Final = 5.0
-"""What is not on the disk so long after the end is given up."""
-
-
 @dataclass(slots=True)
 class _Pending:
     """A box that will be written once its time has come."""
@@ -172,7 +164,7 @@ class BlackBox:
 
     Every trip is in some box: in one of its own, in that of a trip shortly before, or, if there was one of its reason
     less than ``interval`` ago, in one that is written later. A box that waits when the body ends is written before the
-    context is left, unless that takes longer than ``LAST_SECONDS``. A disk that is full, refuses or is too slow loses
+    context is left, unless that takes longer than 5 s. A disk that is full, refuses or is too slow loses
     the box, which is reported, and has no other effect.
 
     Args:
@@ -242,11 +234,12 @@ class BlackBox:
         self._closing = True
         self._wake.set()
         self._hurry.set()
+        last_seconds = 5.0  # what is not on the disk so long after the end is given up
         try:
-            async with self._clock.deadline(LAST_SECONDS):
+            async with self._clock.deadline(last_seconds):
                 await asyncio.shield(self._saving)
         except TimeoutError:
-            log.error("black box: the last box is lost, its disk takes longer than %g s", LAST_SECONDS)
+            log.error("black box: the last box is lost, its disk takes longer than %g s", last_seconds)
         finally:
             self._given_up.set()
             for task in (self._taking, self._saving):
@@ -378,7 +371,10 @@ class BlackBox:
                 for count, entry in enumerate(entries):
                     if self._given_up.is_set():
                         raise TimeoutError(errno.ETIMEDOUT, "given up")
-                    if offloaded and count % BATCH == 0:
+                    # Messages written without a pause: a fraction of a millisecond in which the control loop would have
+                    # to wait.
+                    batch = 8
+                    if offloaded and count % batch == 0:
                         self._hurry.wait(0.001)  # seconds between two batches, for the control loop
                     file.add(entry)
                 file.finish()

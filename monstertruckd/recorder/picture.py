@@ -20,8 +20,6 @@ from monstertruck_schemas.state import Odometry
 from monstertruckd.recorder.config import MapRender
 
 TARGET = "monstertruckd.recorder.picture_worker:MapRenderer"
-FIRST_SPACING = 0.02
-"""Metres between two remembered poses of the driven path, at first."""
 
 
 class MapService:
@@ -61,7 +59,7 @@ class MapService:
         self._tracker = tracker
         self._events = events
         self._driven: list[tuple[float, float, float]] = []
-        self._spacing = FIRST_SPACING
+        self._spacing = 0.02  # metres between two remembered poses of the driven path, at first
         self._before = Reason.DRIVING
 
     async def run(self, ready: Ready) -> None:

@@ -25,8 +25,6 @@ from monstertruckd.ros2.node import RosNode, RosSender
 from monstertruckd.ros2.operators import Operators, stamp_of
 from monstertruckd.ros2.rmw import LATCHED, RELIABLE
 
-KEPT: Final = 32
-"""Number of goals whose result can still be requested."""
 FAILED: Final = 9000
 """``error_code`` of a goal that failed; ``error_msg`` gives the reason."""
 
@@ -207,7 +205,7 @@ class ActionServer(Generic[W]):
 
     def _forget_oldest(self) -> None:
         ended = [number for number, goal in self._goals.items() if goal.status.ended]
-        for number in ended[: max(len(self._goals) - KEPT, 0)]:
+        for number in ended[: max(len(self._goals) - 32, 0)]:  # number of goals whose result can still be requested
             del self._goals[number]
 
     async def _pursue(self, goal: ActionGoal[W], sender: RosSender) -> None:

@@ -38,10 +38,6 @@ FRAMES: Final = {"base": "base_link", "lidar": "laser"}
 """Frames that ROS calls otherwise."""
 
 
-LAST: Final = 2**31 * SECOND - 1
-"""Last time that a ``builtin_interfaces/msg/Time`` can hold, ns."""
-
-
 def _own_name(frame: str) -> str:
     return frame
 
@@ -57,7 +53,8 @@ class RosNames:
 
     def time(self, stamp: int) -> RosValues:
         """``builtin_interfaces/msg/Time`` of the robot's time; its end, in 2038, for what is later."""
-        seconds, nanoseconds = divmod(min(max(0, stamp + self.offset), LAST), SECOND)
+        last = 2**31 * SECOND - 1  # last time that a ``builtin_interfaces/msg/Time`` can hold, ns
+        seconds, nanoseconds = divmod(min(max(0, stamp + self.offset), last), SECOND)
         return {"sec": seconds, "nanosec": nanoseconds}
 
     def header(self, message: Message) -> RosValues:

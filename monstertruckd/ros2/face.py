@@ -43,8 +43,6 @@ TF: Final = RosQos(depth=100)
 """Quality of service of ``/tf``, as ``tf2_ros`` has it."""
 ROSOUT: Final = RosQos(depth=1000, latched=True)
 """Of ``/rosout``, as ``rcl`` has it."""
-CLOCK_STEP: Final = SECOND // 1000
-"""Change of the robot's offset to real time from which on stamps follow it, ns: below it, stamps of one drive agree."""
 ORDERS: Final = (Order.ARM, Order.DISARM, Order.RESET, Order.ESTOP, Order.STOP)
 """Orders that are services of the node."""
 
@@ -173,7 +171,10 @@ class RosFace:
         )
 
     def _follow_clock(self, message: ClockOffset) -> None:
-        if abs(message.offset - self._names.offset) > CLOCK_STEP:
+        # Change of the robot's offset to real time from which on stamps follow it, ns: below it, stamps of one drive
+        # agree.
+        clock_step = SECOND // 1000
+        if abs(message.offset - self._names.offset) > clock_step:
             self._names = replace(self._names, offset=message.offset)
         if self._options.clock:
             self._publish("/clock", "rosgraph_msgs/msg/Clock", {"clock": self._names.time(message.stamp)})

@@ -37,8 +37,6 @@ PRIMITIVES: Final = {
     for name in names.split()
 }
 """Type ids of ``type_description_interfaces/msg/FieldType``; a ``char`` of ROS 2 is a uint8."""
-NESTED: Final = 1
-"""Type id of a field that is an interface itself."""
 ARRAY, BOUNDED, UNBOUNDED = 48, 96, 144
 """Offsets of the type ids of arrays and of sequences with and without a greatest length."""
 
@@ -66,7 +64,8 @@ class RosField:
 
     def described(self) -> dict[str, Any]:
         """The field in a type description, without its default value."""
-        number = (NESTED if self.nested else PRIMITIVES[self.kind]) + self.many
+        nested = 1  # type id of a field that is an interface itself
+        number = (nested if self.nested else PRIMITIVES[self.kind]) + self.many
         kind = {"type_id": number, "capacity": self.count, "string_capacity": 0}
         return {"name": self.name, "type": kind | {"nested_type_name": wire_name(self.nested or "")}}
 

@@ -18,12 +18,8 @@ from monstertruck_runtime.errors import BusyError, InputError, TruckError
 from monstertruckd.ros2.cdr import RosMessage
 from monstertruckd.ros2.node import RosArrival, RosSender
 
-MAX_AGE: Final = 0.5
-"""Seconds by which a stamp may differ from this clock: as old as a request may be for the gate."""
 LEASE: Final = 0.25
 """Seconds for which a message that drives stands; nothing repeats it."""
-MOST_OPERATORS: Final = 16
-"""Nodes that are connected to the robot at once."""
 
 RosOrder = Callable[[TruckClient], Awaitable[Any]]
 """Asks the robot for something."""
@@ -48,10 +44,11 @@ def stamp_of(time: RosMessage) -> int:
 
 def _require_recent(what: str, stamp: int, now: int) -> None:
     difference = (now - stamp) / SECOND
-    if abs(difference) > MAX_AGE:
+    max_age = 0.5  # seconds by which a stamp may differ from this clock: as old as a request may be for the gate
+    if abs(difference) > max_age:
         side = "behind" if difference > 0.0 else "ahead of"
         raise InputError(
-            f"{what} is {abs(difference):.1f} s {side} this clock (at most {MAX_AGE} s): an old message, or clocks "
+            f"{what} is {abs(difference):.1f} s {side} this clock (at most {max_age} s): an old message, or clocks "
             "that differ; run NTP on both computers"
         )
 
@@ -248,8 +245,9 @@ class Operators:
         if sender in self._operators:
             return self._operators[sender].client
         if sender not in self._opening:
-            if len(self._operators) + len(self._opening) >= MOST_OPERATORS:
-                raise BusyError(f"{MOST_OPERATORS} ROS nodes are connected: expected fewer")
+            most_operators = 16  # nodes that are connected to the robot at once
+            if len(self._operators) + len(self._opening) >= most_operators:
+                raise BusyError(f"{most_operators} ROS nodes are connected: expected fewer")
             self._opening[sender] = asyncio.create_task(self._open(sender))
         return (await asyncio.shield(self._opening[sender])).client
 

@@ -118,10 +118,6 @@ def token_key(
     return "/".join(chunks)
 
 
-_NODE_CHUNKS: Final = 9
-"""Chunks of a node's token."""
-
-
 def parsed_token(key: str) -> RosEntity:
     """The entity of a token; newer releases may append chunks.
 
@@ -131,7 +127,7 @@ def parsed_token(key: str) -> RosEntity:
     chunks = key.split("/")
     try:
         kind = EntityKind(chunks[5])
-        namespace, node = (chunk.replace("%", "/") for chunk in chunks[7:_NODE_CHUNKS])
+        namespace, node = (chunk.replace("%", "/") for chunk in chunks[7:9])  # chunks of a node's token
         owner = f"{chunks[2]}/{chunks[3]}"
         if kind is EntityKind.NODE:
             return RosEntity(kind, namespace, node, owner=owner)

@@ -6,7 +6,7 @@ import socket
 import threading
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import zenoh
 from zenoh import ext
@@ -35,15 +35,6 @@ from monstertruckd.ros2.rmw import (
     token_key,
 )
 
-PUBLISHERS: Final = 64
-"""Publishers of a topic whose newest message may wait for the event loop; further ones are lost."""
-REQUESTS: Final = 64
-"""Requests of a service that may wait; the oldest is lost."""
-GRAPH: Final = 100_000
-"""Changes of the graph that may wait."""
-PORTS: Final = 10
-"""Ports that are tried for the first that is free."""
-
 
 def session_settings(connect: str | None, listen: str) -> dict[str, Any]:
     """Configuration of the node's Zenoh session.
@@ -70,7 +61,8 @@ def free_endpoint(listen: str) -> str:
         BusyError: none of the next ports is free.
     """
     protocol, host, first = protocol_of(listen), host_of(listen), port_of(listen) or 0
-    for port in range(first, first + PORTS):
+    ports = 10  # ports that are tried for the first that is free
+    for port in range(first, first + ports):
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
@@ -78,7 +70,7 @@ def free_endpoint(listen: str) -> str:
             except OSError:
                 continue
             return endpoint_of(protocol, host, probe.getsockname()[1])
-    raise BusyError(f"ports {first} to {first + PORTS - 1} of {host} are taken: expected a free one (--listen)")
+    raise BusyError(f"ports {first} to {first + ports - 1} of {host} are taken: expected a free one (--listen)")
 
 
 class ZenohNode:
@@ -125,7 +117,8 @@ class ZenohNode:
         except zenoh.ZError as error:
             places = self._settings.get("connect", self._settings.get("listen", {})).get("endpoints")
             raise NotFoundError(f"no Zenoh session for ROS 2 at {', '.join(places or ())}: {error}") from None
-        hop: ThreadHop[tuple[str, bool]] = ThreadHop(self._seen, GRAPH, lambda _: None)
+        graph = 100_000  # changes of the graph that may wait
+        hop: ThreadHop[tuple[str, bool]] = ThreadHop(self._seen, graph, lambda _: None)
         try:
             await in_thread(partial(self._join, hop))
         except BusyError:
@@ -243,7 +236,9 @@ class ZenohNode:
             with lock:
                 scheduled = bool(newest)
                 waiting = newest.get(attachment.gid)
-                if waiting is None and len(newest) >= PUBLISHERS:
+                # Publishers of a topic whose newest message may wait for the event loop; further ones are lost.
+                publishers = 64
+                if waiting is None and len(newest) >= publishers:
                     self.malformed += 1
                 elif waiting is None or attachment.sequence > waiting[0].sequence:
                     newest[attachment.gid] = attachment, sample.payload.to_bytes()
@@ -273,8 +268,9 @@ class ZenohNode:
         """Offer a service; see ``RosNode``."""
         name = self.qualified(service)
         key = self._key(name, interface)
+        requests = 64  # requests of a service that may wait; the oldest is lost
         hop: ThreadHop[zenoh.Query] = ThreadHop(
-            partial(self._request, key, name, interface, answer), REQUESTS, lambda _: None
+            partial(self._request, key, name, interface, answer), requests, lambda _: None
         )
         # Clients ask with target ALL_COMPLETE.
         self._kept.append(self._session.declare_queryable(key, hop.put, complete=True))

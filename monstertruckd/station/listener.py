@@ -6,16 +6,9 @@ import ssl
 from collections import Counter
 from collections.abc import Callable, Coroutine
 from contextlib import ExitStack
-from typing import Any, Final
+from typing import Any
 
 from monstertruckd.station.users import network_of
-
-HANDSHAKE_LIMIT: Final = 5.0
-"""Seconds that a handshake may take."""
-MOST_OF_NETWORK: Final = 32
-"""Connections of one network that are being set up; further connections are closed at once."""
-DESCRIPTOR_PAUSE: Final = 0.2
-"""Seconds before connections are taken again after there was no file descriptor for one."""
 
 
 class WebListener:
@@ -82,19 +75,23 @@ class WebListener:
                 taken, name = await loop.sock_accept(sock)
             except OSError as error:  # too many open files, or the other end is gone already
                 self._refused("?", f"a connection cannot be taken: {error.strerror or error}")
-                await asyncio.sleep(DESCRIPTOR_PAUSE)
+                # Seconds before connections are taken again after there was no file descriptor for one.
+                descriptor_pause = 0.2
+                await asyncio.sleep(descriptor_pause)
                 continue
             address = str(name[0])
             network = network_of(address)
-            if self._under_way[network] < MOST_OF_NETWORK:
+            # Connections of one network that are being set up; further connections are closed at once.
+            most_of_network = 32
+            if self._under_way[network] < most_of_network:
                 self._under_way[network] += 1
                 self._begin(self._greet(taken, address, network))
             else:
                 taken.close()
-                self._refused(address, f"{MOST_OF_NETWORK} connections of {network} are being set up: no further one")
+                self._refused(address, f"{most_of_network} connections of {network} are being set up: no further one")
 
     async def _greet(self, taken: socket.socket, address: str, network: str) -> None:
-        longest = None if self._tls is None else HANDSHAKE_LIMIT
+        longest = None if self._tls is None else 5.0  # seconds that a handshake may take
         try:
             await asyncio.get_running_loop().connect_accepted_socket(
                 self._inside, taken, ssl=self._tls, ssl_handshake_timeout=longest

@@ -63,8 +63,6 @@ MEMORY: Final = 200
 """Newest heartbeats among which the quickest is found."""
 MOST_ASKED: Final = 16
 """Commands of one browser whose outcome is waited for at once."""
-DRAWN_SPACING: Final = 0.05
-"""Distance between two poses of a drawn path, m."""
 SHORTEST: Final = 0.3
 """Least length of a drawn path, m."""
 LONGEST_DRAWN_PATH: Final = 200.0
@@ -264,7 +262,7 @@ def read_mission(text: str) -> Mission:
 
 
 def drawn_path(points: Sequence[tuple[float, float]]) -> Path:
-    """A drawn line as a path, resampled to ``DRAWN_SPACING`` and smoothed, driven forward; m, in map.
+    """A drawn line as a path, resampled to 5 cm and smoothed, driven forward; m, in map.
 
     Raises:
         InputError: it is too short to be driven, or too long.
@@ -277,13 +275,14 @@ def drawn_path(points: Sequence[tuple[float, float]]) -> Path:
         raise InputError(f"path: {along[-1]:.2f} m are drawn, expected at least {SHORTEST} m")
     if along[-1] > LONGEST_DRAWN_PATH:
         raise InputError(f"path: {along[-1]:.4g} m are drawn, expected at most {LONGEST_DRAWN_PATH:g} m")
-    places = np.linspace(0.0, along[-1], max(math.ceil(along[-1] / DRAWN_SPACING), 2) + 1)
+    drawn_spacing = 0.05  # distance between two poses of a drawn path, m
+    places = np.linspace(0.0, along[-1], max(math.ceil(along[-1] / drawn_spacing), 2) + 1)
     even = np.column_stack([np.interp(places, along, line[:, i]) for i in (0, 1)])
     smoothing = 0.12  # standard deviation of the weights with which a drawn line is smoothed, m: hands tremble
     # Mirrored at its ends, which stay where they are.
-    more = min(math.ceil(3 * smoothing / DRAWN_SPACING), len(even) - 1)
+    more = min(math.ceil(3 * smoothing / drawn_spacing), len(even) - 1)
     mirrored = np.concatenate((2 * even[0] - even[more:0:-1], even, 2 * even[-1] - even[-2 : -2 - more : -1]))
-    weights = np.exp(-0.5 * (np.arange(-more, more + 1) * DRAWN_SPACING / smoothing) ** 2)
+    weights = np.exp(-0.5 * (np.arange(-more, more + 1) * drawn_spacing / smoothing) ** 2)
     smooth = np.column_stack([np.convolve(mirrored[:, i], weights / weights.sum(), "valid") for i in (0, 1)])
     turns = np.gradient(smooth, axis=0)
     poses = np.column_stack((smooth, np.arctan2(turns[:, 1], turns[:, 0])))

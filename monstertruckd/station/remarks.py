@@ -5,8 +5,6 @@ import logging
 from collections import Counter
 from typing import Final
 
-COUNTING_WINDOW: Final = 60.0
-"""Seconds over which lines are counted."""
 BURST: Final = 20
 """Lines of one address in that time; further ones are counted, and their number is reported at its end."""
 MOST_PEERS: Final = 32
@@ -43,7 +41,7 @@ class Remarks:
         if self._counts[known] <= BURST:
             self._log.log(level, "%s", printable(text))
         if self._timer is None:
-            self._timer = asyncio.get_running_loop().call_later(COUNTING_WINDOW, self.tell)
+            self._timer = asyncio.get_running_loop().call_later(60.0, self.tell)  # seconds over which lines are counted
 
     def tell(self) -> None:
         """Write how many lines were left out, and count again."""

@@ -48,17 +48,9 @@ MOST_REPLAYS: Final = 4
 """Recordings that are shown, and kept in memory, at once."""
 RECORDING: Final = re.compile(r"[A-Za-z0-9_.-]{1,120}\.mcap")
 TYPES: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
-CHECK_PERIOD: Final = 1.0
-"""Seconds between two checks of robots that appeared, users that were revoked, and the number of connections."""
 END: Final = 5.0
 """Seconds that sessions with robots may take to close at the end."""
 LANGUAGE: Final = "en"
-MOST_BROWSERS: Final = 32
-"""Browsers at one time: each holds a session with a robot, which accepts a limited number."""
-MOST_OF_USER: Final = 8
-"""Browsers of one user who logs in, so that nobody uses up all of them."""
-MOST_CONNECTIONS: Final = 256
-"""Connections of one network at most: a browser keeps some six. The newest beyond that are closed."""
 MESSAGES: Final = 200.0
 """Messages a second of one browser, in bursts of as many; what comes faster waits, without a delay for others."""
 USUAL_PORTS: Final = {"http": 80, "https": 443}
@@ -191,9 +183,12 @@ class Station:
             except OSError as error:
                 raise BusyError(f"{place.url} cannot be served: {error.strerror or error}") from None
             ready()
+            # Seconds between two checks of robots that appeared, users that were revoked, and the number of
+            # connections.
+            check_period = 1.0
             while True:  # robots may come while others are followed, and users go
                 done, _ = await asyncio.wait(
-                    [*self._following.values(), *discovering], return_when=asyncio.FIRST_COMPLETED, timeout=CHECK_PERIOD
+                    [*self._following.values(), *discovering], return_when=asyncio.FIRST_COMPLETED, timeout=check_period
                 )
                 for task in done:
                     if not task.cancelled():  # of a recording that was dropped
@@ -227,14 +222,16 @@ class Station:
     def _close_crowds(self, server: web.Server) -> None:
         """Close what one network has too many of, before a login too, so that it does not take all file descriptors."""
         of_peer: dict[str, int] = {}
+        # Connections of one network at most: a browser keeps some six. The newest beyond that are closed.
+        most_connections = 256
         for connection in server.connections:  # the oldest first
             peer = _peer(connection)
             of_peer[peer] = of_peer.get(peer, 0) + 1
-            if of_peer[peer] > MOST_CONNECTIONS and connection.transport is not None:
+            if of_peer[peer] > most_connections and connection.transport is not None:
                 connection.transport.abort()
         for peer, count in of_peer.items():
-            if count > MOST_CONNECTIONS:
-                self._remarks.add(peer, f"{count} connections of {peer}, {count - MOST_CONNECTIONS} are closed")
+            if count > most_connections:
+                self._remarks.add(peer, f"{count} connections of {peer}, {count - most_connections} are closed")
 
     def _follow(self, feed: RobotFeed | ReplayFeed) -> None:
         """Follow it, and offer it in every browser."""
@@ -402,7 +399,9 @@ class Station:
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         user = request[USER]
         count, own = len(self._browsers), sum(each.user.name == user.name for each in self._browsers)
-        if count >= MOST_BROWSERS or (user is not LOCAL and own >= MOST_OF_USER):
+        most_browsers = 32  # browsers at one time: each holds a session with a robot, which accepts a limited number
+        most_of_user = 8  # browsers of one user who logs in, so that nobody uses up all of them
+        if count >= most_browsers or (user is not LOCAL and own >= most_of_user):
             self._refused(request, f"{count} browsers are connected, {own} of this user")
             raise web.HTTPServiceUnavailable(text="too many browsers", headers=HEADERS)
         name = f"{user.name}{'-' * bool(user.name)}{self._run}.{next(self._numbers)}"

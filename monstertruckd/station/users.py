@@ -29,8 +29,6 @@ log = logging.getLogger(__name__)
 COST: Final = {"n": 2**14, "r": 8, "p": 1}
 """Parameters of scrypt: 16 MB and some 50 ms for each attempt."""
 LENGTH: Final = 32
-WRONG_PASSWORD_PAUSE: Final = 1.0
-"""Seconds that a wrong password costs, one attempt after the other."""
 MOST_ATTEMPTS: Final = 16
 """Attempts of one address that wait for their turn; further ones are wrong at once."""
 HASH: Final = re.compile(rf"[0-9a-f]{{{2 * LENGTH}}}:[0-9a-f]{{{2 * LENGTH}}}")
@@ -129,7 +127,7 @@ class StationUsers:
                 async with self._hashing:
                     right = await in_thread(lambda: _matches(password, kept))
                 if not right or not self.stands(user):
-                    await asyncio.sleep(WRONG_PASSWORD_PAUSE)
+                    await asyncio.sleep(1.0)  # seconds that a wrong password costs, one attempt after the other
                     return None
             self._known[mark] = user
             while len(self._known) > 256:

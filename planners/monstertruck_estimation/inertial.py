@@ -1,7 +1,7 @@
 """What an inertial measurement unit gives the odometry: its yaw rate over level ground, and the body's tilt.
 
 The tilt is a complementary filter: the gyroscopes turn the vertical, the specific force draws it back (Mahony et al.
-2008, the direct form with one vector). The body's own acceleration averages out over ``VERTICAL_TIME``.
+2008, the direct form with one vector). The body's own acceleration averages out over 2 s.
 """
 
 import math
@@ -17,8 +17,6 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Imu, Vector3
 
-VERTICAL_TIME: Final = 2.0
-"""Time constant with which the vertical follows the specific force, s."""
 LONGEST_SILENCE: Final = 0.5
 """Seconds without a measurement after which it starts again."""
 STEEPEST: Final = 0.7
@@ -48,7 +46,8 @@ class InertialTilt:
         else:
             up = added(self._up, _scaled(_cross(self._up, rate), dt))
             if felt is not None:
-                up = added(_scaled(up, 1.0 - dt / VERTICAL_TIME), _scaled(felt, dt / VERTICAL_TIME))
+                vertical_time = 2.0  # time constant with which the vertical follows the specific force, s
+                up = added(_scaled(up, 1.0 - dt / vertical_time), _scaled(felt, dt / vertical_time))
         self._up = None if up is None else _scaled(up, 1.0 / math.hypot(*up))
         self._stamp = stamp
 

@@ -38,8 +38,6 @@ Pair = tuple[float, float]
 """Of the left and of the right wheel."""
 
 SIDES: Final = ("left", "right")
-WAITING: Final = 32
-"""Readings queued at most."""
 LATE: Final = SECOND // 5
 """Interval between two readings from which on one is missing, ns."""
 KEPT_READINGS: Final = 256
@@ -442,7 +440,7 @@ def build_rear_wheels(config: RearWheelConfig, context: OdometryContext) -> Odom
         raise InputError("odometry.kind encoders: expected body tricycle and the device encoders")
     imu = context.inertial(config.gyro)
     reckoning = RearWheelReckoning(config, context.chassis, None if imu is None else imu.inertial)
-    measured = context.bus.subscribe(topics.ENCODERS, fifo(WAITING))
+    measured = context.bus.subscribe(topics.ENCODERS, fifo(32))  # readings queued at most
     events = context.bus.event_sink()
     encoders = EncoderInput(reckoning, measured, events, OdometryService.name)
     return OdometryService(

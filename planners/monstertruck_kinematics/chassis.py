@@ -68,9 +68,6 @@ AXLES: Final = ("front", "rear")
 STANDING: Final = 0.1
 """A forward speed below this share of the whole motion is none."""
 
-CONTRADICTION: Final = 0.2
-"""Shaft speeds may be off the motion they agree on best by this share of the fastest."""
-
 
 WHEEL_REACH: Final = math.radians(100.0)
 """Angle that wheels with servos of their own reach to both sides: more than a quarter turn, so that a wheel need not
@@ -194,7 +191,8 @@ class Chassis(ABC):
         twist = self.twist(self.input_speeds(shaft_speeds, *angles), *angles)
         fit = self.shafts_along(twist, *angles)
         off, name = max((abs(a - b), name) for a, b, name in zip(shaft_speeds, fit, self.shafts, strict=True))
-        if off > CONTRADICTION * max(map(abs, shaft_speeds)) + 1e-9:  # m/s
+        contradiction = 0.2  # shaft speeds may be off the motion they agree on best by this share of the fastest
+        if off > contradiction * max(map(abs, shaft_speeds)) + 1e-9:  # m/s
             raise KinematicsError(
                 f"the shafts push against each other: {name} is {off:.3g} m/s off the motion they agree on best"
             )

@@ -364,18 +364,15 @@ class ScanPoints:
         return self._newest[1]
 
 
-TILE = 64
-"""Edge of the squares by which changes of a grid are found, cells."""
-
-
 def boxes_of(mask: NDArray[np.bool_]) -> "list[Box]":
-    """Boxes that hold all marked cells of a grid (rows, columns), one for each square of TILE cells with any."""
+    """Boxes that hold all marked cells of a grid (rows, columns), one for each square of 64 by 64 cells with any."""
     boxes = []
-    for row in np.flatnonzero(np.logical_or.reduceat(mask.any(axis=1), np.arange(0, len(mask), TILE))) * TILE:
-        strip = mask[row : row + TILE]
-        columns = np.arange(0, mask.shape[1], TILE)
-        for column in np.flatnonzero(np.logical_or.reduceat(strip.any(axis=0), columns)) * TILE:
-            rows_in, columns_in = np.nonzero(strip[:, column : column + TILE])
+    tile = 64  # edge of the squares by which changes of a grid are found, cells
+    for row in np.flatnonzero(np.logical_or.reduceat(mask.any(axis=1), np.arange(0, len(mask), tile))) * tile:
+        strip = mask[row : row + tile]
+        columns = np.arange(0, mask.shape[1], tile)
+        for column in np.flatnonzero(np.logical_or.reduceat(strip.any(axis=0), columns)) * tile:
+            rows_in, columns_in = np.nonzero(strip[:, column : column + tile])
             top, left, bottom, right = rows_in.min(), columns_in.min(), rows_in.max() + 1, columns_in.max() + 1
             boxes.append((int(row + top), int(column + left), int(row + bottom), int(column + right)))
     return boxes

@@ -37,8 +37,6 @@ E = TypeVar("E")
 
 STAND_LOOK_PERIOD: Final = 0.5
 """Half the period of reports why the truck stands, s."""
-PLANNER_START: Final = 240.0
-"""Seconds that a planner may take to start."""
 ACCEPT_TIMEOUT: Final = 3.0
 """Seconds in which a path is accepted or refused."""
 
@@ -180,7 +178,7 @@ async def _taken_on(
     """Answer to the goal; while the planner is starting it is sent again and again.
 
     Raises:
-        RequestRefusedError: for another reason, or the planner takes longer than ``PLANNER_START``.
+        RequestRefusedError: for another reason, or the planner takes longer than 240 s.
         NoAnswerError: the robot does not answer.
     """
     began = clock.now()
@@ -189,9 +187,10 @@ async def _taken_on(
             return await driver.goal(goal, via=via)
         except RequestRefusedError as refused:
             waited = (clock.now() - began) / SECOND
-            if refused.refusal is not Reason.PLANNER_STARTING or waited > PLANNER_START:
+            planner_start = 240.0  # seconds that a planner may take to start
+            if refused.refusal is not Reason.PLANNER_STARTING or waited > planner_start:
                 raise
-            report.waiting(str(refused), waited / PLANNER_START)
+            report.waiting(str(refused), waited / planner_start)
         await clock.sleep(STAND_LOOK_PERIOD)
 
 

@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Final
 
 PROC: Final = Path("/proc")
-SHOWN_COMMAND: Final = 160
-"""Characters of a command line that are shown."""
 
 
 def holders(targets: Collection[str], proc: Path = PROC) -> Iterator[str]:
@@ -40,4 +38,4 @@ def _command_line(folder: Path) -> str:
         words = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:
         return "ended"
-    return " ".join(words).strip()[:SHOWN_COMMAND]
+    return " ".join(words).strip()[:160]  # characters of a command line that are shown

@@ -16,9 +16,6 @@ T = TypeVar("T")
 
 GONE: Final = 2.0
 """Seconds without the state of the gate, which comes ten times a second, after which a client that drives gives up."""
-LOST: Final = 60.0
-"""Seconds without it after which a client that waits gives up: links that are lost for shorter come back, and the robot
-drives on by itself meanwhile."""
 
 
 class Subscriber(Protocol):
@@ -33,7 +30,7 @@ async def while_it_runs(robot: Subscriber, work: Awaitable[T], needs: ServiceNam
 
     Raises:
         RequestRefusedError: the service failed, or the robot restarted: its new run knows nothing of it.
-        NoAnswerError: it has been silent for ``LOST`` s.
+        NoAnswerError: it has been silent for 60 s.
         Exception: what ``work`` raised.
     """
     working = asyncio.ensure_future(work)
@@ -50,11 +47,14 @@ async def while_it_runs(robot: Subscriber, work: Awaitable[T], needs: ServiceNam
 
 async def _until_gone(gate: Mailbox[GateState], health: Mailbox[HealthTable], needs: ServiceName) -> NoReturn:
     run: str | None = None
-    while (state := await gate.next_within(LOST)) is not None:
+    # Seconds without it after which a client that waits gives up: links that are lost for shorter come back, and the
+    # robot drives on by itself meanwhile.
+    lost = 60.0
+    while (state := await gate.next_within(lost)) is not None:
         run = run or state.nonce
         if state.nonce != run:
             raise RequestRefusedError(Reason.SHUTDOWN, "the robot's daemon was restarted meanwhile")
         for service in () if health.latest is None else health.latest.services:
             if service.name == needs and service.state is ServiceState.FAILED:
                 raise RequestRefusedError(Reason.SERVICE_FAILED, f"{service.name}: {service.detail}")
-    raise NoAnswerError(f"the robot has been silent for {LOST:g} s: it may be driving on")
+    raise NoAnswerError(f"the robot has been silent for {lost:g} s: it may be driving on")

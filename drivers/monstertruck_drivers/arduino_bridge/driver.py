@@ -8,7 +8,7 @@ motors, and so does the last one. In between every set-point feeds the board's o
 import contextlib
 from collections import deque
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
 from monstertruck_drivers.arduino_bridge.protocol import pwm, speeds
@@ -22,13 +22,6 @@ from monstertruck_schemas.cmd import DriveAction, DriveCommand
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveFeedback, DriveMode
-
-AVERAGED: Final = 4
-"""Readings over which a speed is taken: a count is much of what a slow wheel turns in one cycle."""
-OVERSPEED: Final = 3.0
-"""Times the greatest rate: a shaft cannot have turned faster, so its counter was reset."""
-SAFE_DEADLINE: Final = 0.3
-"""Seconds a session may take at its end to stop the motors."""
 
 Counts = tuple[int, int]
 
@@ -105,7 +98,8 @@ class ArduinoBridgeDriver:
         self._events = events
         self._counts: list[int] = [0, 0]
         """Counted over sessions and restarts of the board."""
-        self._readings: deque[tuple[Counts, int]] = deque(maxlen=AVERAGED + 1)
+        averaged = 4  # readings over which a speed is taken: a count is much of what a slow wheel turns in one cycle
+        self._readings: deque[tuple[Counts, int]] = deque(maxlen=averaged + 1)
         """Newest counters of this session, with their instants."""
         self._sent = DriveMode.DISABLED
 
@@ -174,7 +168,8 @@ class ArduinoBridgeDriver:
         if self._readings:
             before, then = self._readings[-1]
             steps = [new - old for old, new in zip(before, counts, strict=True)]
-            most = OVERSPEED * config.max_rate / config.turn * (stamp - then) / SECOND + 1
+            overspeed = 3.0  # times the greatest rate: a shaft cannot have turned faster, so its counter was reset
+            most = overspeed * config.max_rate / config.turn * (stamp - then) / SECOND + 1
             if max(map(abs, steps)) > most:
                 text = f"{self._port.name}: counters jumped by {steps[0]} and {steps[1]}: the board has restarted"
                 self._events(Reason.DEVICE_RESTARTED, Severity.WARNING, self.name, text)
@@ -198,7 +193,7 @@ class ArduinoBridgeDriver:
 
     async def _make_safe(self, session: BoardSession) -> None:
         with contextlib.suppress(DeviceError, TimeoutError):
-            async with self._clock.deadline(SAFE_DEADLINE):
+            async with self._clock.deadline(0.3):  # seconds a session may take at its end to stop the motors
                 await session.exchange(speeds(0, 0))
                 await session.exchange(pwm(0, 0))
             return

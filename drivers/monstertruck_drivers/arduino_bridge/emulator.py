@@ -21,15 +21,6 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-BOOT: Final = 1500 * MILLISECOND
-"""From a restart to the first answer: the boot loader waits for a new program."""
-THINKING: Final = 0.001
-"""Seconds from the end of a command to its answer."""
-WATCH_PERIOD: Final = 0.01
-"""Seconds between two looks at the auto-stop."""
-FULL_PWM: Final = 255
-FREE_RPM: Final = 200.0
-"""Speed of a motor at full PWM, rpm."""
 TO_RPM: Final = 60.0
 
 
@@ -74,7 +65,8 @@ class ArduinoBridgeEmulator:
 
     def power_cycle(self) -> None:
         """Supply off and on, or the reset that opening its port gives it."""
-        self._restart(BOOT)
+        boot = 1500 * MILLISECOND  # from a restart to the first answer: the boot loader waits for a new program
+        self._restart(boot)
 
     def inject(self, fault: str, *values: str) -> None:
         """Start or end a fault, see the class.
@@ -119,7 +111,7 @@ class ArduinoBridgeEmulator:
     async def _watch(self) -> None:
         """Stop the motors when set-points stop coming."""
         while True:
-            await self._clock.sleep(WATCH_PERIOD)
+            await self._clock.sleep(0.01)  # seconds between two looks at the auto-stop
             if any(self._targets) and self._clock.now() - self._fed > self._config.auto_stop * SECOND:
                 self._targets = [0.0, 0.0]
                 self._drive()
@@ -134,7 +126,9 @@ class ArduinoBridgeEmulator:
                     self.signals.order(name, counts / self._config.counts_per_turn * TO_RPM, partial(self._turn, i))
                 self._fed = self._clock.now()
             case b"o":
-                left, right = (number / FULL_PWM * FREE_RPM if number else None for number in numbers[:2])
+                full_pwm = 255
+                free_rpm = 200.0  # speed of a motor at full PWM, rpm
+                left, right = (number / full_pwm * free_rpm if number else None for number in numbers[:2])
                 self._targets, self._fed = [left, right], self._clock.now()
                 self._drive()
             case b"e":
@@ -177,7 +171,8 @@ class ArduinoBridgeEmulator:
         if self._noise > 0:
             self._noise -= 1
             line = bytes((line[0] ^ 0x40,)) + line[1:]
-        end.write(line + b"\r\n", self._late.pop() if self._late else THINKING)
+        thinking = 0.001  # seconds from the end of a command to its answer
+        end.write(line + b"\r\n", self._late.pop() if self._late else thinking)
 
 
 def _atoi(word: bytes) -> int:

@@ -1,7 +1,5 @@
 """Commands and answers, with a board over one open link; shared by driver and probe."""
 
-from typing import Final
-
 from monstertruck_drivers.arduino_bridge.protocol import (
     BAUD_RATE,
     ENCODERS,
@@ -16,9 +14,6 @@ from monstertruck_drivers.arduino_bridge.protocol import (
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
-
-KNOCK: Final = 0.25
-"""Seconds between two questions to a board that restarts."""
 
 
 class BoardSession:
@@ -58,11 +53,12 @@ class BoardSession:
             DeviceTimeoutError: silence.
             WrongDeviceError: something else answers.
         """
-        until = self._clock.now() + round(max(boot, KNOCK) * SECOND)
+        knock = 0.25  # seconds between two questions to a board that restarts
+        until = self._clock.now() + round(max(boot, knock) * SECOND)
         while self._clock.now() < until:
             self._forget()
             self.send(END, speeds(0, 0), BAUD_RATE)
-            found = await self._collect(KNOCK, 4)
+            found = await self._collect(knock, 4)
             if OK in found and any(map(is_number, found)):
                 return
         name = self._link.name

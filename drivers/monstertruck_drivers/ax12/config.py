@@ -10,11 +10,6 @@ from monstertruck_schemas.base import Positive, Schema
 Steps = Annotated[int, Field(ge=0, le=POSITION_MAX)]
 Seconds = Annotated[float, Field(ge=0)]
 
-TIMEOUT_MIN = 0.005
-"""Seconds; below that a busy host misses answers that came in time."""
-SCHEDULING = 0.002
-"""Seconds a host may take in addition to line and adapter."""
-
 
 class JointConfig(Schema):
     """One unit: ``position = zero + direction * angle / step``."""
@@ -102,4 +97,6 @@ class Ax12Config(Schema):
 
     def timeout(self, size: int, baud: int = BAUD) -> float:
         """Seconds to wait for an exchange of ``size`` bytes: line, return delay, and the adapter both ways."""
-        return max(TIMEOUT_MIN, size * 10 / baud + self.return_delay + 2 * self.usb_latency + SCHEDULING)
+        timeout_min = 0.005  # seconds; below that a busy host misses answers that came in time
+        scheduling = 0.002  # seconds a host may take in addition to line and adapter
+        return max(timeout_min, size * 10 / baud + self.return_delay + 2 * self.usb_latency + scheduling)

@@ -18,8 +18,6 @@ from monstertruck_schemas.sensor import StabiliserFeedback, StabiliserJoint, Tor
 
 STORED: Final = 19
 """Bytes of settings from the start of the control table."""
-SETTINGS: Final = 12
-"""Bytes from the torque switch to the torque limit."""
 ANSWERS_ALL: Final = b"\x02"
 """Status level at which writes are answered too."""
 
@@ -158,14 +156,15 @@ class Joint:
             self._miss(str(error))
 
     def _is_straying(self, before: Present, present: Present) -> bool:
-        """Whether the unit drives itself away from its goal, in ``STRAYS`` readings one after the other."""
+        """Whether the unit drives itself away from its goal, in three readings one after the other."""
         if self.torque is not TorqueState.HOLDING or self._goal is None:
             self._straying = 0
             return False
         gap, gap_before = present.position - self._goal, before.position - self._goal
         driven = present.load * gap > 0 and abs(gap) > max(abs(gap_before), self._config.margin)
         self._straying = self._straying + 1 if driven else 0
-        return self._straying >= STRAYS
+        strays = 3  # readings in which a unit drives itself away from its goal after which it loses its torque
+        return self._straying >= strays
 
     async def _stop_straying(self, session: Ax12Session, present: Present) -> None:
         """Take the unit's torque away for a rest; read back, as a late answer may be that of an earlier write.
@@ -253,7 +252,8 @@ class Joint:
 
     async def _settings(self, session: Ax12Session, retries: int = 0) -> tuple[int, int, int]:
         """Torque switch, moving speed, torque limit."""
-        answer = await session.read(self.id, p.TORQUE_ENABLE, SETTINGS, retries)
+        settings = 12  # bytes from the torque switch to the torque limit
+        answer = await session.read(self.id, p.TORQUE_ENABLE, settings, retries)
         self._error, data = answer.error, answer.data
         self._check_at = self._clock.now() + round(self._config.check_interval * SECOND)
         return data[0], word(data, 8), word(data, 10)
@@ -292,12 +292,6 @@ class Joint:
 
     def _report(self, reason: Reason, severity: Severity, text: str, **values: Value) -> None:
         self._events(reason, severity, self._source, f"{self._name} joint (unit {self.id}) {text}", **values)
-
-
-STRAYS: Final = 3
-"""Readings in which a unit drives itself away from its goal after which it loses its torque."""
-STRANGE: Final = 3
-"""Bytes out of form that show another device; fewer may be disturbances."""
 
 
 class Ax12Driver:
@@ -363,7 +357,7 @@ class Ax12Driver:
                 missing[joint] = str(error)
         if len(missing) == len(self._joints):
             ids = " and ".join(str(joint.id) for joint in self._joints)
-            if session.strange >= STRANGE:
+            if session.strange >= 3:  # bytes out of form that show another device; fewer may be disturbances
                 raise WrongDeviceError(
                     f"{self._port.name}: {session.strange} bytes, but no answer of an AX-12A: another device, another "
                     f"baud rate than {session.baud}, or several units with one id; expected ids {ids}"

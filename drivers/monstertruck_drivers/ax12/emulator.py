@@ -18,11 +18,6 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
 AS_SET: Final = Horn(None, None)
-UNITS_MAX: Final = 6
-BYTE_GAP: Final = 100_000_000
-"""Nanoseconds of silence inside a packet after which a unit gives it up."""
-BYTE_TIME: Final = 10 / p.BAUD
-BAUD_TOLERANCE: Final = 0.03
 
 Damage = Literal["late", "double", "truncate", "garble", "mute"]
 
@@ -74,8 +69,9 @@ class Ax12Bus:
         load: Load = no_load,
         voltage: Voltage = steady_voltage,
     ) -> None:
-        if len(ids) > UNITS_MAX or not all(0 <= ident <= p.ID_MAX for ident in ids):
-            raise InputError(f"ax12: ids {tuple(ids)}: expected at most {UNITS_MAX}, each 0..{p.ID_MAX}")
+        units_max = 6
+        if len(ids) > units_max or not all(0 <= ident <= p.ID_MAX for ident in ids):
+            raise InputError(f"ax12: ids {tuple(ids)}: expected at most {units_max}, each 0..{p.ID_MAX}")
         self.name = "ax12"
         self.received = ReceivedBytes()
         """Bytes the host sent, for tests."""
@@ -202,7 +198,7 @@ class Ax12Bus:
         while True:
             data = await end.read()
             now = self._clock.now()
-            if now - heard > BYTE_GAP:
+            if now - heard > 100_000_000:  # nanoseconds of silence inside a packet after which a unit gives it up
                 parser = Ax12Parser()
             heard = now
             self.received.extend(data)
@@ -215,13 +211,14 @@ class Ax12Bus:
                     self._answer(end, [Packet(unit.get(p.ID), unit.error(now) | Alarm.CHECKSUM)], [unit])
 
     def _listening(self, ident: int) -> list[Unit]:
+        baud_tolerance = 0.03
         return [
             unit
             for unit in self.units
             if unit.powered
             and unit.present
             and ident in (unit.get(p.ID), p.BROADCAST)
-            and abs(2_000_000 / (unit.get(p.BAUD_CODE) + 1) / self._host_baud - 1) <= BAUD_TOLERANCE
+            and abs(2_000_000 / (unit.get(p.BAUD_CODE) + 1) / self._host_baud - 1) <= baud_tolerance
         ]
 
     def _obey(self, end: DeviceEnd, packet: Packet) -> None:
@@ -286,7 +283,7 @@ class Ax12Bus:
                 case "late":
                     asyncio.get_running_loop().call_later(self._late_s, end.write, wire)
                     return
-        end.write(wire, self.latency_s + delay + BYTE_TIME)
+        end.write(wire, self.latency_s + delay + 10 / p.BAUD)
 
     def _garbled(self, wire: bytes) -> bytes:
         noise = self._rng.integers(1, 256, len(wire), dtype=np.uint8)

@@ -11,8 +11,6 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 
 RETRIES: Final = 2
-GAP: Final = 100e-6
-"""Seconds between a packet without an answer and the next one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +105,8 @@ class Ax12Session:
         await self._clock.sleep_until(self._quiet_until)
         packet = protocol.sync_write(start, data)
         self._link.write(packet)
-        self._quiet_until = self._clock.now() + round((len(packet) * 10 / self.baud + GAP) * SECOND)
+        gap = 100e-6  # seconds between a packet without an answer and the next one
+        self._quiet_until = self._clock.now() + round((len(packet) * 10 / self.baud + gap) * SECOND)
 
     async def _ask(self, unit: int, request: bytes, count: int, retries: int) -> Answer:
         def wanted(packet: Packet) -> bool:

@@ -43,27 +43,10 @@ def unit_signals(number: int) -> dict[str, SignalKind]:
 
 TICK: Final = 2_000_000
 """Nanoseconds of one step of the motion."""
-IDLE_TICK: Final = 100_000_000
-"""Nanoseconds of one step of a motion without speed, as where the shaft stalls."""
-RATED_VOLTAGE: Final = 12.0
-NO_LOAD_SPEED: Final = 59 * tau / 60 / p.STEP
-"""Steps a second at rated voltage and full drive."""
-STALL_TORQUE: Final = 1.5
-"""N m at rated voltage."""
-GEAR_FRICTION: Final = 0.15
-"""N m the unpowered gear holds."""
-HEAT_RISE: Final = 80.0
-"""Degrees above the surroundings that lasting full drive ends at."""
-HEAT_TIME: Final = 100.0
-"""Time constant of the temperature, s."""
-OVERLOAD_DRIVE: Final = 0.8
-"""Share of the full torque that, without motion, is an overload."""
 OVERLOAD_TIME: Final = 1.0
 """Seconds until the alarm."""
 AMBIENT: Final = 25.0
 NO_ALARM: Final = Alarm(0)
-HISTORY: Final = 1024
-"""Points of the shaft's past that are kept: two seconds of motion."""
 
 
 class Unit:
@@ -115,7 +98,8 @@ class Unit:
         self._alarms = NO_ALARM
         self._sensed = position
         self._pending: tuple[int, bytes] | None = None
-        self._past: deque[tuple[int, float]] = deque([(time_ns, position)], maxlen=HISTORY)
+        history = 1024  # points of the shaft's past that are kept: two seconds of motion
+        self._past: deque[tuple[int, float]] = deque([(time_ns, position)], maxlen=history)
         self._table = bytearray(p.TABLE_SIZE)
         self._values: dict[int, int] = {}
         """Of the registers, by their address: the same as in the table."""
@@ -288,7 +272,8 @@ class Unit:
         while self._time < time_ns:
             self._drive = self._wanted_drive()
             self._speed = self._wanted_speed()
-            tick = TICK if self._speed else IDLE_TICK if self._drive else time_ns
+            idle_tick = 100_000_000  # nanoseconds of one step of a motion without speed, as where the shaft stalls
+            tick = TICK if self._speed else idle_tick if self._drive else time_ns
             span = min(tick, time_ns - self._time)
             self._step(span / SECOND)
             self._time += span
@@ -317,12 +302,16 @@ class Unit:
     def _wanted_speed(self) -> float:
         """Steps a second."""
         push = self._load(self.get(p.ID), self._time)
-        volts = self._volts() / RATED_VOLTAGE
+        rated_voltage = 12.0
+        volts = self._volts() / rated_voltage
         if self.blocked or volts <= 0:
             return 0.0
-        if self._drive == 0 and abs(push) <= GEAR_FRICTION:
+        gear_friction = 0.15  # N m the unpowered gear holds
+        if self._drive == 0 and abs(push) <= gear_friction:
             return 0.0
-        speed = NO_LOAD_SPEED * (self._drive * volts + push / STALL_TORQUE)
+        no_load_speed = 59 * tau / 60 / p.STEP  # steps a second at rated voltage and full drive
+        stall_torque = 1.5  # N m at rated voltage
+        speed = no_load_speed * (self._drive * volts + push / stall_torque)
         top = self.get(p.MOVING_SPEED) * p.SPEED_UNIT / p.STEP
         if self.wheel_mode or not top or not self._drive:
             return speed
@@ -338,13 +327,16 @@ class Unit:
             before = self.position
             self.position = min(max(before + (left if overshoots else move), 0.0), float(p.POSITION_MAX))
             self._speed = (self.position - before) / seconds
-        target = AMBIENT + HEAT_RISE * self._drive**2
-        self.temperature += (target - self.temperature) * (1 - exp(-seconds / HEAT_TIME))
+        heat_rise = 80.0  # degrees above the surroundings that lasting full drive ends at
+        target = AMBIENT + heat_rise * self._drive**2
+        heat_time = 100.0  # time constant of the temperature, s
+        self.temperature += (target - self.temperature) * (1 - exp(-seconds / heat_time))
 
     def _judge(self, seconds: float) -> None:
         if not self.powered:
             return
-        stalled = abs(self._drive) >= min(OVERLOAD_DRIVE, self.get(p.TORQUE_LIMIT) / 1023) and abs(self._speed) < 1
+        overload_drive = 0.8  # share of the full torque that, without motion, is an overload
+        stalled = abs(self._drive) >= min(overload_drive, self.get(p.TORQUE_LIMIT) / 1023) and abs(self._speed) < 1
         self._overload_for = self._overload_for + seconds if stalled and self._drive else 0.0
         volts = self._volts() / p.VOLT_UNIT
         fired = NO_ALARM

@@ -13,8 +13,6 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-CONVERSION_PERIOD: Final = 0.05
-"""Seconds between two conversions."""
 FOLDER: Final = "iio:device0"
 COUNTS: Final = "counts"
 """Signal: converted voltage, LSB."""
@@ -82,7 +80,7 @@ class IioEmulator:
         while True:
             if self.plugged:
                 self.convert()
-            await self._clock.sleep(CONVERSION_PERIOD)
+            await self._clock.sleep(0.05)  # seconds between two conversions
 
     def convert(self) -> None:
         """One conversion becomes readable, at once and whole."""

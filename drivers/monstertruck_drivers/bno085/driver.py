@@ -15,8 +15,6 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, Imu
 
-LISTEN: Final = 1.0
-"""Seconds to receive a frame at the start; the unit needs a few tenths after power-up."""
 LONGEST_GAP: Final = 10
 """Frames that may be missing between two of which a turn rate is computed: at 10 rad/s half a turn is 31 frames."""
 
@@ -154,7 +152,8 @@ async def first_frames(stream: DeviceStream[RvcFrame]) -> list[RvcFrame]:
         WrongDeviceError: bytes, but no frame.
     """
     try:
-        return await stream.receive(LISTEN)
+        listen = 1.0  # seconds to receive a frame at the start; the unit needs a few tenths after power-up
+        return await stream.receive(listen)
     except ProtocolError as error:
         text = "of a BNO085 in UART-RVC mode: another device, another baud rate, or PS0 and PS1 set for another mode"
         raise WrongDeviceError(f"{error} {text}") from None

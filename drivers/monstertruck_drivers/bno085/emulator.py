@@ -16,14 +16,8 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-BOOT: Final = 300_000_000
-"""Nanoseconds from power-up to the first frame."""
-FUSION: Final = 0.5
-"""Time constant with which pitch and roll follow the accelerometer's vertical, s."""
 NOISE: Final = 4.0
 """Standard deviation of the accelerometer, 0.001 g."""
-LATENCY: Final = 0.004
-"""Seconds from a measurement to the first byte of its frame."""
 REPORTED: Final = ("yaw", "pitch", "roll", "x", "y", "z")
 
 
@@ -61,7 +55,7 @@ class Bno085Emulator:
         self._tilt: tuple[float, float] | None = None
         self._last: RvcFrame | None = None
         self._torn = True
-        self._awake_at = self._clock.now() + BOOT
+        self._awake_at = self._clock.now() + 300_000_000  # nanoseconds from power-up to the first frame
 
     def inject(self, fault: str, *values: str) -> None:
         """Start or end a fault.
@@ -110,7 +104,7 @@ class Bno085Emulator:
                 data = data[:9] + bytes((data[9] ^ 0x10,)) + data[10:]
             if self._torn:
                 self._torn, data = False, data[5:]
-            end.write(data, LATENCY)
+            end.write(data, 0.004)  # seconds from a measurement to the first byte of its frame
 
     def _frame(self, now: int) -> RvcFrame:
         reading = self._source.imu(now)
@@ -119,7 +113,8 @@ class Bno085Emulator:
         self._turning = turning
         x, y, z = reading.acceleration
         felt = atan2(-x, hypot(y, z)), atan2(y, z)
-        share = 1.0 if self._tilt is None else 1.0 - exp(-1.0 / (RATE * FUSION))
+        fusion = 0.5  # time constant with which pitch and roll follow the accelerometer's vertical, s
+        share = 1.0 if self._tilt is None else 1.0 - exp(-1.0 / (RATE * fusion))
         pitch, roll = self._tilt or felt
         roll_rate, pitch_rate, _ = (rate / RATE for rate in reading.angular_velocity)
         pitch, roll = pitch + pitch_rate, roll + roll_rate

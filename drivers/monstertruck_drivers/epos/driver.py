@@ -39,8 +39,6 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveFeedback, DriveMode
 
 RAD_S_PER_RPM = 2 * math.pi / 60
-OVERSPEED = 1.5
-"""Times the greatest speed: a shaft cannot have moved faster, so its counter was reset."""
 
 
 class Setpoint(NamedTuple):
@@ -114,7 +112,8 @@ class Odometer:
         if self._last is not None:
             before, then = self._last
             step = (raw - before + 2**31) % 2**32 - 2**31
-            if abs(step) <= OVERSPEED * fastest * (now - then) / SECOND + 1:
+            overspeed = 1.5  # times the greatest speed: a shaft cannot have moved faster, so its counter was reset
+            if abs(step) <= overspeed * fastest * (now - then) / SECOND + 1:
                 self.counts += step
         self._last = raw, now
         return self.counts
@@ -124,27 +123,17 @@ class Odometer:
         self._last = None
 
 
-HANDSHAKE_ATTEMPTS = 2
-"""Quick retries: a motor that kept its speed behind a lost link must rest <= 1.2 s after the link is back."""
 SAFE_TIME = 0.225
 """Seconds a session may take to leave the motor stopped and disabled, besides the time of the quick stop itself, from
 when the controller listens."""
-LONGEST_BRAKING = 1.0
-"""Seconds after which a quick stop is not waited for any longer, however slow it is configured."""
 SAFE_ATTEMPTS = 2
 """Attempts with such a time each: the first one may meet the rest of what was damaged."""
-DISABLE_TIME = 0.04
-"""Seconds of ``SAFE_TIME`` kept for the last exchange."""
 STOPS = {State.QUICK_STOP: Control.QUICK_STOP, State.SWITCH_ON_DISABLED: Control.DISABLE_VOLTAGE}
 """Controlwords that must not wait, by what they lead to."""
-REENABLE_LIMIT = 0.3
-"""Seconds after which running again from a quick stop goes the long way, through power stage off."""
 SLOW_EXCHANGE = 0.03
 """Median duration of exchanges, s, from which on the link is slow: at 38400 baud they take 10 to 13 ms."""
 QUICK_EXCHANGE = 0.02
 """Median duration, s, up to which it is no longer slow."""
-GOAL_LIMIT = 2.0
-"""Seconds after which a controller that does not follow its commands is reported."""
 
 
 class EposDriver:
@@ -273,7 +262,9 @@ class _DriveSession:
 
     async def _stop_first(self) -> None:
         try:
-            await self._line.write(od.CONTROLWORD, Control.QUICK_STOP, HANDSHAKE_ATTEMPTS)
+            # Quick retries: a motor that kept its speed behind a lost link must rest <= 1.2 s after the link is back.
+            handshake_attempts = 2
+            await self._line.write(od.CONTROLWORD, Control.QUICK_STOP, handshake_attempts)
         except ObjectError as error:
             if error.code == od.WRONG_NODE:
                 raise DeviceMismatchError(f"{error}, configured {self._config.node}") from error
@@ -316,13 +307,16 @@ class _DriveSession:
         from when the controller listens again: it is given the silence that a damaged or late answer before asks for.
         """
         full_speed = self._config.max_motor_rpm / self._config.quick_stop_deceleration_rpm_s
-        limit = SAFE_TIME + min(full_speed, LONGEST_BRAKING)
+        # Seconds after which a quick stop is not waited for any longer, however slow it is configured.
+        longest_braking = 1.0
+        limit = SAFE_TIME + min(full_speed, longest_braking)
         for _ in range(SAFE_ATTEMPTS):
             try:
                 await self._line.finish()
                 await self._line.settle()
                 async with self._clock.deadline(limit):
-                    await self._brake_and_switch_off(limit - DISABLE_TIME)
+                    disable_time = 0.04  # seconds of ``SAFE_TIME`` kept for the last exchange
+                    await self._brake_and_switch_off(limit - disable_time)
             except DeviceLostError:
                 return
             except (DeviceError, TimeoutError):
@@ -514,14 +508,17 @@ class _DriveSession:
         if goal is not self._goal or settled(self._state, goal) or self._state in FAULTED:
             self._goal, self._goal_since, self._late_reported = goal, now, False
         late = (now - self._goal_since) / SECOND
-        if late > GOAL_LIMIT and not self._late_reported:
+        goal_limit = 2.0  # seconds after which a controller that does not follow its commands is reported
+        if late > goal_limit and not self._late_reported:
             self._late_reported = True
             text = f"controller stays in {self._state.name}, wanted {goal.name}"
             self._report(Reason.DEVICE_TIMEOUT, Severity.WARNING, text)
         control = next_control(self._state, goal)
         if control is Control.SHUTDOWN:
             await self._prepare()
-        if self._state is State.QUICK_STOP and late > REENABLE_LIMIT and not self._moves:
+        # Seconds after which running again from a quick stop goes the long way, through power stage off.
+        reenable_limit = 0.3
+        if self._state is State.QUICK_STOP and late > reenable_limit and not self._moves:
             control = Control.DISABLE_VOLTAGE
         if control is not None:
             await self._control(control)

@@ -37,15 +37,6 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.roles import SHAFTS, DeviceRole
 
-TURN_AROUND = 0.001
-"""Seconds from the last byte received to the first one sent; most of it is the host's USB converter."""
-BOOT_TIME = 0.4
-WATCH_PERIOD = 0.05
-"""Seconds between checks of the supply while no host asks anything."""
-SEGMENT_BYTES = 4
-STRAY = 0xA5
-FOR_EVER = 1 << 62
-
 FAULT_NAMES = {
     "over_current": od.OVER_CURRENT,
     "over_voltage": od.OVER_VOLTAGE,
@@ -160,7 +151,7 @@ class EposEmulator:
 
     def _inject_delay(self, milliseconds: str, count: str | None = None) -> None:
         self._delay = float(milliseconds) / 1000
-        self._counts["delay"] = FOR_EVER if count is None else int(count)
+        self._counts["delay"] = 1 << 62 if count is None else int(count)
 
     def _inject_silent(self, word: str) -> None:
         self._silent = _flag(word)
@@ -182,7 +173,7 @@ class EposEmulator:
             self.firmware.shut_down()
         elif on and not self._power:
             self.firmware.boot()
-            self._booted_at = self._clock.now() + int(BOOT_TIME * SECOND)
+            self._booted_at = self._clock.now() + int(0.4 * SECOND)  # from power to the first answer
         self._power = on
         if self._powered is not None and not self._powered.expired():  # whatever exchange is under way ends here
             self._powered.reschedule(0)
@@ -213,7 +204,7 @@ class EposEmulator:
     async def _watch(self) -> None:
         """A controller lives without being asked: supply faults stop the motor."""
         while True:
-            await self._clock.sleep(WATCH_PERIOD)
+            await self._clock.sleep(0.05)  # seconds between checks of the supply while no host asks anything
             if self._power:
                 self.firmware.advance()
 
@@ -269,11 +260,13 @@ class EposEmulator:
 
     def _acknowledge(self, end: DeviceEnd) -> None:
         if self._due("stray"):
-            end.write(bytes((STRAY,)))
+            end.write(b"\xa5")
         self._send(end, bytes((READY ^ 0x10 if self._due("acknowledge") else READY,)))
 
     def _send(self, end: DeviceEnd, data: bytes) -> None:
-        end.write(data, TURN_AROUND)
+        # Seconds from the last byte received to the first one sent; most of it is the host's USB converter.
+        turn_around = 0.001
+        end.write(data, turn_around)
 
     async def _within(self, end: DeviceEnd, count: int) -> bytes:
         """Bytes of a frame; too long a pause raises ``TimeoutError``."""
@@ -317,8 +310,9 @@ class EposEmulator:
         data, expected = self._long
         if toggle is not expected:
             raise AccessRefusedError(od.TOGGLE_ERROR)
-        self._long = data[SEGMENT_BYTES:], not toggle
-        return ObjectSegment(data[:SEGMENT_BYTES], toggle, len(data) > SEGMENT_BYTES)
+        segment_bytes = 4
+        self._long = data[segment_bytes:], not toggle
+        return ObjectSegment(data[:segment_bytes], toggle, len(data) > segment_bytes)
 
     def _network(self, request: Frame) -> None:
         if request.words in ((0, NmtCommand.RESET_NODE), (self._node, NmtCommand.RESET_NODE)):

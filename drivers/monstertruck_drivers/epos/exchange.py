@@ -34,29 +34,15 @@ from monstertruck_runtime.errors import DeviceMismatchError, DeviceTimeoutError,
 T = TypeVar("T")
 
 ACKNOWLEDGE_TIMEOUT = 0.1
-ANSWER_TIMEOUT = 0.25
 QUIET = 0.55
 """Seconds of silence after which a controller as delivered has surely dropped a half frame."""
 QUICK_ANSWER = 0.05
 """Longest of the newest exchanges (s) up to which a line is quick: a byte that has not come by then is lost, not
 late."""
-QUICK_FRAME_TIMEOUT_MS = 50
-"""Timeout of a half frame that the host sets on a quick line: no good frame takes longer."""
-FRAME_TIMEOUT_MS = 120
-"""The same on other lines: more than the host waits for an acknowledge, so that only damage meets it."""
 HELD_BACK = 0.01
 """Seconds in which bytes that an adapter or this host holds back come in."""
 RECENT = 32
 """Exchanges whose duration is judged."""
-QUIET_LIMIT = 1.1
-"""Seconds after which a line that never falls silent is used anyway: it is not an EPOS."""
-BUSY_PAUSE = 0.01
-BUSY_RETRIES = 3
-REST_OF_FRAME = 0.005
-"""Seconds in which the rest of a damaged answer has come in."""
-REPEAT_WAIT = 0.03
-"""Seconds in which a controller that repeats a refused answer has begun to do so."""
-SEGMENT_LIMIT = 16
 STRAY_LIMIT = 3
 """Unknown bytes skipped before an acknowledge."""
 ATTEMPTS = 3
@@ -161,7 +147,11 @@ class Exchanger:
             DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
         """
         quick = max(self.durations, default=SECOND) <= QUICK_ANSWER * SECOND
-        milliseconds = QUICK_FRAME_TIMEOUT_MS if quick else FRAME_TIMEOUT_MS
+        # Timeout of a half frame that the host sets on a quick line: no good frame takes longer.
+        quick_frame_timeout_ms = 50
+        # The same on other lines: more than the host waits for an acknowledge, so that only damage meets it.
+        frame_timeout_ms = 120
+        milliseconds = quick_frame_timeout_ms if quick else frame_timeout_ms
         with suppress(ObjectError):
             await self.write(od.RS232_TIMEOUT, milliseconds, ATTEMPTS)
             self._frame_timeout = milliseconds / 1000
@@ -174,7 +164,8 @@ class Exchanger:
         """
         await self._answer(segmented_read_request(entry, self._node), entry, 1)
         data, toggle = b"", False
-        for _ in range(SEGMENT_LIMIT):
+        segment_limit = 16
+        for _ in range(segment_limit):
             answer = await self._answer(segment_request(toggle), entry, 1)
             try:
                 segment = decode_segment(answer.words[2:])
@@ -184,7 +175,7 @@ class Exchanger:
             if not segment.more:
                 return data
             toggle = not toggle
-        raise ProtocolError(f"{self._link.name}: {entry}: more than {SEGMENT_LIMIT} segments")
+        raise ProtocolError(f"{self._link.name}: {entry}: more than {segment_limit} segments")
 
     async def finish(self) -> None:
         """Wait for the exchange whose caller was cancelled, if there is one; its outcome does not matter."""
@@ -235,7 +226,8 @@ class Exchanger:
         Raises:
             DeviceLostError: the link went down.
         """
-        limit = self._clock.now() + int(QUIET_LIMIT * SECOND)
+        quiet_limit = 1.1  # seconds after which a line that never falls silent is used anyway: it is not an EPOS
+        limit = self._clock.now() + int(quiet_limit * SECOND)
         while (left := min(self.quiet_until, limit) - self._clock.now()) > 0:
             with suppress(TimeoutError):
                 async with self._clock.deadline(left / SECOND):
@@ -307,9 +299,10 @@ class Exchanger:
         raise ProtocolError(f"{self._link.name}: frame refused twice")
 
     def _ask(self, request: Frame) -> Steps[None]:
-        for attempt in range(1 + BUSY_RETRIES):
+        busy_retries = 3
+        for attempt in range(1 + busy_retries):
             if attempt:
-                yield WaitFor(0, BUSY_PAUSE)
+                yield WaitFor(0, 0.01)
             self._write(request.head)
             if (yield from self._acknowledge()) == READY:
                 return
@@ -329,7 +322,8 @@ class Exchanger:
         """Answer frame; None = damaged, and the controller has forgotten it: ask again."""
         self._answer_awaited = True
         skipped = b""
-        while (byte := (yield from self._exactly(1, ANSWER_TIMEOUT)))[0] != ANSWER:
+        answer_timeout = 0.25
+        while (byte := (yield from self._exactly(1, answer_timeout)))[0] != ANSWER:
             self.strange = skipped = skipped + byte
             if len(skipped) > STRAY_LIMIT:
                 raise ProtocolError(f"{self._link.name}: {skipped.hex(' ')} instead of an answer")
@@ -346,11 +340,12 @@ class Exchanger:
 
     def _repeated(self, lengths: frozenset[int] | None) -> Steps[Frame | None]:
         """Refuse a damaged answer. Undocumented whether the controller repeats it or forgets it: listen which."""
-        yield WaitFor(0, REST_OF_FRAME)
+        yield WaitFor(0, 0.005)  # seconds in which the rest of a damaged answer has come in
         self._link.discard()
         self._write(bytes((REFUSED,)))
         try:
-            return (yield from self._frame(lengths, REPEAT_WAIT))
+            repeat_wait = 0.03  # seconds in which a controller that repeats a refused answer has begun to do so
+            return (yield from self._frame(lengths, repeat_wait))
         except DeviceTimeoutError:
             return None
         except FrameError as error:

@@ -106,20 +106,6 @@ RANGES: dict[ObjectEntry, tuple[int, int]] = {
 }
 
 SERIAL = bytes.fromhex("6301602400001234")
-REMOTE = 1 << 9
-TARGET_REACHED = 1 << 10
-STANDSTILL = 1 << 12
-
-UNDER_VOLTAGE_BELOW = 9.0
-OVER_VOLTAGE_ABOVE = 27.0
-"""Volts; the real limit is not known."""
-VELOCITY_WINDOW = 50.0
-AVERAGE_TIME = 0.02
-"""Time constant of the averaged velocity and current, s."""
-CURRENT_NOISE = 8.0
-"""Standard deviation, mA."""
-REACTION_TIME = 0.05
-"""Seconds a fault reaction lasts before the state is FAULT."""
 
 
 class AccessRefusedError(Exception):
@@ -188,7 +174,7 @@ class Firmware:
         """Answer an impossible controlword with "wrong device state" instead of ignoring it."""
         self.latched_quick_stop = False
         """Quick stop is left through power stage off only (what the real one does is not sure)."""
-        self.over_voltage_above = OVER_VOLTAGE_ABOVE
+        self.over_voltage_above = 27.0  # volts; the real limit is not known
         self.causes: set[int] = set()
         """Injected fault codes whose cause is still present; supply faults come and go by themselves."""
         self.quick_stop_input = False
@@ -314,13 +300,17 @@ class Firmware:
         return round(round(reading.rpm * per_ms + self._rng.uniform(-0.5, 0.5)) / per_ms)
 
     def _current(self, reading: MotorReading) -> int:
-        return round(reading.current_ma + CURRENT_NOISE * self._rng.standard_normal())
+        return round(reading.current_ma + 8.0 * self._rng.standard_normal())  # standard deviation, mA
 
     def _statusword(self, reading: MotorReading) -> int:
-        word = self.state.value | REMOTE
-        if self.state is State.ENABLED and abs(reading.rpm - self._target()) < VELOCITY_WINDOW:
-            word |= TARGET_REACHED
-        return word | (STANDSTILL if abs(reading.rpm) < VELOCITY_WINDOW else 0)
+        remote = 1 << 9
+        word = self.state.value | remote
+        velocity_window = 50.0
+        if self.state is State.ENABLED and abs(reading.rpm - self._target()) < velocity_window:
+            target_reached = 1 << 10
+            word |= target_reached
+        standstill = 1 << 12
+        return word | (standstill if abs(reading.rpm) < velocity_window else 0)
 
     def _apply(self, entry: ObjectEntry, value: int) -> None:
         match entry:
@@ -393,7 +383,8 @@ class Firmware:
         self._history = [code, *self._history][: od.HISTORY_SIZE]
         running = self.state in POWERED
         self._set(State.FAULT_REACTION_ENABLED if running else State.FAULT_REACTION_DISABLED)
-        self._pending = (self._now() + int(REACTION_TIME * SECOND), State.FAULT)
+        reaction_time = 0.05  # seconds a fault reaction lasts before the state is FAULT
+        self._pending = (self._now() + int(reaction_time * SECOND), State.FAULT)
 
     def advance(self) -> MotorReading:
         """Let time-driven things happen: filters, supply faults, states that pass; the motor as it is then."""
@@ -402,7 +393,7 @@ class Firmware:
         then, turns = self._seen
         if now > then:
             span = (now - then) / SECOND
-            share = 1 - math.exp(-span / AVERAGE_TIME)
+            share = 1 - math.exp(-span / 0.02)  # time constant of the averaged velocity and current, s
             self._velocity_average += share * ((reading.turns - turns) / span * 60 - self._velocity_average)
             self._current_average += share * (reading.current_ma - self._current_average)
             self._seen = (now, reading.turns)
@@ -415,7 +406,7 @@ class Firmware:
         return reading if self.state is state else self._motor.reading(now)
 
     def _supply_faults(self, volts: float) -> set[int]:
-        if volts < UNDER_VOLTAGE_BELOW:
+        if volts < 9.0:  # least supply
             return {od.UNDER_VOLTAGE}
         return {od.OVER_VOLTAGE} if volts > self.over_voltage_above else set()
 

@@ -11,7 +11,6 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 
 SAMPLES = 5
-SAMPLE_PERIOD = 0.05
 
 
 async def probe(port: Port, clock: Clock, settings: EposConfig | None = None) -> dict[str, Any]:
@@ -56,7 +55,7 @@ async def _report(line: Exchanger, clock: Clock) -> dict[str, Any]:
                 "current_ma": await line.read(od.CURRENT, ATTEMPTS),
             }
         )
-        await clock.sleep(SAMPLE_PERIOD)
+        await clock.sleep(0.05)
     return {
         "device": "maxon EPOS 24/1",
         "identity": {**identity.as_values(), "serial_number": await _serial_number(line)},

@@ -53,20 +53,8 @@ from monstertruck_schemas.sensor import LaserScan
 
 TRANSFER = 0.002
 """Seconds assumed from the last beam to the arrival where it cannot be measured."""
-GREATEST_2CHAR = 4.095
-"""Greatest range in two characters, m."""
-LISTEN = 0.05
-"""Seconds whose bytes are thrown away after opening."""
-WAKE_TIMEOUT = 0.5
-"""Seconds for the answer to one QT while anything may still be streaming."""
-WAKE_ATTEMPTS = 4
-"""One QT completes a half line, three may stay unanswered."""
-QUIET = 0.15
-"""Seconds of silence that prove a stream has ended."""
-DRAIN_LIMIT = 2.0
 ANSWER_LIMIT = 2.0
 """Seconds for a whole answer, also over a slow RS232 line."""
-STOP_TIMEOUT = 0.3
 
 
 class Dialect(StrEnum):
@@ -192,7 +180,7 @@ class ScipSession:
     async def stop(self) -> None:
         """Laser off, stream ended; waits briefly for the answer and never fails."""
         with contextlib.suppress(DeviceError, TimeoutError):
-            async with self._clock.deadline(STOP_TIMEOUT):
+            async with self._clock.deadline(0.3):
                 await self._exchange("QT" if self._dialect is Dialect.SCIP2 else "L0")
 
     async def reset(self) -> None:
@@ -229,10 +217,11 @@ class ScipSession:
 
     async def _wake(self) -> Dialect:
         """End whatever the sensor is doing; it is idle afterwards."""
-        await self._discard(LISTEN)
-        for _ in range(WAKE_ATTEMPTS):
+        await self._discard(0.05)  # seconds whose bytes are thrown away after opening
+        for _ in range(4):  # one QT completes a half line, three may stay unanswered
             try:
-                async with self._clock.deadline(WAKE_TIMEOUT):
+                wake_timeout = 0.5  # seconds for the answer to one QT while anything may still be streaming
+                async with self._clock.deadline(wake_timeout):
                     reply = await self._exchange("QT")
             except TimeoutError:
                 continue
@@ -264,10 +253,10 @@ class ScipSession:
             ProtocolError: there is no silence.
         """
         try:
-            async with self._clock.deadline(DRAIN_LIMIT):
+            async with self._clock.deadline(2.0):
                 with contextlib.suppress(TimeoutError):
                     while True:
-                        async with self._clock.deadline(QUIET):
+                        async with self._clock.deadline(0.15):  # seconds of silence that prove a stream has ended
                             await self._receive()
         except TimeoutError as error:
             raise ProtocolError(f"{self._link.name}: keeps sending after QT") from error
@@ -456,6 +445,7 @@ class HokuyoDriver:
         last = first + (len(block.values) - 1) * config.cluster
         ranges, codes = split(block.values, geometry, config)
         longest = geometry.greatest_mm / 1000
+        greatest_2char = 4.095  # greatest range in two characters, m
         self._out.put(
             LaserScan(
                 stamp=step_0 + round(first * geometry.step_time * SECOND),
@@ -467,7 +457,7 @@ class HokuyoDriver:
                 time_increment=geometry.step_time * config.cluster,
                 scan_time=geometry.period,
                 range_min=geometry.least_mm / 1000,
-                range_max=min(longest, GREATEST_2CHAR) if config.scan_format == "MS" else longest,
+                range_max=min(longest, greatest_2char) if config.scan_format == "MS" else longest,
                 ranges=ranges,
                 codes=codes,
             )

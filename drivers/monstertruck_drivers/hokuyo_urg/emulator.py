@@ -107,7 +107,9 @@ def scan_lines(order: ScanOrder, counter: int, revolution: NDArray[np.int32]) ->
 
 def _strength(values: NDArray[np.int32]) -> NDArray[np.int32]:
     """Intensities of the returns of ranges, mm: of a near white surface, falling with the distance."""
-    return np.rint(BRIGHT / (1.0 + (np.maximum(values, 0) / FADING) ** 2)).astype(np.int32)
+    bright = 4000  # intensity of a near white surface; it falls with the distance
+    fading = 6000  # distance that halves the intensity, mm
+    return np.rint(bright / (1.0 + (np.maximum(values, 0) / fading) ** 2)).astype(np.int32)
 
 
 def counter_line(counter: int) -> bytes:
@@ -126,17 +128,7 @@ def _clustered(values: NDArray[np.int32], cluster: int) -> NDArray[np.int32]:
     return np.where(least < huge, least, groups[:, 0]).astype(np.int32)
 
 
-BRIGHT: Final = 4000
-"""Intensity of a near white surface; it falls with the distance."""
-FADING: Final = 6000
-"""Distance that halves the intensity, mm."""
-PROCESSING: Final = 1_500_000
-"""Nanoseconds from the last step to the first byte."""
 DEFAULT_BAUD: Final = 19200
-ANSWER_DELAY: Final = 0.0005
-"""Seconds from a request to its answer."""
-CATCH_UP: Final = 5
-"""Revolutions sent late after the host's machine slept; older ones are lost."""
 
 StartState = Literal["scip1", "scip2", "streaming", "time_adjust"]
 FAULTS: Final = (
@@ -149,8 +141,6 @@ RANGE: Final = "range"
 """All distances of a scan, mm."""
 COUNTER: Final = "counter"
 """Time stamp of a scan, ms."""
-SPECULAR: Final = 0.2
-"""Share of a mirror, in its middle, from which the light comes straight back."""
 
 Handler = Callable[[str, str], tuple[str, list[bytes]]]
 """Answers a request and its note by a status and lines."""
@@ -306,7 +296,8 @@ class HokuyoEmulator:
             model = self._model
             values = np.where(values >= model.least_mm, 2 * values, values)
             values[values > model.greatest_mm] = model.unreturned
-            half = round(len(values) * SPECULAR / 2)
+            specular = 0.2  # share of a mirror, in its middle, from which the light comes straight back
+            half = round(len(values) * specular / 2)
             values[len(values) // 2 - half : len(values) // 2 + half] = model.dazzled
             return values
 
@@ -369,7 +360,8 @@ class HokuyoEmulator:
         if previous is None:
             return -(-self._time() // period) * period
         late = (self._time() - previous) // period
-        return previous + period * (1 if late <= CATCH_UP else late)
+        catch_up = 5  # revolutions sent late after the host's machine slept; older ones are lost
+        return previous + period * (1 if late <= catch_up else late)
 
     def _latest_revolution(self) -> int:
         """Sensor's time at step 0 of the last revolution that is complete."""
@@ -386,7 +378,8 @@ class HokuyoEmulator:
         return revolution
 
     def _sweep(self) -> int:
-        return self._steps[1] * self._model.period // self._model.steps_per_turn + PROCESSING
+        processing = 1_500_000  # nanoseconds from the last step to the first byte
+        return self._steps[1] * self._model.period // self._model.steps_per_turn + processing
 
     def _sent_at(self, begin: int) -> int:
         """The world's time at which the scan begun at ``begin`` reaches the host."""
@@ -434,7 +427,7 @@ class HokuyoEmulator:
     async def _serve(self, end: DeviceEnd) -> None:
         while True:
             line, repeated = await self._requests.get()
-            await self._clock.sleep(ANSWER_DELAY)
+            await self._clock.sleep(0.0005)  # seconds from a request to its answer
             if line in self._pending:
                 self._pending.remove(line)
             answer = self._answer_scip2(line, repeated) if self._scip2 else self._answer_scip1(line)

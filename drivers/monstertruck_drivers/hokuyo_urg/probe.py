@@ -16,9 +16,6 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
 from monstertruck_drivers.link import Port
 from monstertruck_runtime.clock import Clock
 
-FIRST_SCAN = 1.6
-"""Seconds allowed for the first scan."""
-
 
 async def probe(port: Port, clock: Clock, settings: HokuyoConfig | None = None) -> dict[str, object]:
     """Handshake, identity, state and a summary of the first scan, ready for JSON; the laser is off afterwards.
@@ -60,7 +57,7 @@ async def _one_scan(session: ScipSession, sensor: Sensor) -> ScanBlock:
         return decode_scan(await session.demand(scip1_scan_command(*shape)), *shape)
     command = scan_command("MD", *shape, count=1)
     await session.demand(command)
-    reply = await session.next_reply(FIRST_SCAN)
+    reply = await session.next_reply(1.6)  # seconds allowed for the first scan
     return decode_scan(reply, *shape)
 
 

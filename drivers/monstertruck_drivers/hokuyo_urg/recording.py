@@ -13,15 +13,8 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.outside import lines_of, reading
 
 COLUMNS: Final = 707
-TIME_COLUMN: Final = 0
-FIRST_RANGE_COLUMN: Final = 24
 FIRST_STEP: Final = 43
 LAST_STEP: Final = 725
-STEPS: Final = 769
-GREATEST: Final = (1 << 18) - 1
-"""Most that three characters hold, mm."""
-LEAD: Final = 10_000_000
-"""Nanoseconds from the request for scans to step 0 of the first recorded one."""
 
 
 class RecordedRanges:
@@ -72,7 +65,8 @@ class RecordedRanges:
         at = int(np.searchsorted(self.times, time_ns - self._begin))
         near = [i for i in (at - 1, at) if 0 <= i < len(self.times)]
         best = min(near, key=lambda i: abs(int(self.times[i]) - (time_ns - self._begin)))
-        values = np.zeros(STEPS, np.int32)
+        steps = 769
+        values = np.zeros(steps, np.int32)
         values[FIRST_STEP : LAST_STEP + 1] = self.ranges[best]
         return values
 
@@ -82,11 +76,14 @@ def _parse(line: str, where: str) -> tuple[int, NDArray[np.int32]]:
     if len(words) != COLUMNS:
         raise InputError(f"{where}: expected {COLUMNS} numbers, found {len(words)}")
     try:
-        time, row = int(words[TIME_COLUMN]), np.array(words[FIRST_RANGE_COLUMN:], np.int64)
+        time_column = 0
+        first_range_column = 24
+        time, row = int(words[time_column]), np.array(words[first_range_column:], np.int64)
     except ValueError as error:
         raise InputError(f"{where}: expected whole numbers: {error}") from error
-    if row.min() < 0 or row.max() > GREATEST:
-        raise InputError(f"{where}: expected ranges within 0..{GREATEST} mm")
+    greatest = (1 << 18) - 1  # most that three characters hold, mm
+    if row.min() < 0 or row.max() > greatest:
+        raise InputError(f"{where}: expected ranges within 0..{greatest} mm")
     return time, row.astype(np.int32)
 
 
@@ -122,7 +119,8 @@ class RecordedHokuyoEmulator(HokuyoEmulator):
     async def _next_revolution(self, previous: int | None) -> int | None:
         if previous is None:
             await self._wanted.wait()
-            self._first = self._time() + LEAD
+            lead = 10_000_000  # nanoseconds from the request for scans to step 0 of the first recorded one
+            self._first = self._time() + lead
             self._recording.start(self._first)
             self.began = self._world_time(self._first)
         self._index += 1

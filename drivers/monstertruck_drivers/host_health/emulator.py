@@ -8,8 +8,6 @@ from monstertruck_drivers.host_health.readings import FIRMWARE_THROTTLED
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
-WRITE_PERIOD: Final = 0.5
-"""Seconds between two writes."""
 CORES: Final = 4
 
 
@@ -42,9 +40,10 @@ class HostEmulator:
 
     async def run(self) -> None:
         """Let time pass until cancelled."""
+        write_period = 0.5  # seconds between two writes
         while True:
-            await self._clock.sleep(WRITE_PERIOD)
-            ticks = round(100 * CORES * WRITE_PERIOD)  # processor ticks a second and core
+            await self._clock.sleep(write_period)
+            ticks = round(100 * CORES * write_period)  # processor ticks a second and core
             self._ticks += ticks
             self._busy_ticks += round(ticks * self._busy)
             self.write()

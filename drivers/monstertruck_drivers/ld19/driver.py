@@ -1,7 +1,5 @@
 """Driver of the LD19: listens, and publishes every revolution."""
 
-from typing import Final
-
 import numpy as np
 
 from monstertruck_drivers.ld19.config import Ld19Config
@@ -28,15 +26,6 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 
-BATCH: Final = 4 * SIZE
-"""Bytes worth waking for."""
-TRANSFER: Final = 0.001
-"""Seconds assumed from the end of a packet on the line to its arrival."""
-LISTEN: Final = 1.5
-"""Seconds to find a packet of a unit that was powered just now; it is silent for half a second."""
-WIDEST: Final = FULL_TURN // 4
-"""Angle that no packet covers, 0.01 degrees: a damaged one, or a head that starts."""
-
 
 class Ld19Session:
     """Listening to one unit.
@@ -62,7 +51,8 @@ class Ld19Session:
             DeviceTimeoutError: silence.
         """
         try:
-            data = await self._link.read(within, least=BATCH)
+            batch = 4 * SIZE  # bytes worth waking for
+            data = await self._link.read(within, least=batch)
         except TimeoutError:
             raise DeviceTimeoutError(f"{self._link.name}: silent for {within:.1f} s") from None
         self.arrival = self._clock.now()
@@ -78,7 +68,8 @@ class Ld19Session:
             DeviceTimeoutError: silence to the end.
             WrongDeviceError: bytes, but none of an LD19.
         """
-        until = self._clock.now() + round(LISTEN * SECOND)
+        listen = 1.5  # seconds to find a packet of a unit that was powered just now; it is silent for half a second
+        until = self._clock.now() + round(listen * SECOND)
         while (left := until - self._clock.now()) > 0:
             try:
                 packets = await self.receive(left / SECOND)
@@ -108,7 +99,8 @@ class PacketSamples:
             if self._stamp is not None:
                 self.elapsed += (packet.stamp - self._stamp) % STAMP_TURN * 1_000_000
             self._stamp = packet.stamp
-            if packet.speed and 0 < packet.span < WIDEST:
+            widest = FULL_TURN // 4  # angle that no packet covers, 0.01 degrees: a damaged one, or a head that starts
+            if packet.speed and 0 < packet.span < widest:
                 kept.append(packet)
                 ends.append(self.elapsed)
         points = np.frombuffer(b"".join(packet.points for packet in kept), POINT)
@@ -165,7 +157,8 @@ class Ld19Driver:
         config, limits = self._config, MODELS[self._config.model].ranges
         async with await self._port.open() as link:
             session, cutter, samples = Ld19Session(link, self._clock), TurnCutter(), PacketSamples()
-            mapping = ClockMap(round((SIZE * 10 / BAUD + TRANSFER) * SECOND), turn=STAMP_TURN)
+            transfer = 0.001  # seconds assumed from the end of a packet on the line to its arrival
+            mapping = ClockMap(round((SIZE * 10 / BAUD + transfer) * SECOND), turn=STAMP_TURN)
             due, first = self._clock.now() + round(config.first_scan * SECOND), True
             packets = await session.start()
             heard = session.packets

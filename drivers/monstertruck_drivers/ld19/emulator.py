@@ -25,14 +25,6 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-BOOT: Final = 500_000_000
-"""Nanoseconds from power-up to the first packet (maker's description of the start-up)."""
-OVERSLEPT: Final = 5 * SECOND // 10
-"""Nanoseconds that it lags behind after the host's machine slept, at most; older packets are lost."""
-BRIGHT: Final = 230
-"""Intensity of a near white surface; it falls with the distance."""
-FADING: Final = 6.0
-"""Distance at which a quarter of the intensity is left, m."""
 RANGE: Final = "range"
 """Distances of a packet, mm."""
 COUNTER: Final = "counter"
@@ -109,9 +101,12 @@ class Ld19Emulator:
             times = (begin + self._period * np.arange(1, POINTS + 1)).astype(np.int64)
             last = int(times[-1])
             await self._clock.sleep_until(self.head.world_time(last))
-            late = self.head.now() - last > OVERSLEPT
+            # Nanoseconds that it lags behind after the host's machine slept, at most; older packets are lost.
+            overslept = 5 * SECOND // 10
+            late = self.head.now() - last > overslept
             begin = float(self.head.now() if late else begin + self._period * POINTS)
-            if self._silent or last - self._powered_at < BOOT:
+            boot = 500_000_000  # nanoseconds from power-up to the first packet (maker's description of the start-up)
+            if self._silent or last - self._powered_at < boot:
                 self.head.turn(times)
                 continue
             data = build(self._packet(times))
@@ -127,7 +122,9 @@ class Ld19Emulator:
         points = np.zeros(POINTS, POINT)
         millimetres = np.rint(ranges * 1000).astype(np.int64)
         points["distance"] = np.clip(self.signals.report(RANGE, millimetres), 0, 0xFFFF)
-        points["intensity"] = np.where(points["distance"] > 0, BRIGHT / (1.0 + 3.0 * (ranges / FADING) ** 2), 0.0)
+        bright = 230  # intensity of a near white surface; it falls with the distance
+        fading = 6.0  # distance at which a quarter of the intensity is left, m
+        points["intensity"] = np.where(points["distance"] > 0, bright / (1.0 + 3.0 * (ranges / fading) ** 2), 0.0)
         angles = np.rint(turned[[0, -1]] * FULL_TURN).astype(np.int64) % FULL_TURN
         stamp = self.signals.report(COUNTER, (int(times[-1]) - self._powered_at) // 1_000_000 % STAMP_TURN)
         return Ld19Packet(

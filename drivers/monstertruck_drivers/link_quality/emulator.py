@@ -8,8 +8,6 @@ from monstertruck_drivers.emulation import EmulatorSetup, FileTree
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
-SIGNAL_PERIOD: Final = 0.5
-"""Seconds between two changes of the signal."""
 HEADER: Final = (
     "Inter-| sta-|   Quality        |   Discarded packets               | Missed | WE\n"
     " face | tus | link level noise |  nwid  crypt   frag  retry   misc | beacon | 22\n"
@@ -45,9 +43,10 @@ class NetworkEmulator:
 
     async def run(self) -> None:
         """Follow the signal until cancelled."""
+        signal_period = 0.5  # seconds between two changes of the signal
         while True:
-            await self._clock.sleep(SIGNAL_PERIOD)
-            self._bytes += round(ON_AIR * SIGNAL_PERIOD)
+            await self._clock.sleep(signal_period)
+            self._bytes += round(ON_AIR * signal_period)
             self.write()
 
     def write(self) -> None:

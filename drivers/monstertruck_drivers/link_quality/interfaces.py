@@ -10,7 +10,6 @@ from typing import Final
 from monstertruck_runtime.small_files import number_of, text_of
 from monstertruck_schemas.health import LinkMedium
 
-MEGABIT: Final = 1e6
 ERROR_COUNTERS: Final = ("rx_errors", "tx_errors", "rx_dropped", "tx_dropped")
 
 
@@ -100,7 +99,7 @@ def _read(folder: Path, signals: dict[str, Signal]) -> Sample | None:
         medium=LinkMedium.WIFI if wifi else LinkMedium.ETHERNET,
         connected=connected,
         signal=signal,
-        bit_rate=speed * MEGABIT if speed is not None and speed > 0 else None,
+        bit_rate=speed * 1e6 if speed is not None and speed > 0 else None,
         received=number_of(statistics / "rx_bytes") or 0,
         sent=number_of(statistics / "tx_bytes") or 0,
         errors=sum(number_of(statistics / counter) or 0 for counter in ERROR_COUNTERS),

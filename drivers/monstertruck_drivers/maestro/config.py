@@ -13,9 +13,6 @@ from monstertruck_schemas.base import Schema
 Channel = Annotated[int, Field(ge=0, lt=CHANNELS)]
 Microseconds = Annotated[float, Field(gt=0, le=4000)]
 
-ROUNDING = 2
-"""Quarter microseconds by which a pulse may differ from its target."""
-
 
 class ServoConfig(Schema):
     """One steering servo: ``pulse_us = centre_us + direction * scale_us_per_deg * servo angle in degrees``."""
@@ -56,7 +53,8 @@ class ServoConfig(Schema):
 
     def within_limits(self, quarters: int) -> bool:
         """Whether a pulse in quarter microseconds can be one of this driver's targets."""
-        return 4 * self.min_us - ROUNDING <= quarters <= 4 * self.max_us + ROUNDING
+        rounding = 2  # quarter microseconds by which a pulse may differ from its target
+        return 4 * self.min_us - rounding <= quarters <= 4 * self.max_us + rounding
 
     def angle(self, quarters: int) -> float:
         """Servo angle (rad, left positive) of a pulse in quarter microseconds."""

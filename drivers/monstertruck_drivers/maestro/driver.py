@@ -1,7 +1,6 @@
 """Steering driver: servo targets out; pulses, errors and battery voltage in."""
 
 import contextlib
-from typing import Final
 
 from monstertruck_drivers.battery.monitor import BatteryMonitor
 from monstertruck_drivers.link import Port
@@ -17,8 +16,6 @@ from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
-
-LINE_HIGH: Final = 8000
 
 
 class MaestroDriver:
@@ -146,8 +143,9 @@ class MaestroDriver:
 
     def _line(self, session: MaestroSession, *, high: bool) -> list[bytes]:
         channel = self._config.deadman_channel
+        line_high = 8000
         # 4000: targets of a digital output, quarter microseconds: on either side of the device's threshold
-        return [] if channel is None else [session.encode.set_target(channel, LINE_HIGH if high else 4000)]
+        return [] if channel is None else [session.encode.set_target(channel, line_high if high else 4000)]
 
     def _more(self, session: MaestroSession, *, rest: bool = False) -> list[bytes]:
         """Commands to what else hangs on the unit; ``rest`` brings it to rest."""

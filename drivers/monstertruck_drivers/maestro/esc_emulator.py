@@ -14,13 +14,8 @@ from monstertruck_drivers.maestro.emulator import MaestroEmulator
 from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
 from monstertruck_runtime.clock import SECOND, Clock
 
-FRAME: Final = 0.02
-"""Seconds between two pulses."""
 NEAR: Final = 10.0
 """Us around the neutral pulse that count as neutral."""
-SERIAL_TIMEOUT: Final = 0.2
-"""Seconds; set once in the unit, by the maker's tool."""
-RPM: Final = math.tau / 60
 
 
 class MaestroEscEmulator(MaestroEmulator):
@@ -55,7 +50,7 @@ class MaestroEscEmulator(MaestroEmulator):
             clock,
             servos,
             seed=seed,
-            serial_timeout_s=SERIAL_TIMEOUT,
+            serial_timeout_s=0.2,  # seconds; set once in the unit, by the maker's tool
             home={config.esc.channel: config.esc.neutral_us},
             outputs=outputs,
         )
@@ -68,7 +63,7 @@ class MaestroEscEmulator(MaestroEmulator):
 
     async def _obey_pulses(self) -> None:
         while True:
-            await self._clock.sleep(FRAME)
+            await self._clock.sleep(0.02)  # seconds between two pulses
             now = self._clock.now()
             pulse = self.pulse_us(self._esc.channel, now) if self._powered else None
             if pulse is None:
@@ -78,7 +73,8 @@ class MaestroEscEmulator(MaestroEmulator):
             self._arm(pulse, now)
             rate = self._esc.rate(pulse) if self._armed and abs(pulse - self._esc.neutral_us) > NEAR else 0.0
             slowing = self._esc.deceleration if rate else self._esc.quick_deceleration
-            self._plant.command(now, rate / RPM, slowing / RPM)
+            rpm = math.tau / 60
+            self._plant.command(now, rate / rpm, slowing / rpm)
 
     def _arm(self, pulse: float, now: int) -> None:
         if abs(pulse - self._esc.neutral_us) > NEAR:

@@ -1,7 +1,5 @@
 """Compass driver: what the unit streams becomes attitudes."""
 
-from typing import Final
-
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.os4000.attitude import to_attitude
 from monstertruck_drivers.os4000.config import NEEDED, Os4000Config
@@ -13,13 +11,6 @@ from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude
-
-RATE_TOLERANCE: Final = 0.25
-"""Share by which the observed rate may differ from the configured one."""
-SETTING_PERIOD: Final = 3600.0
-"""Least seconds between two writes of one setting: they go to memory that wears, and each pauses the stream."""
-LOOKS: Final = 2
-"""Looks at the stream that must agree before a setting is written: one may fall into a pause of the host."""
 
 
 class Os4000Driver:
@@ -75,7 +66,9 @@ class Os4000Driver:
     async def _set_up(self, session: Os4000Session) -> None:
         heard = await session.start(self._config.rate, self._may_write)
         wrong = self._differences(heard)
-        for _ in range(LOOKS - 1):
+        # Looks at the stream that must agree before a setting is written: one may fall into a pause of the host.
+        looks = 2
+        for _ in range(looks - 1):
             if not wrong:
                 return
             heard = await session.listen(LISTEN)
@@ -96,7 +89,9 @@ class Os4000Driver:
     def _may_write(self, key: Key) -> bool:
         """Whether a setting may be written once more; it counts as written."""
         now, before = self._clock.now(), self._written.get(key)
-        if before is not None and now - before < SETTING_PERIOD * SECOND:
+        # Least seconds between two writes of one setting: they go to memory that wears, and each pauses the stream.
+        setting_period = 3600.0
+        if before is not None and now - before < setting_period * SECOND:
             return False
         self._written[key] = now
         return True
@@ -110,7 +105,8 @@ class Os4000Driver:
             text = f"the unit sends {_names(fields)}, configured is {_names(Fields(config.fields))}"
             wrong[Key.FIELDS] = config.fields, text
         rate = observed_rate(heard)
-        if rate is None or abs(rate / config.rate - 1) > RATE_TOLERANCE:
+        rate_tolerance = 0.25  # share by which the observed rate may differ from the configured one
+        if rate is None or abs(rate / config.rate - 1) > rate_tolerance:
             seen = "too seldom" if rate is None else f"{rate:.1f} times a second"
             wrong[Key.RATE] = config.rate, f"the unit sends {seen}, configured is {config.rate}"
         return wrong

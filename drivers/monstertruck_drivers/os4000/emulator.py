@@ -28,10 +28,6 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-LOOK: Final = 50_000_000
-"""Nanoseconds after which a waiting stream looks whether it may go on."""
-BOOT: Final = 200_000_000
-"""Nanoseconds from power-up to the first sentence."""
 VERSION: Final = b"OS4000-T Ver 2.1\r\n"
 
 
@@ -139,7 +135,7 @@ class Os4000Emulator:
         self._command: Key | None = None
         self._digits = b""
         self._torn = True
-        self._resume_at = self._clock.now() + BOOT
+        self._resume_at = self._clock.now() + 200_000_000  # nanoseconds from power-up to the first sentence
         self._line_free = self._clock.now()
         if self._end is not None and self._pace:
             self._end.baud = self._baud
@@ -267,7 +263,8 @@ class Os4000Emulator:
                 self._emit(end, now)
                 last = max(last + period, now - period)
                 continue
-            await self._clock.sleep_until(now + LOOK if period is None else min(now + LOOK, last + period))
+            look = 50_000_000  # nanoseconds after which a waiting stream looks whether it may go on
+            await self._clock.sleep_until(now + look if period is None else min(now + look, last + period))
 
     def _period(self) -> int | None:
         rate = self.settings.rate

@@ -6,9 +6,6 @@ from monstertruck_drivers.os4000.protocol import Fields, Key
 from monstertruck_drivers.os4000.session import Os4000Session, observed_fields, observed_rate
 from monstertruck_runtime.clock import Clock
 
-PROBE_RATE = 20
-"""Set only when the unit was set to be silent."""
-
 
 async def probe(port: Port, clock: Clock, settings: Os4000Config | None = None) -> dict[str, object]:
     """Listen, and ask for the firmware version. Only a silent unit is set to another rate.
@@ -25,7 +22,7 @@ async def probe(port: Port, clock: Clock, settings: Os4000Config | None = None) 
     """
     async with await port.open() as link:
         session = Os4000Session(link, clock)
-        heard = await session.start(PROBE_RATE)
+        heard = await session.start(20)  # set only when the unit was set to be silent
         version = await session.ask(Key.VERSION)
     _, sample = heard[-1]
     rate = observed_rate(heard)

@@ -12,8 +12,6 @@ from monstertruck_runtime.errors import DeviceTimeoutError, WrongDeviceError
 
 LISTEN: Final = 1.2
 """Seconds to receive a sentence of a streaming unit; also longer than it pauses after a setting."""
-PROMPT: Final = 0.3
-"""Seconds to wait for the prompt of a command."""
 LEAVE: Final = b"\x1b\r"
 """ESC leaves a command; where there was none it begins one, which CR, being no key, leaves again."""
 SAMPLES: Final = 6
@@ -114,7 +112,7 @@ class Os4000Session:
             DeviceLostError: unplugged.
         """
         self._link.write(protocol.key(command))
-        await self.listen(PROMPT, count=1000)
+        await self.listen(0.3, count=1000)  # seconds to wait for the prompt of a command
         for end in (protocol.value(number), b"\r", LEAVE):
             self._link.write(end)
             if await self.listen(LISTEN, count=1):

@@ -16,14 +16,11 @@ ADDRESS: Final = 0xC8
 CHANNELS_TYPE: Final = 0x16
 LINK_TYPE: Final = 0x14
 LINK_SIZE: Final = 10
-LONGEST: Final = 62
-"""Greatest length byte."""
-_POLYNOMIAL: Final = 0xD5
 
 
 def _crc_of(byte: int) -> int:
     for _ in range(8):
-        byte = (byte << 1 ^ _POLYNOMIAL if byte & 0x80 else byte << 1) & 0xFF
+        byte = (byte << 1 ^ 0xD5 if byte & 0x80 else byte << 1) & 0xFF
     return byte
 
 
@@ -76,7 +73,8 @@ class CrsfParser:
         buffer = self._buffer
         while len(buffer) >= 2:
             size = buffer[1] + 2
-            if buffer[0] == ADDRESS and 4 <= size <= LONGEST + 2:
+            longest = 62  # greatest length byte
+            if buffer[0] == ADDRESS and 4 <= size <= longest + 2:
                 if len(buffer) < size:
                     return None
                 body = bytes(buffer[2 : size - 1])

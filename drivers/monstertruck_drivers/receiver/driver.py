@@ -17,16 +17,8 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import HandControls
 
-LISTEN: Final = 1.0
-"""Seconds to receive a frame at the start; a receiver without its transmitter sends link statistics only."""
-SILENT: Final = 1.0
-"""Seconds without a byte that end the session."""
 PERIOD: Final = SECOND // 50
 """Between two messages; a change of the switches or of the link comes at once."""
-SWITCHED: Final = 0.5
-"""Position from which on a switch is on."""
-RECENT: Final = 100
-"""Frames of which the share that arrived is the link quality of a receiver that does not say it."""
 
 
 def parser_of(config: ReceiverConfig) -> ReceiverParser:
@@ -51,7 +43,8 @@ class Hand:
         self._failsafe = False
         self._quality: float | None = None
         self._rssi: float | None = None
-        self._missed: deque[bool] = deque(maxlen=RECENT)
+        recent = 100  # frames of which the share that arrived is the link quality of a receiver that does not say it
+        self._missed: deque[bool] = deque(maxlen=recent)
 
     def take(self, frame: ReceiverFrame, now: int) -> None:
         """Take one frame that came at ``now``."""
@@ -66,7 +59,7 @@ class Hand:
             return
         self._channels, self._heard = frame.channels, now
         for channel, raw in enumerate(frame.channels, 1):
-            on = self._position(channel, raw) > SWITCHED
+            on = self._position(channel, raw) > 0.5  # position from which on a switch is on
             self._on[channel] = self._on.get(channel, 0) + 1 if on else 0
 
     def lost(self, now: int) -> bool:
@@ -163,7 +156,7 @@ class ReceiverDriver:
                     heard = self._clock.now()
                 except (DeviceTimeoutError, ProtocolError):
                     frames = []
-                    if self._clock.now() - heard > SILENT * SECOND:
+                    if self._clock.now() - heard > 1.0 * SECOND:  # seconds without a byte that end the session
                         raise
 
     def _publish(self, hand: Hand, newest: HandControls | None) -> HandControls:
@@ -192,7 +185,9 @@ async def first_frames(stream: DeviceStream[ReceiverFrame], config: ReceiverConf
         WrongDeviceError: bytes, but no frame.
     """
     try:
-        return await stream.receive(LISTEN)
+        # Seconds to receive a frame at the start; a receiver without its transmitter sends link statistics only.
+        listen = 1.0
+        return await stream.receive(listen)
     except ProtocolError as error:
         hint = "another protocol or baud rate" if isinstance(config, CrsfConfig) else "is the line inverted back?"
         raise WrongDeviceError(f"{error} of a receiver: {hint}") from None

@@ -18,14 +18,8 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-CRSF_PERIOD: Final = SECOND // 100
-"""Between two packets of a transmitter at 100 Hz, ns."""
-STATISTICS: Final = 20
-"""Packets for each frame of link statistics."""
 FAILSAFE_AFTER: Final = SECOND
 """After which an SBUS receiver says that it has lost its transmitter, ns."""
-SIGNAL: Final = -60.0
-"""dBm."""
 
 
 class ReceiverEmulator:
@@ -94,7 +88,8 @@ class ReceiverEmulator:
     async def run(self, end: DeviceEnd) -> None:
         """DeviceStream until cancelled."""
         end.baud = crsf.BAUD if self._crsf else sbus.BAUD
-        period = CRSF_PERIOD if self._crsf else round(sbus.PERIOD * SECOND)
+        crsf_period = SECOND // 100  # between two packets of a transmitter at 100 Hz, ns
+        period = crsf_period if self._crsf else round(sbus.PERIOD * SECOND)
         due = self._clock.now()
         while True:
             due += period
@@ -120,10 +115,11 @@ class ReceiverEmulator:
             gone = not self._transmitter and self._clock.now() - self._lost_at >= FAILSAFE_AFTER
             return [sbus.frame(self._sent, lost=not arrives, failsafe=gone)]
         frames = [crsf.channels_frame(self._sent)] if arrives else []
-        if self._packets % STATISTICS == 0:
+        if self._packets % 20 == 0:  # packets for each frame of link statistics
             quality = self._quality if self._transmitter else 0.0
             quality = max(0.0, min(1.0, self.signals.report("quality", quality)))
-            frames.append(crsf.link_frame(quality, SIGNAL if self._transmitter else 0.0))
+            signal = -60.0  # dBm
+            frames.append(crsf.link_frame(quality, signal if self._transmitter else 0.0))
         return frames
 
 

@@ -1,7 +1,5 @@
 """Requests and answers of one RoboClaw; shared by driver and probe."""
 
-from typing import Final
-
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.roboclaw.protocol import (
     COUNTS_SIZE,
@@ -15,8 +13,6 @@ from monstertruck_drivers.roboclaw.protocol import (
 )
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
-
-ATTEMPTS: Final = 3
 
 
 class RoboclawSession:
@@ -44,7 +40,7 @@ class RoboclawSession:
             WrongDeviceError: something else answers.
         """
         heard = b""
-        for _ in range(ATTEMPTS):
+        for _ in range(3):
             answer = await self._text()
             heard = answer or heard
             asked = request(self._address, RoboclawCommand.VERSION)

@@ -30,15 +30,7 @@ from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 
-WAKE_PERIOD: Final = 0.01
-"""Seconds of samples worth waking for."""
-TRANSFER: Final = 0.001
-"""Seconds assumed from the end of a record on the line to its arrival."""
 STANDS: Final = ": its motor does not turn (an A1's turns with port.dtr false)"
-AGREE: Final = 0.25
-"""Share by which a record's span may differ from the usual one: else records between were lost."""
-RELEARN: Final = 5
-"""Spans in a row that disagree and make the usual one."""
 
 
 class SampleStream:
@@ -52,7 +44,8 @@ class SampleStream:
     def __init__(self, mode: ScanMode, baud: int | None) -> None:
         self.parser = RecordParser(mode.answer)
         self._mode = mode
-        self._latency = ((SIZES[mode.answer] * 10 / baud if baud else 0.0) + TRANSFER) * SECOND
+        transfer = 0.001  # seconds assumed from the end of a record on the line to its arrival
+        self._latency = ((SIZES[mode.answer] * 10 / baud if baud else 0.0) + transfer) * SECOND
         self._before: tuple[Record, float] | None = None
         self._usual: float | None = None
         self._odd: list[float] = []
@@ -75,12 +68,13 @@ class SampleStream:
         assert record.start is not None
         assert following.start is not None
         span = float((following.start - record.start) % TURN_Q6)
-        if self._usual is not None and abs(span - self._usual) <= AGREE * self._usual:
+        agree = 0.25  # share by which a record's span may differ from the usual one: else records between were lost
+        if self._usual is not None and abs(span - self._usual) <= agree * self._usual:
             self._usual += (span - self._usual) / 8
             self._odd.clear()
             return True
         self._odd.append(span)
-        if self._usual is None or len(self._odd) >= RELEARN:
+        if self._usual is None or len(self._odd) >= 5:  # spans in a row that disagree and make the usual one
             self._usual = float(np.median(self._odd))
             self._odd.clear()
         return False
@@ -161,7 +155,8 @@ class RplidarDriver:
         config, clock, begin = self._config, self._clock, self._clock.now()
         stream, cutter = SampleStream(mode, baud), TurnCutter()
         times = ArrivalTimes(mode.sample_time * SECOND)
-        records = max(WAKE_PERIOD / mode.sample_time / COUNTS[mode.answer], 1.0)
+        wake_period = 0.01  # seconds of samples worth waking for
+        records = max(wake_period / mode.sample_time / COUNTS[mode.answer], 1.0)
         batch = round(records) * SIZES[mode.answer]
         limits = MODELS[config.model].ranges.least, mode.longest
         due, first, measured = begin + round(config.first_scan * SECOND), True, False

@@ -38,22 +38,8 @@ from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-BOOT: Final = SECOND // 2
-"""Nanoseconds after power-up and reset without an answer."""
 GREETING: Final = b"RP LIDAR System.\r\nFirmware Ver 1.29 - rc7, HW Ver 7\r\nModel: 18\r\n"
 """What an A1 says when it starts."""
-ANSWER_DELAY: Final = 0.001
-"""Seconds from a request to its answer."""
-OVERSLEPT: Final = SECOND // 2
-"""Nanoseconds that it lags behind after the host's machine slept, at most."""
-IDLE: Final = 0.01
-"""Seconds between two looks at what to do."""
-GROUP: Final = 8
-"""Standard samples that are sent together."""
-DEFAULT_PWM: Final = 660
-"""Duty cycle, of 1023, at which the head turns as the data sheet says."""
-OFFSET: Final = 20
-"""Angle that is to be subtracted from express samples, 1/8 degrees; the real ones depend on the distance."""
 RANGE: Final = "range"
 """Distances of a record, mm."""
 SCAN: Final = "scan"
@@ -119,7 +105,7 @@ class RplidarEmulator:
                     continue
                 self._input += data
                 while (taken := self._request()) is not None:
-                    await self._clock.sleep(ANSWER_DELAY)
+                    await self._clock.sleep(0.001)  # seconds from a request to its answer
                     self._answer(end, *taken)
 
     def power_cycle(self) -> None:
@@ -132,7 +118,8 @@ class RplidarEmulator:
     def _restart(self) -> None:
         self.mode, self._input = None, b""
         self._health = (2, 0x8001) if self._switches["broken"] else (0, 0)
-        self._ready_at = self._clock.now() + BOOT
+        boot = SECOND // 2  # nanoseconds after power-up and reset without an answer
+        self._ready_at = self._clock.now() + boot
         self._greeting = self._model.number == MODELS["a1"].number
 
     def inject(self, fault: str, *values: str) -> None:
@@ -216,7 +203,8 @@ class RplidarEmulator:
         """The adapter board sets the motor's speed; a scan goes on."""
         if self._model.adapter and len(payload) == struct.calcsize("<H"):
             (pwm,) = struct.unpack("<H", payload)
-            self.head.frequency = self._model.frequency * pwm / DEFAULT_PWM
+            default_pwm = 660  # duty cycle, of 1023, at which the head turns as the data sheet says
+            self.head.frequency = self._model.frequency * pwm / default_pwm
 
     def _begin(self, end: DeviceEnd, mode: ScanMode, *, forced: bool) -> None:
         if self._health[0] == 2:  # protects itself
@@ -258,10 +246,11 @@ class RplidarEmulator:
                 self._greeting = False
                 end.write(GREETING)
             self.head.turn(np.array([self.head.now()], np.int64))
-            await self._clock.sleep(IDLE)
+            await self._clock.sleep(0.01)  # seconds between two looks at what to do
 
     async def _stream(self, end: DeviceEnd, mode: ScanMode) -> None:
-        count = GROUP if mode.answer is DataType.STANDARD else COUNTS[mode.answer]
+        group = 8  # standard samples that are sent together
+        count = group if mode.answer is DataType.STANDARD else COUNTS[mode.answer]
         period, fresh = mode.sample_time * SECOND, True
         begin = float(self.head.now())
         while self.mode is mode:
@@ -269,7 +258,8 @@ class RplidarEmulator:
             times = (begin + period * np.arange(1, count + 1 + ahead)).astype(np.int64)
             last = int(times[-1])
             await self._clock.sleep_until(self.head.world_time(last))
-            late = self.head.now() - last > OVERSLEPT
+            overslept = SECOND // 2  # nanoseconds that it lags behind after the host's machine slept, at most
+            late = self.head.now() - last > overslept
             begin = float(self.head.now() if late else begin + period * count)
             if self.mode is not mode or late:
                 continue
@@ -297,8 +287,10 @@ class RplidarEmulator:
             millimetres = self._millimetres(self.head.look(turned, times))
             return build_capsule(start, millimetres.astype("<u2").tobytes(), fresh=fresh)
         if mode.answer is DataType.EXPRESS:
-            millimetres = np.minimum(self._millimetres(self.head.look(turned - OFFSET / 8 / 360, times)), 0x3FFF)
-            return build_capsule(start, build_express(millimetres, np.full(len(times), OFFSET)), fresh=fresh)
+            # Angle that is to be subtracted from express samples, 1/8 degrees; the real ones depend on the distance.
+            offset = 20
+            millimetres = np.minimum(self._millimetres(self.head.look(turned - offset / 8 / 360, times)), 0x3FFF)
+            return build_capsule(start, build_express(millimetres, np.full(len(times), offset)), fresh=fresh)
         guessed = self.head.look(turned - ultra_offset(np.array([3000.0])), times)
         millimetres = self._millimetres(self.head.look(turned - ultra_offset(guessed * 1000), times))
         return build_capsule(start, build_ultra(millimetres), fresh=fresh)

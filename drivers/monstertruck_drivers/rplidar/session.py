@@ -30,22 +30,8 @@ from monstertruck_runtime.errors import (
     WrongDeviceError,
 )
 
-ATTEMPTS: Final = 3
-"""Requests for the identity: half a request of a dead host may swallow the first."""
 QUIET: Final = 0.1
 """Seconds of silence that prove that a stream has ended; it ends within 1 ms of STOP (maker's protocol)."""
-ENDED: Final = 0.3
-"""Seconds in which a stream must end."""
-STOPS: Final = 5
-"""Requests to stop: half a request of a dead host may swallow the first ones."""
-ADAPTER_SUPPORTS_PWM: Final = 1
-"""Bit of the adapter board's answer."""
-LISTS_MODES_FROM: Final = (1, 24)
-"""Firmware from which on a unit lists its modes (maker's protocol, GET_LIDAR_CONF)."""
-PROTECTED: Final = 2
-"""Health of a unit that has stopped to protect itself."""
-LONGEST_ANSWER: Final = 128
-"""Bytes of the longest single answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,12 +75,14 @@ class RplidarSession:
         if wanted is not None and identity.serial != wanted.upper():
             raise WrongDeviceError(f"{self._link.name}: expected unit {wanted}, found {identity.serial}")
         health = await self._health()
-        if health.status == PROTECTED:
+        protected = 2  # health of a unit that has stopped to protect itself
+        if health.status == protected:
             await self.reset()
             health = await self._health()
-            if health.status == PROTECTED:
+            if health.status == protected:
                 raise DeviceFaultError(f"{self._link.name}: unit protects itself, code 0x{health.code:04x}")
-        lists = identity.firmware >= LISTS_MODES_FROM
+        lists_modes_from = (1, 24)  # firmware from which on a unit lists its modes (maker's protocol, GET_LIDAR_CONF)
+        lists = identity.firmware >= lists_modes_from
         modes, typical = await self._listed_modes() if lists else await self._early_modes()
         return ScannerUnit(identity, health, modes, typical, await self._has_pwm(identity))
 
@@ -128,9 +116,9 @@ class RplidarSession:
         Raises:
             WrongDeviceError: it does not fall silent.
         """
-        for _ in range(STOPS):
+        for _ in range(5):  # requests to stop: half a request of a dead host may swallow the first ones
             self._link.write(request(RplidarCommand.STOP))
-            until = self._clock.now() + round(ENDED * SECOND)
+            until = self._clock.now() + round(0.3 * SECOND)  # seconds in which a stream must end
             while self._clock.now() < until:
                 try:
                     await self._link.read(QUIET)
@@ -161,7 +149,7 @@ class RplidarSession:
     # Parts
 
     async def _identify(self) -> RplidarIdentity:
-        for _ in range(ATTEMPTS):
+        for _ in range(3):  # requests for the identity: half a request of a dead host may swallow the first
             self._heard = 0
             try:
                 return parse_info(await self._ask(request(RplidarCommand.INFO), DataType.INFO))
@@ -204,7 +192,7 @@ class RplidarSession:
         if identity.model >> 4 not in (2, 3):  # only the A2's and the A3's adapter board may
             return False
         answer = await self._ask(request(RplidarCommand.ADAPTER, bytes(4)), DataType.ADAPTER)
-        return bool(answer[0] & ADAPTER_SUPPORTS_PWM)
+        return bool(answer[0] & 1)  # bit of the adapter board's answer
 
     async def _property(self, key: ConfigKey, mode: int = 0) -> bytes:
         data = await self._ask(config_request(key, mode), DataType.CONFIG)
@@ -216,7 +204,7 @@ class RplidarSession:
         self._link.discard()
         self._link.write(asked)
         found = parse_descriptor(await self._descriptor(kind.name))
-        if found.type != kind or found.repeated or not 0 < found.length <= LONGEST_ANSWER:
+        if found.type != kind or found.repeated or not 0 < found.length <= 128:  # bytes of the longest single answer
             raise ProtocolError(f"{self._link.name}: {kind.name} answered with type 0x{found.type:02x}")
         return await self._exactly(found.length, kind.name)
 

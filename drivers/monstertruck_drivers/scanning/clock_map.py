@@ -12,12 +12,6 @@ from typing import Final
 from monstertruck_runtime.clock import SECOND
 
 MILLISECOND: Final = 1_000_000
-RESTART: Final = 1000 * MILLISECOND
-"""Disagreement of both clocks over one scan that only a restarted counter can explain, ns."""
-SETTLE: Final = 20 * SECOND
-"""How long the latency is being found, sensor's ns: by then the drift is known."""
-WINDOW: Final = 60
-"""Scans of which the promptest one is the envelope."""
 BLOCK: Final = 10
 """Scans of which the promptest one stands for all in the estimate of the drift."""
 BLOCKS: Final = 20
@@ -30,12 +24,6 @@ GREATEST_DRIFT: Final = 0.12
 """Greatest relative drift of a clock that is slewed: chrony and the kernel slew by a tenth at most."""
 PROMPT: Final = 8
 """Scans of which one at least is prompt: all above the envelope means that the clocks run apart."""
-APART: Final = 30 * MILLISECOND
-"""Height of such scans above the envelope from which on it follows them, ns: more than the jitter of USB."""
-STEADY: Final = 15 * MILLISECOND
-"""Difference of the envelopes of early and late samples that one drift explains, ns."""
-LATE: Final = 100 * MILLISECOND
-"""Height from which on it does not, ns: no clock jumps, so the scans are late."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +65,7 @@ class ClockMap:
         self._drift = Drift()
         self._settling: list[tuple[int, int]] = []
         self._newest: deque[tuple[int, int]] = deque(maxlen=PROMPT)
-        self._window: deque[tuple[int, int]] = deque(maxlen=WINDOW)
+        self._window: deque[tuple[int, int]] = deque(maxlen=60)  # scans of which the promptest one is the envelope
         self._stamp: int | None = None
 
     @property
@@ -111,7 +99,9 @@ class ClockMap:
             self._take(0, arrival)
             return
         step = (counter - previous) * MILLISECOND % self._turn
-        if abs(self._signed(step - waited)) > RESTART:
+        # Disagreement of both clocks over one scan that only a restarted counter can explain, ns.
+        restart = 1000 * MILLISECOND
+        if abs(self._signed(step - waited)) > restart:
             self.restarts += 1
             self._restart(waited, arrival)
             return
@@ -123,7 +113,8 @@ class ClockMap:
         self._newest.append((elapsed, sample))
         prompt = self._lowest(self._newest)
         above = prompt - self._lowest(self._window) if len(self._newest) == PROMPT else 0.0
-        self.late = round(above) if above > LATE else 0
+        late = 100 * MILLISECOND  # height from which on it does not, ns: no clock jumps, so the scans are late
+        self.late = round(above) if above > late else 0
         if not self.late:
             breaks, drift = self.slews, self.drift
             self._drift.add(elapsed, sample)
@@ -133,7 +124,9 @@ class ClockMap:
                 before = self._settling[: max(len(self._settling) - RECENT * BLOCK, BLOCK)]
                 self._find_latency(self._reference, before, drift)
                 self._keep_latency()
-            if above > APART or abs(self.drift - drift) > BREAK:
+            # Height of such scans above the envelope from which on it follows them, ns: more than the jitter of USB.
+            apart = 30 * MILLISECOND
+            if above > apart or abs(self.drift - drift) > BREAK:
                 self._window.clear()
                 self._window.extend(self._newest)
             else:
@@ -142,14 +135,16 @@ class ClockMap:
         if self._reference is not None:
             self._settling.append((elapsed, sample))
             self._find_latency(self._reference, self._settling, self.drift)
-            if elapsed > SETTLE:
+            settle = 20 * SECOND  # how long the latency is being found, sensor's ns: by then the drift is known
+            if elapsed > settle:
                 self._keep_latency()
 
     def _is_steady(self) -> bool:
         """Whether the present drift, which has just been found, explains all samples since the comparison."""
         third = max(len(self._settling) // 3, 1)
         envelopes = [self._lowest(self._settling[at : at + third]) for at in range(0, len(self._settling), third)]
-        return not envelopes or max(envelopes) - min(envelopes) < STEADY
+        steady = 15 * MILLISECOND  # difference of the envelopes of early and late samples that one drift explains, ns
+        return not envelopes or max(envelopes) - min(envelopes) < steady
 
     def _lowest(self, samples: Iterable[tuple[int, int]]) -> float:
         """The envelope of samples at the newest one's time."""

@@ -1,20 +1,11 @@
 """What becomes of a scanner's clock while it is mapped: reports, and the end of a session whose scans stay late."""
 
-from typing import Final
-
 from monstertruck_drivers.scanning.clock_map import ClockMap
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import DeviceTimeoutError
 from monstertruck_runtime.ports import EventSink
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-
-TOO_LATE: Final = 0.3
-"""Seconds by which scans arrive later than at the start, from which on they are worth little."""
-LATE_FOR: Final = 3.0
-"""Seconds of such scans after which the session restarts, and with it the comparison of the clocks."""
-SLEW_PERIOD: Final = 60.0
-"""Least seconds between two reports of clocks that run apart."""
 
 
 class ClockWatch:
@@ -49,18 +40,22 @@ class ClockWatch:
                 Reason.DEVICE_FAULT, Severity.WARNING, self._source, "sensor's clock restarted", counter=counter
             )
         if mapping.slews > slews and arrival >= self._slew_due:
-            self._slew_due = arrival + round(SLEW_PERIOD * SECOND)
+            slew_period = 60.0  # least seconds between two reports of clocks that run apart
+            self._slew_due = arrival + round(slew_period * SECOND)
             text = f"the sensor's clock and the computer's run apart by {mapping.drift:.1%}: followed"
             self._events(Reason.CLOCK_DRIFT, Severity.WARNING, self._source, text)
         self._check_age(mapping, arrival, port)
         return stamp
 
     def _check_age(self, mapping: ClockMap, arrival: int, port: str) -> None:
-        if mapping.late < TOO_LATE * SECOND:
+        too_late = 0.3  # seconds by which scans arrive later than at the start, from which on they are worth little
+        # Seconds of such scans after which the session restarts, and with it the comparison of the clocks.
+        late_for = 3.0
+        if mapping.late < too_late * SECOND:
             self._late_since = None
         elif self._late_since is None:
             self._late_since = arrival
-        elif arrival - self._late_since > LATE_FOR * SECOND:
+        elif arrival - self._late_since > late_for * SECOND:
             self._late_since = None
             raise DeviceTimeoutError(
                 f"{port}: scans arrive {mapping.late / SECOND:.1f} s later than at the start: begins anew"

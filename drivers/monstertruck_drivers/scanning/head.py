@@ -13,10 +13,6 @@ from monstertruck_runtime.errors import InputError
 
 TURNING: Final = 0.5
 """Share of the set speed from which on the head measures."""
-LEAST_CODE: Final = 20
-"""Values of ``cover`` below are the codes of the URG: no return; others are millimetres."""
-SPECULAR: Final = 0.2
-"""Share of a mirror, in its middle, from which the light comes straight back and dazzles."""
 FAULTS: Final = "cover FROM TO VALUE [SHARE] | cover off | mirror FROM TO | drift PPM | blocked on|off | frequency HZ"
 
 
@@ -140,9 +136,11 @@ class TurningHead:
         self._covers.append((first, last - first, cover))
 
     def _covered(self, value: int, share: float = 1.0) -> Callable[[Array], Array]:
-        shown = 0.0 if value < LEAST_CODE else value / 1000
+        least_code = 20  # values of ``cover`` below are the codes of the URG: no return; others are millimetres
+        shown = 0.0 if value < least_code else value / 1000
         return lambda ranges: np.where(self._rng.random(len(ranges)) < share, shown, ranges)
 
     def _mirrored(self, ranges: Array) -> Array:
-        dazzled = self._rng.random(len(ranges)) < SPECULAR
+        specular = 0.2  # share of a mirror, in its middle, from which the light comes straight back and dazzles
+        dazzled = self._rng.random(len(ranges)) < specular
         return np.where(dazzled | (2 * ranges > self.sheet.greatest), 0.0, 2 * ranges)

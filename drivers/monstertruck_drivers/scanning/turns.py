@@ -12,14 +12,6 @@ from numpy.typing import NDArray
 from monstertruck_drivers.emulation import Array
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM
 
-REAR: Final = 0.5
-"""Where a revolution is cut."""
-LEAST_SAMPLES: Final = 16
-"""BeamSamples without which a revolution has no step."""
-GAP: Final = 4.0
-"""Neighbours so many usual distances apart have lost samples between them."""
-SLOWER: Final = 0.01
-"""Share by which a revolution may take longer than its samples tell: the tolerance of a scanner's clock."""
 MISSING: Final = NO_ECHO + 1
 """Code of a beam that says nothing."""
 
@@ -70,7 +62,7 @@ class TurnCutter:
         """Revolutions that became complete, their angles behind the cut, 0 to 1."""
         if not len(samples.turns):
             return []
-        behind = np.mod(samples.turns - REAR, 1.0)
+        behind = np.mod(samples.turns - 0.5, 1.0)  # where a revolution is cut
         if self._at is None:
             self._at = float(behind[0])
         moved = np.mod(np.diff(behind, prepend=self._at % 1.0) + 0.5, 1.0) - 0.5
@@ -125,8 +117,9 @@ def on_equal_steps(samples: BeamSamples) -> HeadTurn | None:
 def _mean_step(turns: Array) -> float | None:
     """Mean distance of neighbouring angles, rising, turns, gaps left out; None if they are too few."""
     apart = np.diff(turns)
-    usual = float(np.median(apart)) if len(apart) >= LEAST_SAMPLES else 0.0
-    return float(apart[apart < GAP * usual].mean()) if usual > 0.0 else None
+    usual = float(np.median(apart)) if len(apart) >= 16 else 0.0  # BeamSamples without which a revolution has no step
+    gap = 4.0  # neighbours so many usual distances apart have lost samples between them
+    return float(apart[apart < gap * usual].mean()) if usual > 0.0 else None
 
 
 class ArrivalTimes:
@@ -153,7 +146,9 @@ class ArrivalTimes:
         turned = samples.turns * period
         begin = float((samples.times - turned).min())
         if self._next is not None and abs(begin - self._next) < period / 2:
-            begin = min(begin, self._next + SLOWER * period)
+            # Share by which a revolution may take longer than its samples tell: the tolerance of a scanner's clock.
+            slower = 0.01
+            begin = min(begin, self._next + slower * period)
         self._next = begin + period
         return samples._replace(times=begin + turned)
 

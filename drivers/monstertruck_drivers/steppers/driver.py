@@ -33,7 +33,6 @@ from monstertruck_schemas.sensor import DriveFeedback, DriveMode
 
 SAFE_DEADLINE: Final = 0.4
 """Seconds a session may take at its end to stop the motors and switch them off."""
-NOISE_WINDOW: Final = 10 * SECOND
 
 MODES: Final = {
     MotorState.OFF: DriveMode.DISABLED,
@@ -186,9 +185,10 @@ class StepperDriver:
             if not reported:
                 reported = True
                 ready()
-            if self._clock.now() - noted > NOISE_WINDOW:
+            noise_window = 10 * SECOND
+            if self._clock.now() - noted > noise_window:
                 noise, noted = session.splitter.bad, self._clock.now()
-            elif session.splitter.bad - noise >= 5:  # damaged lines within ``NOISE_WINDOW`` that are reported
+            elif session.splitter.bad - noise >= 5:  # damaged lines within ``noise_window`` that are reported
                 text = f"{session.splitter.bad - noise} damaged lines, newest {session.splitter.strange!r}"
                 self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, text)
                 noise = session.splitter.bad

@@ -20,7 +20,6 @@ from monstertruck_drivers.usb.tree import DEVICES, ancestors, parent_of, port_di
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.threads import inline
 
-FTDI_LATENCY: Final = 16
 ENUMERATION: Final = 0.12
 """Seconds between two devices of a hub that comes back."""
 
@@ -296,7 +295,7 @@ class EmulatedUsb:
         interface = f"{DEVICES}/{device.name}:1.{device.interface}"
         link = self.sysfs.root / DEVICES / device.name / f"{device.name}:1.{device.interface}"
         if device.node == "ttyUSB":
-            self._write(f"{interface}/{device.node_name}", {"latency_timer": str(FTDI_LATENCY)})
+            self._write(f"{interface}/{device.node_name}", {"latency_timer": "16"})  # an FTDI's own setting
         else:
             kind = "video4linux" if device.node == "video" else "tty"
             self._write(f"{interface}/{kind}/{device.node_name}", {})

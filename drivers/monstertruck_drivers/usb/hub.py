@@ -413,10 +413,6 @@ def _ns(seconds: float) -> int:
     return round(seconds * SECOND)
 
 
-BURST: Final = 0.02
-"""Seconds in which announcements are gathered: a hub announces dozens at once."""
-WAITING_RESCAN: Final = 0.5
-"""Seconds between two looks while a driver waits for a hub."""
 PERIOD: Final = SECOND
 """Nanoseconds between two trees when nothing changes."""
 
@@ -483,7 +479,7 @@ class UsbService:
                 await self._wake.wait()
         if not self._wake.is_set():
             return False
-        await self._clock.sleep(BURST)
+        await self._clock.sleep(0.02)  # seconds in which announcements are gathered: a hub announces dozens at once
         self._wake.clear()
         return True
 
@@ -494,8 +490,9 @@ class UsbService:
     async def _look(self) -> None:
         snapshot = await self._machine.offload(lambda: read_tree(self._machine.sysfs))
         self._hubs.update(snapshot)
+        waiting_rescan = 0.5  # seconds between two looks while a driver waits for a hub
         # Who waits for a hub does not ask for a look, so without announcements one has to be quick oneself.
-        rescan = min(self._config.rescan, WAITING_RESCAN) if self._hubs.waiting else self._config.rescan
+        rescan = min(self._config.rescan, waiting_rescan) if self._hubs.waiting else self._config.rescan
         self._look_at = self._clock.now() + round(rescan * SECOND)
         for node in self._hubs.tree():
             if node.role is not None and node.autosuspend and self._reported_asleep.get(node.name) != node.replugs:

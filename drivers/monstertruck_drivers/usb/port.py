@@ -63,14 +63,6 @@ def _timer(node: Node) -> str:
     return f"{node.path}/latency_timer"
 
 
-FIRST_PAUSE: Final = 1
-LONGEST_PAUSE: Final = 60
-FORGET_AFTER: Final = 600
-"""Seconds without a cycle after which the pause starts from the first one again."""
-SETTLED: Final = 0.5
-"""Seconds a device is left unauthorized."""
-
-
 class PortPower:
     """Cycles ports, every one at most after 1, 2, 4 ... 60 s.
 
@@ -113,7 +105,8 @@ class PortPower:
             elif method is CycleMethod.PORT:
                 await self._toggle(await self._halves(name), "1", "0", self.config.off_time)
             else:
-                await self._toggle([f"{DEVICES}/{name}/authorized"], "0", "1", SETTLED)
+                settled = 0.5  # seconds a device is left unauthorized
+                await self._toggle([f"{DEVICES}/{name}/authorized"], "0", "1", settled)
         except OSError as error:
             raise DeviceError(f"{place(name)} cannot be switched by {method.value!r}: {error}") from error
         self._events(
@@ -142,14 +135,15 @@ class PortPower:
     def _pace(self, name: str, topology: str) -> None:
         now = self._machine.clock.now()
         count, last = self._cycles.get(topology, (0, now))
-        if now - last > FORGET_AFTER * SECOND:
+        if now - last > 600 * SECOND:  # seconds without a cycle after which the pause starts from the first one again
             count = 0
+        longest_pause = 60  # seconds between two cycles of one port
         if count:
-            pause = min(FIRST_PAUSE << (count - 1), LONGEST_PAUSE)
+            pause = min(1 << (count - 1), longest_pause)
             left = pause - (now - last) / SECOND
             if left > 0:
                 raise BusyError(f"{place(name)} was switched just now; again in {left:.1f} s")
-        self._cycles[topology] = (min(count + 1, LONGEST_PAUSE), now)
+        self._cycles[topology] = (min(count + 1, longest_pause), now)
 
     async def _halves(self, name: str) -> list[str]:
         """Attributes of the port: a USB 3 hub is two hubs to the kernel, and power is off once both ports are."""
@@ -206,10 +200,6 @@ def why_no_node(device: UsbDevice, kind: str, interface: int) -> str:
 
 OPEN_TIMEOUT: Final = 2.0
 """Seconds a fresh node may refuse: it is announced before its driver and permissions are in place."""
-RETRY: Final = 0.05
-BUSY_RETRY: Final = 0.5
-"""Seconds until the next attempt at a port that another program holds; each looks through all processes for it."""
-SHORT_SESSION: Final = 10 * SECOND
 
 
 class HubNode:
@@ -321,7 +311,11 @@ class HubPort:
             except (DeviceLostError, PortBusyError) as error:
                 if self._machine.clock.now() >= give_up:
                     raise
-                pause = BUSY_RETRY if isinstance(error, PortBusyError) else RETRY
+                retry = 0.05
+                # Seconds until the next attempt at a port that another program holds; each looks through all processes
+                # for it.
+                busy_retry = 0.5
+                pause = busy_retry if isinstance(error, PortBusyError) else retry
             else:
                 break
             await self._machine.clock.sleep(pause)
@@ -360,7 +354,8 @@ class HubPort:
         opened, self._opened_at = self._opened_at, None
         if opened is None:
             return
-        short = self._machine.clock.now() - opened < SHORT_SESSION
+        short_session = 10 * SECOND
+        short = self._machine.clock.now() - opened < short_session
         self._short_sessions = self._short_sessions + 1 if short else 0
         power = self._power
         if power is None or power.config.after is None or self._short_sessions < power.config.after:

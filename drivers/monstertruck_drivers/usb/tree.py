@@ -16,7 +16,6 @@ from typing import NamedTuple
 from monstertruck_drivers.computer import Sysfs
 
 DEVICES = "bus/usb/devices"
-HUB_CLASS = 0x09
 
 _ROOT = re.compile(r"usb(\d+)")
 _DEVICE = re.compile(r"(\d+)-(\d+(?:\.\d+)*)")
@@ -246,7 +245,7 @@ def _read_device(sysfs: Sysfs, name: str, interfaces: list[str]) -> UsbDevice | 
         name=name,
         devnum=devnum,
         usb_id=f"{vendor}:{product}",
-        hub=sysfs.number(f"{path}/bDeviceClass", 16) == HUB_CLASS,
+        hub=sysfs.number(f"{path}/bDeviceClass", 16) == 0x09,  # class of hubs (USB 2.0, 11.23.1)
         title=sysfs.text(f"{path}/product") or "",
         serial=sysfs.text(f"{path}/serial"),
         autosuspend=sysfs.text(f"{path}/power/control") == "auto",

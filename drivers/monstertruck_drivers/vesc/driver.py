@@ -9,8 +9,9 @@ silent. The first packets of a session brake, and so do the last ones until the 
 """
 
 import contextlib
+import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from monstertruck_drivers.battery.monitor import BatteryMonitor
 from monstertruck_drivers.link import Port
@@ -35,10 +36,6 @@ from monstertruck_schemas.cmd import DriveAction, DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, DriveFeedback, DriveMode, SteeringFeedback
-
-SAFE_DEADLINE: Final = 0.4
-"""Seconds a session may take at its end to stop the motors."""
-FULL_TURN: Final = 6.283185307179586
 
 
 class VescSetpoint(NamedTuple):
@@ -267,7 +264,7 @@ class VescDriver:
     def _publish(self, i: int, values: MotorValues, stamp: int, received: int) -> None:
         config, out = self._config, self._outs[i]
         sign = -1 if config.motors[i].inverted else 1
-        turn = FULL_TURN / (TICKS_PER_ELECTRICAL_TURN * config.pole_pairs)
+        turn = math.tau / (TICKS_PER_ELECTRICAL_TURN * config.pole_pairs)
         out.put(
             DriveFeedback(
                 stamp=stamp,
@@ -296,7 +293,7 @@ class VescDriver:
         with contextlib.suppress(DeviceLostError):
             self._send_all(session, VescSetpoint(DriveMode.QUICK_STOP))
         with contextlib.suppress(DeviceError, TimeoutError):
-            async with self._clock.deadline(SAFE_DEADLINE):
+            async with self._clock.deadline(0.4):  # seconds a session may take at its end to stop the motors
                 while True:
                     self._send_all(session, VescSetpoint(DriveMode.QUICK_STOP))
                     speeds = [abs((await session.values(motor.can_id, ATTEMPTS)).erpm) for motor in config.motors]

@@ -40,24 +40,9 @@ SETTINGS_SIZE: Final = 480
 """Bytes of the settings' answer."""
 SIGNATURE: Final = bytes.fromhex("7d21b4f8")
 """Begins the settings; any number does, the host returns it."""
-BOOT: Final = 500 * MILLISECOND
-"""From power-up to the first answer."""
-THINKING: Final = 0.0005
-"""Seconds from the end of a request to its answer."""
-CAN_DELAY: Final = 0.003
-"""Seconds that an answer of some 80 bytes takes in frames of 8 bytes at 500 kbit/s, both ways."""
-RESTART_OF_APPS: Final = 0.05
-"""Seconds for which a change of settings keeps the answer back."""
-FAULT_STOP: Final = 500 * MILLISECOND
-"""For which the controller takes no set-point after a fault."""
-SERVO_PULSES: Final = (1000.0, 2000.0)
-"""Pulses of the positions 0 and 1, us."""
-WATCH_PERIOD: Final = 10 * MILLISECOND
-"""In which the watchdog looks."""
 NO_LOAD_PER_VOLT: Final = 400.0
 """Rpm of the motor for each volt, at full duty."""
 HARDWARE: Final = "60"
-VERSION: Final = (6, 5)
 
 
 class EmulatedController:
@@ -111,7 +96,8 @@ class EmulatedController:
     def fail(self, code: int) -> None:
         """Take a fault: the motor coasts, and obeys nothing for a while; 0 ends one that stays."""
         self.fault = code
-        self._blocked_until = self._clock.now() + FAULT_STOP
+        fault_stop = 500 * MILLISECOND  # for which the controller takes no set-point after a fault
+        self._blocked_until = self._clock.now() + fault_stop
         self._turn(None)
 
     def run(self, erpm: float) -> None:
@@ -231,7 +217,7 @@ class VescEmulator:
         self._silent, self._no_store = False, False
         self._late: list[float] = []
         self._noise = 0
-        self._version = VERSION
+        self._version = (6, 5)
         self._awake_at = 0
         self._deframer = Deframer()
         places = [*plants, *(FreeMotor() for _ in range(count - len(plants)))][:count]
@@ -249,14 +235,16 @@ class VescEmulator:
         del time_ns
         if channel != 0 or self.position is None:
             return None
-        low, high = SERVO_PULSES
+        servo_pulses = (1000.0, 2000.0)  # pulses of the positions 0 and 1, us
+        low, high = servo_pulses
         return low + self.position * (high - low)
 
     def power_cycle(self) -> None:
         """Supply off and on: all controllers restart."""
         if self._servos is not None:
             self._servos.advance(self._clock.now())
-        self._awake_at = self._clock.now() + BOOT
+        boot = 500 * MILLISECOND  # from power-up to the first answer
+        self._awake_at = self._clock.now() + boot
         self.position = None
         self._deframer.restart()
         for controller in self.controllers:
@@ -311,20 +299,24 @@ class VescEmulator:
                     self._take(end, payload)
 
     async def _watch(self) -> None:
+        watch_period = 10 * MILLISECOND  # in which the watchdog looks
         while True:
-            await self._clock.sleep(WATCH_PERIOD / SECOND)
+            await self._clock.sleep(watch_period / SECOND)
             for controller in self.controllers:
                 controller.watch()
 
     def _take(self, end: DeviceEnd, payload: bytes) -> None:
-        controller, delay = self._own, THINKING
+        controller, delay = self._own, 0.0005  # seconds from the end of a request to its answer
         if payload[0] == PacketId.FORWARD_CAN and len(payload) > 2:
-            controller, delay = self._by_id.get(payload[1]), CAN_DELAY
+            # Seconds that an answer of some 80 bytes takes in frames of 8 bytes at 500 kbit/s, both ways.
+            can_delay = 0.003
+            controller, delay = self._by_id.get(payload[1]), can_delay
             payload = payload[2:]
         if payload[0] == PacketId.SET_SERVO_POS and len(payload) == 3:
             self._set_servo(int.from_bytes(payload[1:], "big", signed=True) / SERVO_SCALE)
         elif controller is not None and (answer := self._obey(controller, payload)) is not None:
-            late = RESTART_OF_APPS if payload[0] == PacketId.SET_APPCONF_NO_STORE else 0.0
+            restart_of_apps = 0.05  # seconds for which a change of settings keeps the answer back
+            late = restart_of_apps if payload[0] == PacketId.SET_APPCONF_NO_STORE else 0.0
             self._send(end, answer, delay + late)
 
     def _set_servo(self, position: float) -> None:

@@ -12,8 +12,6 @@ from monstertruck_sim.world.camera import CameraPlace, FlatPanel, opencv
 from monstertruck_sim.world.config import HeldBoard
 from monstertruck_sim.world.noise import BOARD, generator
 
-SQUARE_PIXELS: int = 40
-"""Pixels of a board's square in its texture."""
 ASIDE: float = 0.5
 """Greatest distance of the board's middle from the camera's axis, as a share of half the picture's width."""
 BELOW: float = 0.4
@@ -97,5 +95,6 @@ def board_texture(columns: int, rows: int, square: float, marker: float) -> NDAr
     cv2 = opencv("sim.world.board")
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     board = cv2.aruco.CharucoBoard((columns, rows), square, marker, family)
-    drawn = board.generateImage((columns * SQUARE_PIXELS, rows * SQUARE_PIXELS), marginSize=0)
+    square_pixels = 40  # pixels of a board's square in its texture
+    drawn = board.generateImage((columns * square_pixels, rows * square_pixels), marginSize=0)
     return np.asarray(drawn, dtype=np.uint8)

@@ -15,7 +15,6 @@ STEP_S = 0.02
 """Seconds between two checks of the path ahead."""
 SIDE = 0.25
 """What is further than this from the way somebody sweeps is passed, m."""
-_TURNS = (pi / 6, -pi / 6, pi / 3, -pi / 3, pi / 2, -pi / 2)
 _TRIES = 400
 
 Free = Callable[[float, float, float], bool]
@@ -128,7 +127,8 @@ class Person:
             return ahead
         if self._config.before == "turn":
             reach = self.radius + SIDE
-            for turn in _TURNS:
+            turns = (pi / 6, -pi / 6, pi / 3, -pi / 3, pi / 2, -pi / 2)
+            for turn in turns:
                 x, y = self.x + reach * cos(ahead + turn), self.y + reach * sin(ahead + turn)
                 if not self._blocked(ahead + turn, others) and self._free(x, y, self.radius):
                     return ahead + turn

@@ -411,7 +411,8 @@ def _joint(body: Element, joint: PartJoint) -> None:
     if joint.name in HEAD_JOINTS:
         element.set("armature", "0.001")
     if joint.name.endswith("_steer"):
-        element.set("armature", f"{_STEERING_ARMATURE}")
+        # Armature of a steering servo behind its linkage, as each wheel feels it, kg m^2.
+        element.set("armature", "0.002")
 
 
 def _link(body: Element, link: Part) -> None:
@@ -450,18 +451,12 @@ def _shape(body: Element, shape: Shape, name: str) -> None:
     geom.set("euler", _text(math.pi / 2, shape.yaw, 0.0))
 
 
-_STEERING_ARMATURE: Final = 0.002
-"""Armature of a steering servo behind its linkage, as each wheel feels it, kg m^2."""
 _HEAD_STIFFNESS: Final = 15.0
 """Stiffness between a stabiliser's shaft and what it turns, Nm/rad."""
 _HEAD_DAMPING: Final = 0.15
 """Nm s/rad."""
 HEAD_LAG: Final = _HEAD_DAMPING / _HEAD_STIFFNESS
 """Seconds by which a joint would trail a shaft that turns, because its damper holds it against the body."""
-_STEERING_STIFFNESS: Final = 60.0
-"""Nm/rad: the linkage gives a little."""
-_STEERING_DAMPING: Final = 0.8
-"""Nm s/rad."""
 
 
 def _drive(root: Element, description: Description, drive: DriveLine) -> None:
@@ -479,7 +474,7 @@ def _drive(root: Element, description: Description, drive: DriveLine) -> None:
         SubElement(equalities, "tendon", tendon1=f"case_{i}_a", tendon2=f"case_{i}_b", solref="0.01 1")
     for joint in description.joints:
         if joint.name.endswith("_steer"):
-            gains = {"kp": f"{_STEERING_STIFFNESS}", "kv": f"{_STEERING_DAMPING}"}
+            gains = {"kp": "60.0", "kv": "0.8"}  # Nm/rad and Nm s/rad: the linkage gives a little
             SubElement(actuators, "position", gains, name=joint.name, joint=joint.name)
     for joint in description.joints:
         if joint.name in HEAD_JOINTS:

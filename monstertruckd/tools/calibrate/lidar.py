@@ -48,8 +48,6 @@ LEAST_OVERLAP: Final = 0.5
 """Least overlap of two scans that are registered."""
 LEAST_SCANS: Final = 3
 """Scans at each rest, at least."""
-SCAN: Final = 0.002
-"""Least standard deviation of a registered position, m: walls are not straight to less."""
 CRAB: Final = 0.005
 """Standard deviation of the direction of travel on one leg, by tyres, rad."""
 LEG_DRIFT: Final = 0.006
@@ -112,7 +110,8 @@ class LidarLeg:
             )
         errors = np.sqrt(np.diag(np.linalg.inv(fit.information)))
         x, y, yaw = fit.pose.tolist()
-        return cls(distance, (x, y, yaw), math.hypot(SCAN, float(np.max(errors[:2]))), math.atan2(aside, ahead))
+        least = 0.002  # least standard deviation of a registered position, m: walls are not straight to less
+        return cls(distance, (x, y, yaw), math.hypot(least, float(np.max(errors[:2]))), math.atan2(aside, ahead))
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,6 @@ LEASE: Final = 0.5
 """Requested, s; the gate may grant less."""
 ARMING: Final = 3.0
 """Seconds in which the truck must be armed."""
-STEERING: Final = 1.0
-"""Seconds for turning the wheels while the truck stands."""
 RESTING_TURN: Final = 0.1
 """Turn of the motor, rad, that counts as rest: an encoder may alternate between two counts."""
 RESTING_TIME: Final = 0.5
@@ -109,9 +107,10 @@ class Mover:
 
     async def _once(self, run: "_Run", move: MoveStep, report: Callable[[float], None]) -> None:
         async with self._armed(run):
+            steering = 1.0  # seconds for turning the wheels while the truck stands
             if move.approach:
-                await run.hold(0.0, move.approach, move.approach, STEERING)
-            await run.hold(0.0, move.front, move.rear, STEERING)
+                await run.hold(0.0, move.approach, move.approach, steering)
+            await run.hold(0.0, move.front, move.rear, steering)
             run.begin()
             await run.hold(0.0, move.front, move.rear, move.rest)
             await self._drive(run, move, report)

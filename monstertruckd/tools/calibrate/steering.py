@@ -29,8 +29,6 @@ ROOM: Final = "2.5 m x 2.5 m, level, the robot in the middle; with --rough 1.5 m
 ROUGH: Final = (0.06, 0.1, 0.4)
 """Speed (m/s), axle angle (rad) and distance (m) of the first arcs: too little turn for the gate to call the steering
 dead, should it go the wrong way."""
-FULL: Final = 0.12
-"""Speed of full circles."""
 
 DEAD_BAND: Final = 2.0
 """Pulse, us, by which a servo may stop short of its goal."""
@@ -196,7 +194,7 @@ class SteeringWizard:
                 front, rear = model.commands(servos, first, maps)
                 move = MoveStep(
                     f"a full circle by {wheels} wheels, {side}",
-                    FULL,
+                    0.12,  # speed of full circles
                     front,
                     rear,
                     2.6 * math.pi / abs(context.chassis.bicycle.curvature(front, rear)),

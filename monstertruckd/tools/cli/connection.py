@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from monstertruck_runtime.endpoints import robot_on_host
 from monstertruck_runtime.errors import NotFoundError, TruckError
@@ -15,9 +15,6 @@ if TYPE_CHECKING:
     from monstertruckd.config.truck import TruckConfig
 
 T = TypeVar("T")
-
-SOON: Final = 0.7
-"""Seconds in which a robot that is there has answered; later the command says what it waits for."""
 
 
 def with_robot(
@@ -60,7 +57,8 @@ def with_robot(
 
 
 async def _say_waiting(robot: str, endpoint: str, clock: "Clock") -> None:
-    await clock.sleep(SOON)
+    soon = 0.7  # seconds in which a robot that is there has answered; later the command says what it waits for
+    await clock.sleep(soon)
     remark(f"waiting for robot {robot!r} at {endpoint} ...")
 
 

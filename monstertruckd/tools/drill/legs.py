@@ -25,11 +25,6 @@ T = TypeVar("T")
 U = TypeVar("U")
 Outcome = TypeVar("Outcome")
 
-MOST_BYTES: Final = 100 * MEGABYTE
-"""Size of a file of outcomes at most: a campaign of a million trials."""
-CONNECT: Final = 10.0
-"""Seconds in which the scheduler of a cluster must answer."""
-
 
 def default_jobs() -> int:
     """Processes of a drill: one core is left for whoever works on the computer."""
@@ -84,7 +79,8 @@ class LegFile(Generic[Outcome]):
         self._found: dict[tuple[int, int], list[Outcome]] = {}
         self._end = 0
         """Bytes of whole lines: an interrupted program leaves part of one."""
-        data = contents(path, "outcomes of a drill", MOST_BYTES) if path.exists() else b""
+        most_bytes = 100 * MEGABYTE  # size of a file of outcomes at most: a campaign of a million trials
+        data = contents(path, "outcomes of a drill", most_bytes) if path.exists() else b""
         try:
             path.open("ab").close()  # before the first leg, not after it: it must be possible to write
         except OSError as error:
@@ -251,7 +247,7 @@ def on_cluster(address: str, step: Callable[[T], U], inputs: Sequence[T]) -> Ite
     except ImportError as error:
         raise not_installed("--cluster: dask.distributed", "cluster") from error
     try:
-        client = Client(address, timeout=CONNECT)
+        client = Client(address, timeout=10.0)  # seconds in which the scheduler of a cluster must answer
     except (OSError, ValueError) as error:
         raise NoAnswerError(f"{address}: no dask scheduler answers: {error}") from error
     with client:

@@ -40,7 +40,6 @@ STOPS_WITHIN: Final = 0.6
 """Seconds from any fault that must stop the truck, or from a disarm order, to standstill."""
 SPEED_MARGIN: Final = 1.05
 """True speed over the greatest commanded one: the motor's overshoot."""
-TURN_WINDOW: Final = 2.0
 FAN: Final = np.linspace(-1.2, 1.2, 49)
 """Directions of the distances that are checked ahead, rad."""
 ROOM: Final = np.linspace(0.0, 0.5, 26)
@@ -571,11 +570,12 @@ class _Turning:
         now = seen.now
         turned = 0.0 if self._held(seen) else (seen.truth.wz - self._asked(seen)) * TRUTH_PERIOD / SECOND
         self._turn_errors.append((now, turned))
-        while now - self._turn_errors[0][0] > TURN_WINDOW * SECOND:
+        # Largest difference between the true turn and the commanded one (rad), and the time over which both count (s).
+        turn_limit, turn_window = 0.5, 2.0
+        while now - self._turn_errors[0][0] > turn_window * SECOND:
             self._turn_errors.popleft()
-        # 0.5: greatest difference of the true turn from the one the pulses ask for within ``TURN_WINDOW`` s, rad
-        if abs(error := sum(turn for _, turn in self._turn_errors)) > 0.5:
-            yield "steering", f"turned {error:+.2f} rad off within {TURN_WINDOW:g} s"
+        if abs(error := sum(turn for _, turn in self._turn_errors)) > turn_limit:
+            yield "steering", f"turned {error:+.2f} rad off within {turn_window:g} s"
 
     def _held(self, seen: Observation) -> bool:
         return len(seen.target) > 1 and any(map(self._world.shaft_blocked, range(len(seen.target))))

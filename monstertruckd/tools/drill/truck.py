@@ -111,8 +111,6 @@ STEERING: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Ways of a wanderer to steer, by a body's freedom: front axle alone, both against each other, both alike, each by
 itself."""
-LOOKS_AHEAD: Final = 2 * MAY_MOVE
-"""Look-ahead of the operator of a robot without range sensors (s): twice ``MAY_MOVE``."""
 
 
 def _can(chassis: Chassis, twist: Twist2) -> bool:
@@ -123,10 +121,10 @@ def _can(chassis: Chassis, twist: Twist2) -> bool:
 
 
 def stays_clear(world: World, twist: Twist2) -> bool:
-    """Whether a robot touches nothing for ``LOOKS_AHEAD``, moving as it does or with ``twist``."""
+    """Whether a robot touches nothing for twice ``MAY_MOVE``, moving as it does or with ``twist``."""
     pose, motions = world.plant.pose, (twist, world.plant.twist)
-    looks = 8  # number of poses checked over ``LOOKS_AHEAD``
-    times = [LOOKS_AHEAD * (look + 1) / looks for look in range(looks)]
+    looks = 8  # number of poses checked over that time
+    times = [2 * MAY_MOVE * (look + 1) / looks for look in range(looks)]
     return all(world.is_free(integrate(pose, *motion, time)) for motion in motions for time in times)
 
 

@@ -18,8 +18,6 @@ from monstertruck_runtime.readable import when_readable
 from monstertruckd.tools.driving.gamepad import AXES, BUTTONS, EV_KEY, EVENT, Action, Pad, PadMapping
 
 FOLDER: Final = Path("/dev/input")
-GAMEPAD_LOOK_PERIOD: Final = 1.0
-"""Seconds between two looks for a gamepad."""
 STOPPING: Final = frozenset({"stop", "estop"})
 """Actions that count however late they are read."""
 EFFECT: Final = struct.Struct("HhHHHHHxxHH28x")
@@ -57,7 +55,7 @@ class PadLink:
             while True:
                 if self._file is None:
                     self._open()
-                await self._clock.sleep(GAMEPAD_LOOK_PERIOD)
+                await self._clock.sleep(1.0)  # seconds between two looks for a gamepad
         finally:
             self._close()
 

@@ -23,9 +23,6 @@ from monstertruckd.tools.logs.geometry import recorded_geometry
 from monstertruckd.tools.logs.messages import Progress
 from monstertruckd.tools.logs.report.scan_map import PlacedScans
 
-EMPTY_EDGE: Final = 0.25
-"""Empty edge around what was seen, m."""
-MOST_FRAMES: Final = 1500
 COLOURS: Final = (
     (255, 255, 255),
     (70, 70, 80),
@@ -128,9 +125,10 @@ def animate(
     scenes = _scenes(reader, round(speed / frames_per_second * SECOND), report)
     if not scenes:
         raise InputError(f"{reader.path}: no pose in it: nothing to draw")
-    if len(scenes) > MOST_FRAMES:
-        needed = speed * len(scenes) / MOST_FRAMES
-        raise InputError(f"{len(scenes)} pictures, at most {MOST_FRAMES}: expected --speed {math.ceil(needed)} or more")
+    most_frames = 1500
+    if len(scenes) > most_frames:
+        needed = speed * len(scenes) / most_frames
+        raise InputError(f"{len(scenes)} pictures, at most {most_frames}: expected --speed {math.ceil(needed)} or more")
     canvas = _AnimationCanvas(scenes, width, recorded_geometry(reader.path, reader.config()))
     rest = 1.5  # seconds for which the last picture stays
     try:
@@ -174,8 +172,9 @@ class _AnimationCanvas:
         self._body = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * (geometry.length / 2, geometry.width / 2)
         poses = np.array([scene.pose[:2] for scene in scenes])
         seen = np.vstack([poses, *(scene.points for scene in scenes)])
-        low = np.minimum(np.quantile(seen, 0.002, axis=0), poses.min(axis=0)) - EMPTY_EDGE
-        high = np.maximum(np.quantile(seen, 0.998, axis=0), poses.max(axis=0)) + EMPTY_EDGE
+        empty_edge = 0.25  # empty edge around what was seen, m
+        low = np.minimum(np.quantile(seen, 0.002, axis=0), poses.min(axis=0)) - empty_edge
+        high = np.maximum(np.quantile(seen, 0.998, axis=0), poses.max(axis=0)) + empty_edge
         self._low, self._scale = low, width / (high[0] - low[0])
         self._height = max(round((high[1] - low[1]) * self._scale), 16)
         self._ground = Image.new("RGB", (width, self._height), PAPER)

@@ -24,11 +24,6 @@ from monstertruckd.recorder.reader import LogReader, open_log
 from monstertruckd.tools.logs.export import LOG_TIME, REAL_TIME, flat, made_folder, record_type, whole_tables
 from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
 
-BATCH_BYTES: Final = 4_000_000
-"""Encoded messages of a batch (bytes): a few hundred scans, whose rows take a few ten MB."""
-BATCH_ROWS: Final = 16_384
-"""Rows of a batch at most: small messages take a hundred times their encoded size as rows."""
-
 
 @cache
 def schema_of(topic: str) -> pa.Schema:
@@ -96,7 +91,10 @@ class _Batch:
         for field in self.schema:
             self._columns[field.name].append(_value(row[field.name], field.type))
         self._bytes, self._rows = self._bytes + size, self._rows + 1
-        return self._bytes >= BATCH_BYTES or self._rows >= BATCH_ROWS
+        # Encoded messages of a batch (bytes): a few hundred scans, whose rows take a few ten MB.
+        batch_bytes = 4_000_000
+        batch_rows = 16_384  # rows of a batch at most: small messages take a hundred times their encoded size as rows
+        return self._bytes >= batch_bytes or self._rows >= batch_rows
 
     def take(self) -> pa.RecordBatch:
         """The rows so far, which are then forgotten.

@@ -24,8 +24,6 @@ KINDS: Final = {
     "FLASER": "FLASER n, n ranges, 6 numbers, time",
 }
 """What is expected of the lines that hold scans; the first kind is preferred."""
-STEADY_MOUNT: Final = 0.01
-"""Poses of laser and robot in one line tell the mount if it stays the same to this, m and rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,4 +130,5 @@ def _mount(lines: list[_LaserLine]) -> Pose2 | None:
     off = mounts - mounts[0]
     off[:, 2] = wrap(off[:, 2])
     middle = np.median(off, axis=0)
-    return vector(mounts[0] + middle) if np.abs(off - middle).max() < STEADY_MOUNT else None
+    steady_mount = 0.01  # poses of laser and robot in one line tell the mount if it stays the same to this, m and rad
+    return vector(mounts[0] + middle) if np.abs(off - middle).max() < steady_mount else None

@@ -23,10 +23,6 @@ from monstertruck_schemas.topics import Topic
 from monstertruckd.tools.logs.report.signals import FIGURES
 from monstertruckd.tools.logs.rerun_view import APPLICATION, Scene, blueprint
 
-LIVE_PERIOD: Final = 0.1
-"""Seconds between two checks of what came."""
-WAITING: Final = 200
-"""Messages of a topic that may wait for a look."""
 DRAWN: Final[tuple[Topic[Any], ...]] = (
     t.SCAN, t.TRANSFORMS, t.MAP, t.PATH, t.POSE, t.CAMERA, t.GATE, t.HEALTH, t.EVENT, t.STOP, t.LOG,
 )  # fmt: skip
@@ -45,8 +41,9 @@ async def follow(robot: str, endpoint: str, clock: Clock, stream: rr.RecordingSt
         with suppress(TruckError):
             async with TruckClient(robot, endpoint, clock=clock, timeout=retry) as client:
                 with ExitStack() as stack:
+                    waiting = 200  # messages of a topic that may wait for a look
                     boxes = [
-                        (topic, stack.enter_context(client.subscribe(topic, fifo(WAITING))))
+                        (topic, stack.enter_context(client.subscribe(topic, fifo(waiting))))
                         for topic in topics.values()
                     ]
                     await _box(scene, client)
@@ -55,7 +52,7 @@ async def follow(robot: str, endpoint: str, clock: Clock, stream: rr.RecordingSt
                         if scene.entities != laid_out:
                             laid_out = set(scene.entities)
                             stream.send_blueprint(blueprint(laid_out))
-                        await clock.sleep(LIVE_PERIOD)
+                        await clock.sleep(0.1)  # seconds between two checks of what came
         await clock.sleep(retry)
 
 

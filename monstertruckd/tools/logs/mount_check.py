@@ -17,14 +17,8 @@ from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between, wrap
 
-STRETCH: Final = 0.3
-"""Distance by odometry over which both motions are compared, m: a match is known to 1 or 2 cm."""
-FEWEST: Final = 10
-"""Stretches with which anything is reported."""
 LEAST_YAW: Final = math.radians(1.5)
 """A lidar is fitted by hand to about this: in recorded logs (Intel, ACES, CSAIL) it is off by 0.4 to 1.2 degrees."""
-SURE: Final = 3.0
-"""Standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +44,7 @@ class MountCheck:
             None if there are too few stretches of odometry.
         """
         pairs = list(_stretches(scans, trajectory))
-        if len(pairs) < FEWEST:
+        if len(pairs) < 10:  # stretches with which anything is reported
             return None
         by_wheels, by_scans = (np.array(motions) for motions in zip(*pairs, strict=True))
         turns = float(np.sum(by_wheels[:, 2] * by_scans[:, 2]))
@@ -66,7 +60,8 @@ class MountCheck:
         """What is wrong with the mount, and the remedy; None if nothing is beyond doubt."""
         if self.mirrored:
             return "scans turn against odometry: the lidar hangs upside down, or its beams run the other way"
-        if abs(self.yaw) < max(LEAST_YAW, SURE * self.deviation):
+        sure = 3.0  # standard deviations
+        if abs(self.yaw) < max(LEAST_YAW, sure * self.deviation):
             return None
         text = f"{math.degrees(self.yaw):+.1f} degrees (standard deviation {math.degrees(self.deviation):.1f})"
         return f"the lidar is turned by {text} against its mount: add that to its yaw, or run `calibrate lidar`"
@@ -88,6 +83,7 @@ def _stretches(
             begin = at, pose
             continue
         moved = between(begin[0], at)
-        if math.hypot(moved[0], moved[1]) >= STRETCH:
+        stretch = 0.3  # distance by odometry over which both motions are compared, m: a match is known to 1 or 2 cm
+        if math.hypot(moved[0], moved[1]) >= stretch:
             yield moved, between(begin[1], pose)
             begin = at, pose

@@ -18,8 +18,6 @@ SHORTEST_RANGE: Final = 0.02
 """Shorter ranges are no returns where the log does not say from where on, m."""
 LONGEST_RANGE: Final = 80.0
 """Ranges from here on are no-returns of the lasers that CARMEN logs come from, m."""
-NO_RETURN_SHARE: Final = 0.001
-"""The greatest range of a log means no return if at least this share of its beams has it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +79,8 @@ def no_return(ranges: Array) -> float:
     """
     finite = ranges[np.isfinite(ranges)]
     greatest = float(finite.max())
-    recurs = np.count_nonzero(finite == greatest) >= max(NO_RETURN_SHARE * finite.size, 3)
+    no_return_share = 0.001  # the greatest range of a log means no return if at least this share of its beams has it
+    recurs = np.count_nonzero(finite == greatest) >= max(no_return_share * finite.size, 3)
     return min(greatest if recurs else math.inf, LONGEST_RANGE)
 
 

@@ -35,10 +35,6 @@ from monstertruckd.tools.logs.scan_log import (
     vector,
 )
 
-LONGEST_LOG: Final = 1e9
-"""A longer npz log has other units than seconds, s."""
-URG_AHEAD: Final = 341
-"""Beam of a URG recording that looks straight ahead."""
 BAG: Final = b"#ROSBAG V"
 DATABASE: Final = b"SQLite format 3\0"
 OWN_FIELD: Final = b"codes"
@@ -159,7 +155,7 @@ def _arrays(path: Path, given: dict[str, Any]) -> ScanLog:
     if len(bad):
         raise InputError(f"{path}: t: expected finite seconds, got {times[bad[0]]} in row {bad[0]}")
     span = float(np.ptp(times))
-    if span > LONGEST_LOG:
+    if span > 1e9:  # a longer npz log has other units than seconds, s
         raise InputError(f"{path}: t: expected seconds, got a log of {span:g} s")
     if not (np.isfinite(ranges) & (ranges > 0)).any():
         raise InputError(f"{path}: ranges: expected metres, got no finite value above 0")
@@ -202,11 +198,12 @@ def _urg(path: Path) -> Iterator[ScanInput]:
     recording = RecordedRanges.load(path)
     urg_errors = 0.02  # shorter readings of a URG are error codes, m
     urg_step = math.tau / 1024
+    urg_ahead = 341  # beam of a URG recording that looks straight ahead
     for time, row in zip(recording.times.tolist(), recording.ranges, strict=True):
         yield ScanInput(
             stamp=BEGIN + time,
             ranges=np.where(row / 1000 >= urg_errors, row / 1000, np.inf),
-            start_angle=-URG_AHEAD * urg_step,
+            start_angle=-urg_ahead * urg_step,
             angle_increment=urg_step,
             range_min=urg_errors,
             range_max=5.6,  # m

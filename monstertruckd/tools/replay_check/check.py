@@ -3,7 +3,7 @@
 Outputs of services in the daemon's loop follow from the log's messages and their order alone, so they are expected bit
 for bit. So are those of the estimation worker and what rests on them in a log of the virtual clock. On the wall clock
 the log shows when the worker's results counted, but not which of two inputs of one instant it had read: there what
-rests on them may differ by ``WORKER_TOLERANCE``, and its own messages are shown, not judged. So are paths to goals,
+rests on them may differ by 0.02 (SI units), and its own messages are shown, not judged. So are paths to goals,
 whose search ended by time there, not by work, and reports on goals: most results of their workers show nowhere.
 """
 
@@ -36,8 +36,6 @@ RESTS_ON_GOALS: Final = frozenset({topics.TRACKER.name, topics.PLAN_DRIVE.name})
 """Outputs a worker has a say in where the robot drives to goals; of the wall clock several stamps of one tick are known
 as one."""
 GOALS: Final = frozenset({topics.PATH.name, topics.GOAL.name})
-WORKER_TOLERANCE: Final = 0.02
-"""Greatest difference, SI units, of outputs that rest on a worker's, in a log of the wall clock."""
 
 
 def check_log(
@@ -73,10 +71,12 @@ def check_log(
     _refuse_the_middle(log, found, compared)
     virtual = first_offset(log, reader.first.metadata().get("run", {})) == 0
     loose, shown = (frozenset[str](),) * 2 if virtual else _inexact(own, used)
+    # Greatest difference, SI units, of outputs that rest on a worker's, in a log of the wall clock.
+    worker_tolerance = 0.02
     comparisons = {
         topic.name: TopicComparison(
             topic,
-            tolerance if tolerance is not None else WORKER_TOLERANCE * (topic.name in loose),
+            tolerance if tolerance is not None else worker_tolerance * (topic.name in loose),
             found.start,
             judged=topic.name not in shown,
         )

@@ -47,7 +47,6 @@ from monstertruckd.tools.security.certificates import (
 AUTHORITY_DAYS: Final = 3650
 ROBOT_DAYS: Final = 825
 PORT: Final = 7447
-PILOTS_PORT: Final = 7448
 ROUTER_FILE: Final = "router.pem"
 """Certificate of the authority of the fleet's router, if there is one."""
 PLACE: Final = Path("/etc/monstertruckd/security")
@@ -376,7 +375,7 @@ def _zenoh(register: CertificateRegister) -> dict[str, Any]:
     assert set(tls) == set(TlsConfig.model_fields)
     return {
         "listen": [f"tls/0.0.0.0:{PORT}"],
-        "listen_pilots": [f"tls/0.0.0.0:{PILOTS_PORT}"],
+        "listen_pilots": ["tls/0.0.0.0:7448"],
         "connect": [] if router is None else [router.endpoint],
         "tls": tls,
     }

@@ -13,8 +13,6 @@ from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
 from monstertruckd.config.truck import TruckConfig
 
-RUN_REQUEST_PERIOD: Final = 0.05
-"""Seconds between two requests."""
 REVERSAL_PAUSE: Final = 0.6
 """Seconds of standstill at a reversal."""
 SETTLING: Final = 2.0
@@ -126,7 +124,7 @@ async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequen
                 end = due + round(stretch.seconds * SECOND)
                 while due < end:
                     await robot.drive_shafts(*row, lease=0.25)
-                    due += round(RUN_REQUEST_PERIOD * SECOND)
+                    due += round(0.05 * SECOND)  # seconds between two requests
                     await clock.sleep_until(min(due, end))
                     state = gate.latest
                     if state is not None and state is not seen:

@@ -30,10 +30,6 @@ GREATEST: Final = 2.0
 """Greatest errors of a measure that works, in standard deviations."""
 FEWEST: Final = 12
 """Places that are compared at least."""
-SLIP_LENGTH: Final = 0.1
-"""Distance (m) or turn (rad) along which slip stays the same."""
-OFFSET: Final = 1.0
-"""Standard deviation of the place at the beginning, m or rad: it is not known."""
 
 
 class ScanStep(NamedTuple):
@@ -133,11 +129,13 @@ def _fit(steps: tuple[ScanStep, ...], moved: Array, axis: _Axis) -> tuple[Array,
     along = moved[..., 2 * axis.place]
     places, lengths = np.cumsum(along, axis=1), np.cumsum(np.abs(along), axis=1)
     ways = np.cumsum(np.hypot(moved[..., 0], moved[..., 1]), axis=1)
-    slip = SLIP_LENGTH * np.minimum(lengths[:, :, None], lengths[:, None, :])
+    slip_length = 0.1  # distance (m) or turn (rad) along which slip stays the same
+    slip = slip_length * np.minimum(lengths[:, :, None], lengths[:, None, :])
     greatest = np.square(axis.share) * (_outer(places) + slip)
     greatest += np.square(axis.bend) * _outer(ways) + np.square(axis.drift) * _outer(seconds[None])
     greatest += np.square(axis.constant) * np.eye(len(steps))
-    root = np.linalg.cholesky(greatest / GREATEST**2 + np.square(OFFSET) + np.diag(seen))
+    offset = 1.0  # standard deviation of the place at the beginning, m or rad: it is not known
+    root = np.linalg.cholesky(greatest / GREATEST**2 + np.square(offset) + np.diag(seen))
     white = np.linalg.solve(root, (shown - places)[..., None])[..., 0]
     volume = 2.0 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)), axis=1)
     return np.sum(np.square(white), axis=1), volume

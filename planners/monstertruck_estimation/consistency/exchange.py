@@ -41,8 +41,6 @@ class StepInput:
 
 REFUTING: Final = 12
 """Points that fit the scans' own motion alone with which a claim is refuted at least."""
-OUTWEIGHED: Final = 4
-"""Their number for every point that fits the claim alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +62,8 @@ class ScanVerdict:
         Where nothing constrains the motion (a corridor, an open field), no point fits one alone. Among people who walk,
         some fit either, and many neither.
         """
-        return self.own >= max(REFUTING + OUTWEIGHED * self.claimed, self.misfits)
+        outweighed = 4  # their number for every point that fits the claim alone
+        return self.own >= max(REFUTING + outweighed * self.claimed, self.misfits)
 
 
 @dataclass(frozen=True, slots=True)

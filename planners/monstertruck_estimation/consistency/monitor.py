@@ -36,28 +36,12 @@ from monstertruck_schemas.state import Doubt, DoubtKind, UnshownMotion
 
 WINDOWS: Final = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
 """Times over which motions are compared, s, up to the configured one."""
-AGAIN: Final = SECOND // 5
-"""Least time between two motions that the scans are asked about, ns."""
-DELAY_PERIOD: Final = SECOND // 4
-"""Time between two looks at the delay of the scans, ns."""
-DELAY_OVER: Final = 4 * SECOND
-"""Time over which it is determined, ns."""
 WITNESSES: Final = (Measure.WHEELS, Measure.GYRO, Measure.ENCODERS, Measure.STAND)
 """Measures that show at what time the motion changes."""
 GAP: Final = SECOND // 2
 """Headings and rates further apart are not joined, ns."""
 IN_USE: Final = 2 * SECOND
 """A measure without a sample for so long is not in use, ns."""
-STAMP: Final = 0.05
-"""Error of a stamp, s."""
-INTERVALS: Final = 10
-"""Intervals between scans of which the longest counts."""
-TURNED_ALONE: Final = 0.15
-"""How far the way may change with a claimed turn, m."""
-REST: Final = SECOND // 2
-"""Time at rest after which the bias of a gyroscope is known, ns."""
-MAX_BIAS: Final = 0.1
-"""A mean rate at rest above this is no bias, rad/s."""
 
 
 class _OpenDisagreement(NamedTuple):
@@ -93,7 +77,7 @@ class ConsistencyMonitor:
         self._rest_since: int | None = None
         self._scans: deque[int] = deque(maxlen=256)
         """Stamps of scans whose motion is known."""
-        self._intervals: deque[float] = deque([0.0], maxlen=INTERVALS)
+        self._intervals: deque[float] = deque([0.0], maxlen=10)  # intervals between scans of which the longest counts
         """Between the newest scans, s."""
         self._steps: deque[ScanStep] = deque()
         self._scatter = 0.0, 0.0
@@ -191,7 +175,8 @@ class ConsistencyMonitor:
             moved = output.motion[0], output.motion[2]
             self._scatter = output.scatter
             self._steps.append(ScanStep(output.since, output.stamp, moved, output.errors))
-            while output.stamp - self._steps[0].since > DELAY_OVER:
+            delay_over = 4 * SECOND  # time over which it is determined, ns
+            while output.stamp - self._steps[0].since > delay_over:
                 self._steps.popleft()
         self._scans.append(output.stamp)
         if self._resting is not None:
@@ -291,9 +276,10 @@ class ConsistencyMonitor:
             return
         self._rest_since = stamp if self._rest_since is None else self._rest_since
         self._rest.append(rate)
-        if stamp - self._rest_since >= REST:
+        rest = SECOND // 2  # time at rest after which the bias of a gyroscope is known, ns
+        if stamp - self._rest_since >= rest:
             mean = math.fsum(self._rest) / len(self._rest)
-            self._bias = mean if abs(mean) <= MAX_BIAS else self._bias
+            self._bias = mean if abs(mean) <= 0.1 else self._bias  # a mean rate at rest above this is no bias, rad/s
             self._rest, self._rest_since = [], None
 
     def _compare(self, stamp: int) -> None:
@@ -316,9 +302,10 @@ class ConsistencyMonitor:
         if not lasting:
             return
         claimant = _claimant(lasting)
+        again = SECOND // 5  # least time between two motions that the scans are asked about, ns
         if claimant is None:
             self._accuse(stamp, lasting)
-        elif self._pending is None and stamp - self._asked >= AGAIN:
+        elif self._pending is None and stamp - self._asked >= again:
             self._pending, self._asked = _OpenDisagreement(begun, lasting, claimant, errors), stamp
 
     def _slack(self, motions: Collection[Measure], since: int, stamp: int) -> tuple[float, float]:
@@ -329,7 +316,7 @@ class ConsistencyMonitor:
         scatter more than they state are that uncertain.
         """
         interval, delay = max(self._intervals), self._config.delay
-        error = interval if interval > delay else STAMP
+        error = interval if interval > delay else 0.05  # error of a stamp, s
         paces = [(self._tracks[measure].pace(since), self._tracks[measure].pace(stamp)) for measure in motions]
         way, turn = (
             max(delay * abs(end[axis] - begin[axis]) + error * max(begin[axis], end[axis]) for begin, end in paces)
@@ -350,7 +337,7 @@ class ConsistencyMonitor:
         pair = Measure.SCANS, claimant
         _, turn = turn_difference(window, *pair, self._errors)
         if self._errors[claimant].way is None:
-            return TURNED_ALONE, turn
+            return 0.15, turn  # how far the way may change with a claimed turn, m
         return way_limit(window, *pair, self._errors), turn
 
     def _starts(self, stamp: int) -> Iterator[int]:
@@ -372,7 +359,8 @@ class ConsistencyMonitor:
         """The motion of the newest scans, and of other measures before, that tells how much the scans lag behind."""
         if not self._steps or self._active_since is None:
             return None
-        if self._steps[-1].stamp - self._delayed_at < DELAY_PERIOD:
+        delay_period = SECOND // 4  # time between two looks at the delay of the scans, ns
+        if self._steps[-1].stamp - self._delayed_at < delay_period:
             return None
         self._delayed_at = self._steps[-1].stamp
         steps = [step for step in self._steps if step.since >= self._active_since]

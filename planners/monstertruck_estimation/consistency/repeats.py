@@ -1,6 +1,6 @@
 """Values that repeat to the digit for longer than their noise allows.
 
-A sensor whose noise has a standard deviation of at least ``ENOUGH`` digits gives its most frequent value with a
+A sensor whose noise has a standard deviation of at least 0.6 digits gives its most frequent value with a
 probability of at most 0.6 (normal distribution): 40 equal values in a row happen once in 10^9. How much noise a value
 has is learned while the robot stands; one without noise, which may stay the same for hours, is never accused.
 """
@@ -9,18 +9,10 @@ import math
 from collections import deque
 from typing import Final
 
-ENOUGH: Final = 0.6
-"""Least standard deviation of a value's noise, in digits, with which it is judged."""
 LEAST_ROW: Final = 40
 """Equal values in a row that such noise does not give."""
-ROW: Final = 10
-"""A longer row may be that of a frozen value, and says nothing about the noise."""
-LONGER: Final = 8
-"""Factor on the longest row seen before: quantisation and filters make rows of their own."""
 WINDOW: Final = 20
 """Values over which the noise is measured."""
-WINDOWS: Final = 2
-"""Windows after which it is known."""
 
 
 class RepeatDetector:
@@ -39,8 +31,10 @@ class RepeatDetector:
     @property
     def frozen(self) -> bool:
         """Whether the value repeats longer than its noise allows."""
-        known = self._windows >= WINDOWS and self._noise >= ENOUGH * self._digit
-        return known and self._row >= max(LEAST_ROW, LONGER * self._longest)
+        enough = 0.6  # least standard deviation of a value's noise, in digits, with which it is judged
+        known = self._windows >= 2 and self._noise >= enough * self._digit  # windows after which it is known
+        longer = 8  # factor on the longest row seen before: quantisation and filters make rows of their own
+        return known and self._row >= max(LEAST_ROW, longer * self._longest)
 
     @property
     def row(self) -> int:
@@ -57,7 +51,7 @@ class RepeatDetector:
                 if not self.frozen:
                     self._longest = max(self._longest, self._row)
             self._last, self._row = value, 1
-        if not still or self._row > ROW:
+        if not still or self._row > 10:  # a longer row may be that of a frozen value, and says nothing about the noise
             self._still.clear()
             return
         self._still.append(value)
@@ -68,10 +62,6 @@ class RepeatDetector:
             self._still.clear()
 
 
-PROOF: Final = 10
-"""Different ones in a row while the robot stands after which noise is known to change each."""
-EQUAL: Final = 3
-"""Equal ones in a row that are no chance then."""
 MOVED: Final = 0.15
 """Distance (m) or turn (rad) after which equal ones are no chance without noise either."""
 
@@ -101,12 +91,14 @@ class WholeRepeats:
         if whole != before:
             self._row, self._moved, self.frozen = 1, 0.0, False
             self._different = self._different + 1 if moved == 0.0 and before is not None else 0
-            self._noisy |= self._different >= PROOF
+            proof = 10  # different ones in a row while the robot stands after which noise is known to change each
+            self._noisy |= self._different >= proof
             return
         self._row += 1
         self._different = 0
         self._moved += moved
-        self.frozen |= self._row >= EQUAL and (self._noisy or self._moved >= MOVED)
+        equal = 3  # equal ones in a row that are no chance then
+        self.frozen |= self._row >= equal and (self._noisy or self._moved >= MOVED)
 
     def pause(self) -> None:
         """The next whole does not follow the last one, or says too little to be compared."""

@@ -22,8 +22,6 @@ SECTOR: Final = math.radians(15)
 """Angle of view that one person at a distance of 2 m covers, rad."""
 DIMENSIONS: Final = 3
 """Of a planar motion."""
-UNLIKELY: Final = 1e-3
-"""Largest p-value of a motion under the stated range noise that the jackknife judges."""
 LEAST: Final = np.finfo(float).tiny
 """Lower bound of a p-value before its conversion to standard deviations."""
 
@@ -53,7 +51,8 @@ def rest_evidence(scan: Scan, earlier: Scan, own: Array, claim: Claim, origin: t
         return RestEvidence()
     x, y, turn = between(claimed, fit.pose).tolist()
     sectors, moved = _sectors(scan, cloud, fit.pose, origin), fit.pose - claimed
-    if _by_noise(sectors, moved) > UNLIKELY:
+    unlikely = 1e-3  # largest p-value of a motion under the stated range noise that the jackknife judges
+    if _by_noise(sectors, moved) > unlikely:
         return RestEvidence((x, y, turn))
     return RestEvidence((x, y, turn), -float(ndtri(max(_by_sectors(sectors, moved), LEAST))))
 

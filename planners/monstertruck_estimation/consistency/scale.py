@@ -5,7 +5,7 @@ them fit one explanation alone, see ``ScanVerdict``.
 """
 
 import math
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,9 +13,6 @@ from monstertruck_estimation.consistency.exchange import REFUTING, ScanVerdict
 from monstertruck_estimation.slam.registration import Cloud, fitting, register
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
-
-LEAST_PAIRS: Final = 30
-"""Minimum number of beams with a range in both revolutions."""
 
 
 class Revolution(NamedTuple):
@@ -63,7 +60,7 @@ def _fits(scan: Scan, cloud: Cloud, motion: Array) -> np.ndarray[tuple[int], np.
 
 def _factor(newest: Array, earlier: Array) -> float | None:
     both = np.isfinite(newest) & np.isfinite(earlier) & (newest > 0.0) & (earlier > 0.0)
-    if np.count_nonzero(both) < LEAST_PAIRS:
+    if np.count_nonzero(both) < 30:  # minimum number of beams with a range in both revolutions
         return None
     return math.exp(float(np.median(np.log(newest[both] / earlier[both]))))
 

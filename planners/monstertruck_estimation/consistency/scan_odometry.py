@@ -25,31 +25,8 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 
-MIN_POINTS: Final = 30
-"""A scan with fewer points says nothing of the motion."""
-LONGEST_RANGE: Final = 30.0
-"""Longer ranges are not used, m."""
 GAP: Final = 1.5
 """Scans further apart in time are not compared, s."""
-FITS: Final = 0.5
-"""Least overlap with the scan before of a motion that counts."""
-THINNED: Final = 0.06
-"""About one point per square of this edge is registered, m."""
-MOST_POINTS: Final = 300
-KEEP_WAY: Final = 0.3
-"""Distance after which another scan is the reference, m."""
-KEEP_TURN: Final = 0.35
-"""Turn after which it is, rad."""
-STEPS: Final = 10
-"""Steps by which a motion over a window is refined: scan odometry drifts."""
-SCATTERED: Final = 20
-"""Newest changes of the motion whose scatter is measured."""
-AVERAGED: Final = 2
-"""Number of motions whose mean velocity deskews the next scan. With one, the registration error feeds back into the
-next scan and grows where only the last beams constrain the motion. With two it decays if a sweep takes no longer than
-the interval between scans."""
-REMEMBERED: Final = 128
-"""Scans kept for claims."""
 
 
 class KissFront:
@@ -87,16 +64,21 @@ class ScanMotionStep:
     def __init__(self) -> None:
         self._front: tuple[str, KissFront | None] | None = None
         self._pose = np.zeros(3)
-        self._motions: deque[tuple[Array, float]] = deque(maxlen=AVERAGED)
+        # Number of motions whose mean velocity deskews the next scan. With one, the registration error feeds back into
+        # the next scan and grows where only the last beams constrain the motion. With two it decays if a sweep takes no
+        # longer than the interval between scans.
+        averaged = 2
+        self._motions: deque[tuple[Array, float]] = deque(maxlen=averaged)
         """Latest motions with their durations (s)."""
-        self._changes: deque[tuple[float, float]] = deque(maxlen=SCATTERED)
+        scattered = 20  # newest changes of the motion whose scatter is measured
+        self._changes: deque[tuple[float, float]] = deque(maxlen=scattered)
         """From one motion to the next, m^2 and rad^2."""
         self._last: tuple[int, Cloud] | None = None
         self._revolution: Revolution | None = None
         """Newest revolution, the reference of the next one's scale."""
         self._reference: tuple[Cloud, Array] | None = None
         """The scan that others are registered to, and its pose."""
-        self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=REMEMBERED)
+        self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=128)  # scans kept for claims
         """Stamp, scan and its pose."""
 
     def step(self, inputs: StepInput) -> StepOutput:
@@ -117,9 +99,11 @@ class ScanMotionStep:
             lasting = motion * (dt / seconds)
             twist = np.sum([moved for moved, _ in self._motions], axis=0) / sum(seconds for _, seconds in self._motions)
         vx, vy, wz = twist.tolist()
-        whole = prepare_input(inputs.scan, LONGEST_RANGE, (vx, vy, wz))
-        scan = whole.downsampled(THINNED, MOST_POINTS)
-        if len(whole) < MIN_POINTS:
+        whole = prepare_input(inputs.scan, 30.0, (vx, vy, wz))  # longer ranges are not used, m
+        thinned = 0.06  # about one point per square of this edge is registered, m
+        most_points = 300
+        scan = whole.downsampled(thinned, most_points)
+        if len(whole) < 30:  # a scan with fewer points says nothing of the motion
             self._last = self._revolution = None
             return StepOutput(stamp, None, front=name)
         found = None
@@ -166,7 +150,8 @@ class ScanMotionStep:
             front.keep(scan, self._pose)
         assert self._reference is not None
         moved = between(self._reference[1], self._pose)
-        if math.hypot(moved[0], moved[1]) > KEEP_WAY or abs(moved[2]) > KEEP_TURN:
+        keep_way = 0.3  # distance after which another scan is the reference, m
+        if math.hypot(moved[0], moved[1]) > keep_way or abs(moved[2]) > 0.35:  # turn after which it is, rad
             self._reference = Cloud.of(scan), self._pose
 
     def _found(
@@ -183,15 +168,16 @@ class ScanMotionStep:
         if front is not None:
             guess = front.match(scan, guess)
         fit = register(scan, cloud, between(origin, guess)) if np.isfinite(guess).all() else None
+        fits = 0.5  # least overlap with the scan before of a motion that counts
         if fit is not None and np.isfinite(fit.pose).all():
             motion = between(self._pose, compose(origin, fit.pose))
             overlap = measure(whole, before, motion).overlap
-            if overlap >= FITS:
+            if overlap >= fits:
                 return motion, overlap, deviations_of(fit)
         # The velocity did not last, or the map holds what is no longer there.
         tries = [register(whole, before, start) for start in (np.zeros(3), lasting)]
         best = max(tries, key=lambda fit: fit.overlap)
-        if best.overlap < FITS:
+        if best.overlap < fits:
             return None
         self._begin(front, scan, compose(self._pose, best.pose))
         return best.pose, best.overlap, deviations_of(best)
@@ -212,7 +198,8 @@ class ScanMotionStep:
         cloud = Cloud.of(earlier[1])
         own = between(earlier[2], self._pose)
         claimed = np.array((*(own[:2] if claim.way is None else claim.way), claim.turn))
-        refined = [register(scan, cloud, start, iterations=STEPS).pose for start in (own, claimed)]
+        steps = 10  # steps by which a motion over a window is refined: scan odometry drifts
+        refined = [register(scan, cloud, start, iterations=steps).pose for start in (own, claimed)]
         fits_own = fitting(scan, cloud, refined[0])
         near = [pose for pose in refined if _is_near(pose, claimed, claim.errors)]
         fits = max((fitting(scan, cloud, pose) for pose in (claimed, *near)), key=np.count_nonzero)

@@ -41,14 +41,6 @@ from monstertruck_schemas.state import Consistency, Doubt, DoubtKind, GateState
 TARGET: Final = "monstertruck_estimation.consistency.scan_odometry:warmed"
 START_TIMEOUT: Final = 180.0
 """Real seconds the worker may take to start: numba compiles at the first start."""
-RATE: Final = 25.0
-"""Readings of the sensors per second."""
-MAX_TILT: Final = 0.1
-"""Scans whose plane was tilted more than this are left out, rad: they show the ground."""
-MAX_SPEED: Final = 5.0
-"""A drive position that would need more than this, m/s, is a new origin, not a motion."""
-FEWEST_BEAMS: Final = 20
-"""Beams with a range of a scan that is compared with the one before."""
 PERIOD: Final = SECOND
 """``state/consistency`` is published on every change and at least this often, ns."""
 
@@ -123,7 +115,8 @@ class ConsistencyService:
             (Measure.STAND, Measure.STAND.value, inputs.stand is not None),
         )
         self.monitor = ConsistencyMonitor(config, {measure: role for measure, role, there in measured if there})
-        self._wheels = WheelMotion(chassis, MAX_SPEED)
+        max_speed = 5.0  # a drive position that would need more than this, m/s, is a new origin, not a motion
+        self._wheels = WheelMotion(chassis, max_speed)
         self._taken: tuple[object, ...] = ()
         self._steered: object = None
         self._rolled: tuple[int, float, float] | None = None
@@ -148,7 +141,8 @@ class ConsistencyService:
                 if self._scans is not None and self._inputs.scan is not None:
                     group.create_task(self._follow_scans(self._scans, self._inputs.scan), name="scan odometry")
                 ready()
-                schedule = Schedule(self._clock, RATE, ESTIMATES)
+                rate = 25.0  # readings of the sensors per second
+                schedule = Schedule(self._clock, rate, ESTIMATES)
                 while True:
                     await schedule.next()
                     self.take()
@@ -226,7 +220,8 @@ class ConsistencyService:
             await actor.start()
             async for scan in scans:
                 seen = int((scan.codes == VALID_BEAM).sum())
-                whole = scan.ranges.tobytes() if seen >= FEWEST_BEAMS else None
+                fewest_beams = 20  # beams with a range of a scan that is compared with the one before
+                whole = scan.ranges.tobytes() if seen >= fewest_beams else None
                 self.monitor.observe_whole(DeviceRole.LIDAR, scan.stamp, whole)
                 work = self._work(setup, scan)
                 if work is None:
@@ -240,7 +235,8 @@ class ConsistencyService:
     def _work(self, setup: ScanSetup, scan: LaserScan) -> StepInput | None:
         """What the worker is to do with a scan; None = its plane is tilted."""
         angles = None if setup.angles is None else setup.angles.at(scan)
-        if scan.tilt is not None and scan.tilt > MAX_TILT:
+        max_tilt = 0.1  # scans whose plane was tilted more than this are left out, rad: they show the ground
+        if scan.tilt is not None and scan.tilt > max_tilt:
             self._anew = True
             return None
         slopes = None if angles is None else plane_slopes(*angles, yaw=setup.mount.yaw)

@@ -13,10 +13,6 @@ from monstertruck_runtime.clock import SECOND
 
 KEPT: Final = 9 * SECOND
 """Time for which motion is kept at least, ns; half as long again at most."""
-AHEAD: Final = SECOND // 10
-"""A motion may be read so far beyond the newest sample, ns; the robot is taken to go on."""
-PACE: Final = SECOND // 4
-"""Time over which a speed is taken, ns."""
 STILL: Final = 0.02, 0.02
 """Speed (m/s) and turn rate (rad/s) up to which the robot stands."""
 
@@ -65,7 +61,8 @@ class MotionTrack:
     def covers(self, since: int, stamp: int) -> bool:
         """Whether the motion between two instants, ns, is known."""
         stamps = self._stamps
-        return len(stamps) > 1 and stamps[0] <= since and stamp <= stamps[-1] + AHEAD
+        ahead = SECOND // 10  # a motion may be read so far beyond the newest sample, ns; the robot is taken to go on
+        return len(stamps) > 1 and stamps[0] <= since and stamp <= stamps[-1] + ahead
 
     def motion(self, since: int, stamp: int) -> Pose2 | None:
         """Pose of base at ``stamp`` in base at ``since``, both ns; None where it is not known."""
@@ -87,7 +84,8 @@ class MotionTrack:
         """Speed (m/s) and turn rate (rad/s), neither negative, before the instant ``at``, ns; 0 where not known."""
         if not self._stamps:
             return 0.0, 0.0
-        since = max(at - PACE, self._stamps[0])
+        pace = SECOND // 4  # time over which a speed is taken, ns
+        since = max(at - pace, self._stamps[0])
         motion = self.motion(since, at)
         if motion is None or at <= since:
             return 0.0, 0.0

@@ -49,84 +49,22 @@ MAX_WINDOW: Final = (12.0, 1.0)
 """Half width of a search at most, m and rad."""
 SMALL_WINDOW: Final = (1.5, 0.3)
 """Matches in windows up to this need no support, m and rad."""
-LEVELS: Final = 7
-"""Levels of the correlation pyramid."""
 QUERY_KEYS: Final = 12
 """Keyframes of the query at most."""
-QUERY_REACH: Final = 3.0
-"""Their distance from the newest keyframe at most, m."""
-QUERY_CELL: Final = 0.1
-"""About one of their points is used per square of this edge, m."""
-QUERY_POINTS: Final = 320
-"""Points of the query at most."""
-WORK: Final = 40_000
-"""Blocks evaluated in one search below the coarsest level, at most."""
-PLACE_KEYS: Final = 60
-"""Keyframes of the place that is searched, at most."""
-MIN_SCORE: Final = 0.45
-"""Least mean likelihood of a match."""
 MIN_OVERLAP: Final = 0.55
 """Share of the query's points that must fit."""
-JOIN_OVERLAP: Final = 0.75
-"""Share of the points that must fit, of a submap that is searched for in the whole map."""
-JOIN_BASELINE: Final = 2.0
-"""Least length of the trajectory between the matches that join two submaps, m."""
-JOIN_CONTRADICTION: Final = (0.1, 0.18)
-"""Greatest contradiction of two submaps (share of the points in view of both that one looked through), as a whole and
-along a stretch: right joins of recordings had at most 0.05 and 0.15, wrong ones in six of seven drives through equal
-rooms 0.18 and more."""
-JOIN_STRETCH: Final = 6
-"""Keyframes of a stretch."""
-CROSSED_KEYS: Final = 24
-"""Newest keyframes of a submap that are compared with another submap."""
-CROSSED_NEAR: Final = 12
-"""Keyframes of the other submap that each is compared with, evenly chosen, at most."""
-CROSSED_REACH: Final = 5.0
-"""Distance of these at most, m."""
-MIN_RATIO: Final = 0.02
-"""Least ratio of the eigenvalues of the position's information: below it is a corridor, where a fit proves nothing."""
-MAX_CORRECTION: Final = 0.3
-"""Distance between the fine and the coarse fit at most, m."""
 CONTRADICTION: Final = 0.15
 """Share of the points looked through by the scans of the other side from which on a match is wrong."""
-PART_SCORE: Final = 0.1
-"""Partial match (only a part of the surroundings was seen before): least mean likelihood."""
-PART_OVERLAP: Final = 0.7
-"""Partial match: share of the points in view of the place that must fit."""
-PART_POINTS: Final = 20
-"""Partial match: least number of points in view."""
 PART_CONTRADICTION: Final = 0.05
 """Partial match: share of the points that may be looked through."""
-PART_WIDER: Final = (1.0, 2.0)
-"""Partial match: added to the half width of the search, m and rad: scans drift more than their covariance says."""
-REVIEWED: Final = 250
-"""Keyframes from which the review searches, at most."""
-MAX_RIVAL: Final = 0.9
-"""A match is ambiguous if another place scores more than this share of it."""
-MIN_SEPARATION: Final = 1.0
-"""Distance at which places are different, m."""
-MIN_LIKENESS: Final = 0.8
-"""Least similarity of the descriptors of a candidate."""
 FLOOR: Final = (0.03, 0.03, 0.01)
 """Standard deviation of a closure, m and rad: its submaps are not rigid."""
 MIN_SUPPORT: Final = 3
 """Matches that must agree before one of a wide search is accepted, and as many more for each that contradicts."""
 BASELINE: Final = 1.0
 """Least length of the trajectory between the first and the last of these, m."""
-CONSISTENT: Final = 11.3
-"""Squared Mahalanobis distance of agreeing hits (99 % of chi-square with three degrees of freedom)."""
-STRETCH: Final = 3.0
-"""Length of trajectory within which the drift is small, so that of two contradicting matches one is false, m."""
-MAX_DRIFT: Final = 1.0
-"""Consistency is not tested where the drift between two matches is greater, m."""
-MAX_AGE: Final = 60
-"""Keyframes after which a match without support is dropped."""
-SEARCH_INTERVAL: Final = 4
-"""Keyframes between two searches in the same place."""
 MOST_WAITING: Final = 20
 """Keyframes that wait for their search, at most."""
-MAX_STRAINED: Final = 0.02
-"""Share of the edges that may become outliers before a closure is removed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,8 +120,10 @@ class LoopCloser:
         own, query = surroundings(keyframes, at)
         self._fingerprints[at] = describe(query.points)
         covariances, far = keyframes.drift(at)
-        self._hits = [hit for hit in self._hits if at - hit.made < MAX_AGE]
-        self._tried = {place: when for place, when in self._tried.items() if at - when < SEARCH_INTERVAL}
+        max_age = 60  # keyframes after which a match without support is dropped
+        self._hits = [hit for hit in self._hits if at - hit.made < max_age]
+        search_interval = 4  # keyframes between two searches in the same place
+        self._tried = {place: when for place, when in self._tried.items() if at - when < search_interval}
         for candidate in self._candidates(keyframes, at, covariances, far):
             self._tried[candidate] = at
             window = _window(covariances[candidate])
@@ -207,12 +147,14 @@ class LoopCloser:
         numbers = np.flatnonzero(keyframes.part == part)
         candidate = int(numbers[np.argmin(_distance(keyframes, at)[numbers])])
         own, query = surroundings(keyframes, at)
-        hit = yield from self._search(keyframes, query, own, at, candidate, MARGIN, least=JOIN_OVERLAP)
+        join_overlap = 0.75  # share of the points that must fit, of a submap that is searched for in the whole map
+        hit = yield from self._search(keyframes, query, own, at, candidate, MARGIN, least=join_overlap)
         if hit is None:
             return None
         yield EDGE_OPTIMISED * len(keyframes.edges)
         poses, count = keyframes.poses, len(keyframes.edges)
-        if not self._accepted(keyframes, hit, sure=False, baseline=JOIN_BASELINE):
+        join_baseline = 2.0  # least length of the trajectory between the matches that join two submaps, m
+        if not self._accepted(keyframes, hit, sure=False, baseline=join_baseline):
             return False
         robots, other = (part, own_part) if part == keyframes.part[-1] else (own_part, part)
         submaps = np.flatnonzero(keyframes.part == robots), np.flatnonzero(keyframes.part == other)
@@ -232,7 +174,8 @@ class LoopCloser:
         """
         self._tried.clear()
         count = len(keyframes)
-        places = np.unique(np.linspace(0, count - 1, min(count, REVIEWED)).astype(np.intp)).tolist()
+        reviewed = 250  # keyframes from which the review searches, at most
+        places = np.unique(np.linspace(0, count - 1, min(count, reviewed)).astype(np.intp)).tolist()
         hits = [hit for at in places if (hit := self._partial_match(keyframes, at)) is not None]
         closed = False
         while group := consistent_group(keyframes, hits):
@@ -259,9 +202,11 @@ class LoopCloser:
         if place > SMALL_WINDOW[0] or turn > SMALL_WINDOW[1]:
             return None
         own, query = surroundings(keyframes, at)
+        # Partial match: added to the half width of the search, m and rad: scans drift more than their covariance says.
+        part_wider = (1.0, 2.0)
         tries = (
             finished(self._search(keyframes, query, own, at, int(numbers[0]), (place * wider, turn * wider), part=True))
-            for wider in PART_WIDER
+            for wider in part_wider
         )
         return next((hit for hit in tries if hit is not None), None)
 
@@ -277,7 +222,8 @@ class LoopCloser:
             return [first]
         alike = likeness(self._fingerprints[newest], np.array([self._fingerprints[k] for k in elsewhere]))
         best = int(np.argmax(alike))
-        return [first, int(elsewhere[best])] if alike[best] > MIN_LIKENESS else [first]
+        min_likeness = 0.8  # least similarity of the descriptors of a candidate
+        return [first, int(elsewhere[best])] if alike[best] > min_likeness else [first]
 
     def _possible(self, keyframes: KeyframeMap, at: int, covariances: Array, far: Array) -> NDArray[np.intp]:
         """Keyframes before ``at`` that may be near it within the drift, the likeliest first."""
@@ -314,28 +260,39 @@ class LoopCloser:
         numbers = numbers[_distance(keyframes, at)[numbers] < window[0] + keyframes.config.local_reach]
         if not len(numbers):
             return None
-        numbers = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), PLACE_KEYS)).astype(np.intp)]
+        place_keys = 60  # keyframes of the place that is searched, at most
+        numbers = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), place_keys)).astype(np.intp)]
         yield 2 * EDGE * len(keyframes.edges) + ELEMENT * sum(len(keyframes.frames[k].scan) for k in numbers)
         submap = keyframes.submap(numbers)
-        yield submap.grid_cost(LEVELS)
-        grid = submap.grid(LEVELS)
+        levels = 7  # levels of the correlation pyramid
+        yield submap.grid_cost(levels)
+        grid = submap.grid(levels)
         deviation = max(window[0] / WINDOW, 0.1), max(window[1] / WINDOW, 0.02)
         guess = keyframes.poses[at]
-        score = PART_SCORE if part else MIN_SCORE
-        yield look_ups(query.points, window, LEVELS)
-        peak = correlate(grid, query.points, guess, window, deviation, score, MIN_SEPARATION, WORK)
-        if peak is None or peak.rival > MAX_RIVAL * peak.score:
+        min_score = 0.45  # least mean likelihood of a match
+        part_score = 0.1  # partial match (only a part of the surroundings was seen before): least mean likelihood
+        score = part_score if part else min_score
+        yield look_ups(query.points, window, levels)
+        work = 40_000  # blocks evaluated in one search below the coarsest level, at most
+        min_separation = 1.0  # distance at which places are different, m
+        peak = correlate(grid, query.points, guess, window, deviation, score, min_separation, work)
+        max_rival = 0.9  # a match is ambiguous if another place scores more than this share of it
+        if peak is None or peak.rival > max_rival * peak.score:
             return None
         yield VERIFIED
         fit = register(query, submap.cloud, peak.pose)
         ratio, _ = degeneracy(fit.information)
         moved = between(peak.pose, fit.pose)
-        if ratio < MIN_RATIO or math.hypot(moved[0], moved[1]) > MAX_CORRECTION:
+        # Least ratio of the eigenvalues of the position's information: below it is a corridor, where a fit proves
+        # nothing.
+        min_ratio = 0.02
+        max_correction = 0.3  # distance between the fine and the coarse fit at most, m
+        if ratio < min_ratio or math.hypot(moved[0], moved[1]) > max_correction:
             return None
         off = keyframes.poses[numbers, :2] - fit.pose[:2]
         near = numbers[np.argsort(np.hypot(off[:, 0], off[:, 1]), kind="stable")][:QUERY_KEYS]
         overlap = _overlap_in_view(keyframes, near, query, submap, fit.pose) if part else fit.overlap
-        if overlap < (PART_OVERLAP if part else least):
+        if overlap < (0.7 if part else least):  # partial match: share of the points in view of the place that must fit
             return None
         if _contradiction(keyframes, own, at, near, fit.pose) > (PART_CONTRADICTION if part else CONTRADICTION):
             return None
@@ -374,7 +331,8 @@ class LoopCloser:
         poses = optimise(before, edges)
         _, squares = residuals(poses, edges)
         holds = robust_weights(squares, edges.loop) > 0.5
-        if not holds[count:].all() or np.count_nonzero(held & ~holds[:count]) > MAX_STRAINED * count:
+        max_strained = 0.02  # share of the edges that may become outliers before a closure is removed
+        if not holds[count:].all() or np.count_nonzero(held & ~holds[:count]) > max_strained * count:
             keyframes.edges.keep(slice(count))
             self.refused += len(hits)
             return False
@@ -400,8 +358,10 @@ def _split_by_consistency(
         off = between(between(keyframes.poses[hit.origin], keyframes.poses[other.origin]), there)
         drifts = at_target[other.target] + at_origin[other.origin]
         place, turn = deviations(drifts + np.linalg.inv(hit.information) + np.linalg.inv(other.information))
-        if place <= MAX_DRIFT:
-            agrees = (off[0] ** 2 + off[1] ** 2) / place**2 + (off[2] / turn) ** 2 < CONSISTENT
+        if place <= 1.0:  # consistency is not tested where the drift between two matches is greater, m
+            # Squared Mahalanobis distance of agreeing hits (99 % of chi-square with three degrees of freedom).
+            consistent = 11.3
+            agrees = (off[0] ** 2 + off[1] ** 2) / place**2 + (off[2] / turn) ** 2 < consistent
             (agreeing if agrees else against).append(other)
     return agreeing, against
 
@@ -413,8 +373,10 @@ def consistent_group(keyframes: KeyframeMap, hits: list[LoopMatch]) -> list[Loop
     further away are not compared: both may be right, and the drift larger than its bound.
     """
     best: list[LoopMatch] = []
+    # Length of trajectory within which the drift is small, so that of two contradicting matches one is false, m.
+    stretch = 3.0
     for hit in hits:
-        near = [other for other in hits if _way(keyframes, [hit, other]) < STRETCH]
+        near = [other for other in hits if _way(keyframes, [hit, other]) < stretch]
         agreeing, against = _split_by_consistency(keyframes, hit, near)
         group = [hit, *agreeing]
         enough = len(group) >= len(against) + MIN_SUPPORT and _way(keyframes, group) >= BASELINE
@@ -441,7 +403,7 @@ def _contradiction(
 def _overlap_in_view(keyframes: KeyframeMap, near: NDArray[np.intp], query: Scan, submap: Submap, pose: Array) -> float:
     """Share of the points of ``query`` at ``pose`` that fit, of those that ``near`` would have seen; 0 if few."""
     seen = in_view([keyframes.frames[k].scan for k in near], keyframes.poses[near], transform(pose, query.points))
-    if np.count_nonzero(seen) < PART_POINTS:
+    if np.count_nonzero(seen) < 20:  # partial match: least number of points in view
         return 0.0
     return measure(query.chosen(seen), submap.cloud, pose).overlap
 
@@ -456,12 +418,15 @@ def crossings(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.
     """
     off = keyframes.poses[own, None, :2] - keyframes.poses[others, :2]
     far = np.hypot(off[..., 0], off[..., 1])
-    met = np.flatnonzero(far.min(axis=1, initial=np.inf) < CROSSED_REACH)[-CROSSED_KEYS:]
+    crossed_keys = 24  # newest keyframes of a submap that are compared with another submap
+    crossed_reach = 5.0  # distance of these at most, m
+    met = np.flatnonzero(far.min(axis=1, initial=np.inf) < crossed_reach)[-crossed_keys:]
     counts = np.zeros((len(met), 2))
     for row, k in enumerate(met.tolist()):
         yield CROSSED
-        near = others[far[k] < CROSSED_REACH]
-        near = near[np.linspace(0, len(near) - 1, min(len(near), CROSSED_NEAR)).astype(np.intp)]
+        near = others[far[k] < crossed_reach]
+        crossed_near = 12  # keyframes of the other submap that each is compared with, evenly chosen, at most
+        near = near[np.linspace(0, len(near) - 1, min(len(near), crossed_near)).astype(np.intp)]
         points, place = keyframes.frames[int(own[k])].scan.points, keyframes.poses[own[k]]
         view, votes = _view(points), np.zeros((len(points), 2), np.int64)
         for j in near.tolist():
@@ -479,20 +444,27 @@ def opposed(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.in
     """
     counts = yield from crossings(keyframes, own, others)
     through, judged = counts.sum(axis=0)
-    if through > JOIN_CONTRADICTION[0] * judged:
+    # Greatest contradiction of two submaps (share of the points in view of both that one looked through), as a whole
+    # and along a stretch: right joins of recordings had at most 0.05 and 0.15, wrong ones in six of seven drives
+    # through equal rooms 0.18 and more.
+    join_contradiction = (0.1, 0.18)
+    if through > join_contradiction[0] * judged:
         return True
-    if len(counts) < JOIN_STRETCH:
+    join_stretch = 6  # keyframes of a stretch
+    if len(counts) < join_stretch:
         return False
-    stretches = np.lib.stride_tricks.sliding_window_view(counts, JOIN_STRETCH, axis=0).sum(axis=-1)
-    return bool((stretches[:, 0] > JOIN_CONTRADICTION[1] * stretches[:, 1]).any())
+    stretches = np.lib.stride_tricks.sliding_window_view(counts, join_stretch, axis=0).sum(axis=-1)
+    return bool((stretches[:, 0] > join_contradiction[1] * stretches[:, 1]).any())
 
 
 def surroundings(keyframes: KeyframeMap, centre: int) -> tuple[NDArray[np.intp], Scan]:
     """Numbers of the keyframes around ``centre``, and their points merged in its frame."""
-    numbers = keyframes.around(centre, QUERY_KEYS, QUERY_REACH)
+    query_reach = 3.0  # their distance from the newest keyframe at most, m
+    numbers = keyframes.around(centre, QUERY_KEYS, query_reach)
     poses = between(keyframes.poses[centre], keyframes.poses[numbers])
     scan = merged([keyframes.frames[k].scan for k in numbers], poses)
-    return numbers, scan.downsampled(QUERY_CELL, QUERY_POINTS)
+    query_cell = 0.1  # about one of their points is used per square of this edge, m
+    return numbers, scan.downsampled(query_cell, 320)  # points of the query at most
 
 
 def _distance(keyframes: KeyframeMap, place: int) -> Array:
@@ -509,10 +481,6 @@ def _way(keyframes: KeyframeMap, hits: list[LoopMatch]) -> float:
 
 VIEW_SECTORS: Final = 180
 """Sectors of a scan's view all round."""
-VIEW_MARGIN: Final = 0.25
-"""Distance in front of what was seen behind a point from which on the point was looked through, m."""
-VIEW_SLACK: Final = 0.04
-"""Added to that, as a share of the range, for the error of the yaw."""
 
 
 def contradiction(one: list[Scan], poses: Array, others: list[Scan], other_poses: Array) -> float:
@@ -580,7 +548,9 @@ def _sight(view, x, y):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     """Of a point: 0 if it is not in view, 1 if it was seen, 2 if it is in view and was looked through."""
     limit = view[_sector(x, y)]
     r = math.hypot(x, y)
-    gap = VIEW_MARGIN + VIEW_SLACK * r
+    # Distance in front of what was seen behind a point from which on the point was looked through, m.
+    view_margin = 0.25
+    gap = view_margin + 0.04 * r  # added to that, as a share of the range, for the error of the yaw
     if limit <= 0 or r >= limit + gap:
         return 0
     return 2 if r < limit - gap else 1
@@ -613,13 +583,8 @@ def _mark_seen(view, points, seen):  # type: ignore[no-untyped-def] # noqa: ANN0
             seen[i] = True
 
 
-DESCRIPTOR_REACH: Final = 5.0
-"""Distance from the robot up to which points are in the descriptor, m."""
-DESCRIPTOR_BINS: Final = 20
-
-
 def describe(points: Array) -> Array:
-    """Histogram, shape (DESCRIPTOR_BINS,), of the distances between ``points`` (shape (n, 2), m, about the robot).
+    """Histogram, shape (20,), of the distances between ``points`` (shape (n, 2), m, about the robot).
 
     Its sum is 1, or 0 without two points.
     """
@@ -627,14 +592,16 @@ def describe(points: Array) -> Array:
 
 
 def likeness(one: Array, others: Array) -> Array:
-    """Histogram intersection, 0..1, of ``one`` (DESCRIPTOR_BINS,) with each of ``others`` (n, DESCRIPTOR_BINS)."""
+    """Histogram intersection, 0..1, of ``one``, shape (20,), with each of ``others``, shape (n, 20)."""
     return np.asarray(np.minimum(one, others).sum(axis=1))
 
 
 @njit(cache=True)
 def _distances(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    result = np.zeros(DESCRIPTOR_BINS)
-    limit = DESCRIPTOR_REACH * DESCRIPTOR_REACH
+    descriptor_bins = 20
+    result = np.zeros(descriptor_bins)
+    descriptor_reach = 5.0  # distance from the robot up to which points are in the descriptor, m
+    limit = descriptor_reach * descriptor_reach
     total = 0
     for i in range(points.shape[0]):
         if points[i, 0] ** 2 + points[i, 1] ** 2 > limit:
@@ -643,6 +610,6 @@ def _distances(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
             if points[j, 0] ** 2 + points[j, 1] ** 2 > limit:
                 continue
             d = np.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
-            result[min(int(d / (2 * DESCRIPTOR_REACH) * DESCRIPTOR_BINS), DESCRIPTOR_BINS - 1)] += 1.0
+            result[min(int(d / (2 * descriptor_reach) * descriptor_bins), descriptor_bins - 1)] += 1.0
             total += 1
     return result / max(total, 1)

@@ -27,12 +27,6 @@ RESOLUTION: Final = 0.05
 """Edge of a cell, m."""
 LONGEST: Final = 0.5
 """An element is drawn to this half length at most, m."""
-MARGIN: Final = math.ceil(LONGEST / RESOLUTION) + 5
-"""Cells round the outermost points."""
-SMEAR: Final = 0.08
-"""Standard deviation of the likelihood round a surface, m: cell size, noise and half a step of the search."""
-DOUBT: Final = 0.002
-"""Penalty of a squared standard deviation from the guess, as share of the score."""
 WORK: Final = 400_000
 """Blocks evaluated, unless the caller says otherwise."""
 PIECE: Final = 2e6
@@ -56,7 +50,8 @@ class LikelihoodGrid:
         without any motion.
         """
         points = cloud.points
-        pad = (1 << (levels - 1)) + MARGIN
+        margin = math.ceil(LONGEST / RESOLUTION) + 5  # cells round the outermost points
+        pad = (1 << (levels - 1)) + margin
         low = np.floor(points.min(axis=0) / RESOLUTION).astype(np.int64) - pad
         high = np.floor(points.max(axis=0) / RESOLUTION).astype(np.int64) + pad
         columns, rows = (high - low + 1).tolist()
@@ -132,7 +127,7 @@ def correlation(
         points: shape (n, 2), in the moving frame, m.
         guess: shape (3,); middle of the window.
         window: half width of the translation (m) and of the yaw (rad).
-        deviation: standard deviation of the guess (m, rad), which breaks ties (``DOUBT``).
+        deviation: standard deviation of the guess (m, rad), which breaks ties.
         least: poses scoring less are no result.
         rival: look for a rival, too.
         work: blocks evaluated before the search, and that for the rival, ends with what it has.
@@ -145,7 +140,8 @@ def correlation(
     turns = np.arange(-half, half + 1, dtype=np.float64) * step
     cells = math.ceil(window[0] / RESOLUTION)
     offsets = _rotated(points, guess, turns, grid.origin[0], grid.origin[1])
-    penalty = (DOUBT * (RESOLUTION / deviation[0]) ** 2, DOUBT / deviation[1] ** 2)
+    doubt = 0.002  # penalty of a squared standard deviation from the guess, as share of the score
+    penalty = (doubt * (RESOLUTION / deviation[0]) ** 2, doubt / deviation[1] ** 2)
     top = _top(len(grid.levels), cells)
     at_once = max(int(PIECE / (_per_axis(cells, top) ** 2 * len(points))), 1)
     parts = []
@@ -155,7 +151,8 @@ def correlation(
     blocks, bounds = (np.concatenate(rows) for rows in zip(*parts, strict=True))
     order = np.argsort(-bounds, kind="stable")
     place = grid.levels, offsets, turns, cells, *penalty, blocks[order], bounds[order]
-    best = yield from _searched(place, least, math.inf, NOWHERE, work)
+    nowhere = (10**9, 10.0**9, 10.0**9, -1.0, -1.0)
+    best = yield from _searched(place, least, math.inf, nowhere, work)
     if best.turn < 0:
         return None
     other = None
@@ -172,7 +169,6 @@ _Place = tuple[Pyramid, Blocks, Array, int, float, float, Blocks, Array]
 """Arguments of ``_search`` that say where to look."""
 _Zone = tuple[int, float, float, float, float]
 """Those that say where not to: turn, x and y of the middle, cells and turns round it."""
-NOWHERE: Final[_Zone] = (10**9, 10.0**9, 10.0**9, -1.0, -1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,12 +219,14 @@ def _dot(grid: Pyramid, px: float, py: float) -> None:
     cx, cy = int(px), int(py)
     # The exponential of a sum is a product: one factor per column and one per row.
     along = np.empty(2 * half + 1)
+    # Standard deviation of the likelihood round a surface, m: cell size, noise and half a step of the search.
+    smear = 0.08
     for k in range(2 * half + 1):
         dx = (cx - half + k + 0.5 - px) * RESOLUTION
-        along[k] = math.exp(-0.5 * dx * dx / (SMEAR * SMEAR))
+        along[k] = math.exp(-0.5 * dx * dx / (smear * smear))
     for gy in range(cy - half, cy + half + 1):
         dy = (gy + 0.5 - py) * RESOLUTION
-        across = 255 * math.exp(-0.5 * dy * dy / (SMEAR * SMEAR))
+        across = 255 * math.exp(-0.5 * dy * dy / (smear * smear))
         for k in range(2 * half + 1):
             value = np.uint8(across * along[k])
             grid[gy, cx - half + k] = max(grid[gy, cx - half + k], value)
@@ -415,10 +413,6 @@ def _sink(keys: Array, heap: Blocks, size: int) -> None:
     keys[at], heap[at] = bound, heap[size]
 
 
-MERGE_CELL: Final = 0.05
-"""Elements within a square of this edge that face the same way become one, m."""
-
-
 @dataclass
 class Submap:
     """A cloud and, when requested, its likelihood pyramids."""
@@ -451,8 +445,9 @@ def merged(scans: Sequence[Scan], poses: Array) -> Scan:
         variances.append(scan.variances)
         extents.append(scan.extents)
     every = np.concatenate(points), np.concatenate(normals), np.concatenate(variances), np.concatenate(extents)
+    merge_cell = 0.05  # elements within a square of this edge that face the same way become one, m
     # Cell and octant of the normal identify the piece of surface.
-    cells = np.floor(every[0] / MERGE_CELL).astype(np.int64)
+    cells = np.floor(every[0] / merge_cell).astype(np.int64)
     facing = np.floor(np.arctan2(every[1][:, 1], every[1][:, 0]) / (np.pi / 4) + 0.5).astype(np.int64) % 8
     lone = (every[2][:, 0] == every[2][:, 1]).astype(np.int64)
     cells -= cells.min(axis=0) if len(cells) else 0

@@ -28,36 +28,18 @@ from monstertruck_kinematics.se2 import Pose2, between, compose
 from monstertruck_runtime.clock import SECOND
 
 LEVELS: Final = 7
-QUERY_POINTS: Final = 100
-"""The time of a search is proportional to it; with 300 right places scored the same to 0.04 as with 160."""
 QUERY_KEYS: Final = 6
 """Keyframes that make the query: more would carry the drift of a search without odometry."""
-MIN_POINTS: Final = 30
-MIN_SCORE: Final = 0.6
 MIN_OVERLAP: Final = (0.85, 0.7)
 """Share of the query's points that must fit the place found, and a unique one: in a recording from an office right
 places had 0.92 and more, wrong ones 0.84 at most; at the edge of the map unique ones of 0.7 were right."""
 MAX_CONTRADICTION: Final = (0.15, 0.3)
 """Greatest share of beams that contradict the saved grid, likewise: of a recording in an office, right places had 0.08
 on the median, wrong ones 0.45; with beams of 30 m unique right ones of another had 0.27."""
-UNIQUE_RATIO: Final = 0.85
-"""A place is unique if the next best scores less than this share of it."""
-AMBIGUOUS_RATIO: Final = 0.97
-"""A place is ambiguous if another scores more than this share of it."""
-MIN_SEPARATION: Final = 1.0
-"""Distance at which places are different, m."""
-CONFIRM_TOLERANCE: Final = (0.3, 0.1)
-"""Two searches found the same place if they differ by less, m and rad."""
 BASELINE: Final = (0.8, 3.0)
 """Distance between two looks that makes a place certain, m: if both found it unique, and if not."""
 BROKEN: Final = frozenset({MappingEvent.APART, MappingEvent.PRUNED})
 """After these events keyframes of the local map are elsewhere, or have other numbers: it starts again."""
-SHARE: Final = 0.7
-"""Share of ``BUDGET`` that one scan spends on the search, 14 to 18 ms: the local map searches for loops as well."""
-WORK: Final = 3e6
-"""Blocks evaluated in a search, and in that for the rival, before it ends with what it has."""
-OUTSIDE_AFTER: Final = 10 * SECOND
-"""Time after which a robot that no search has found on the map is outside it, ns."""
 
 
 @dataclass
@@ -101,7 +83,7 @@ class GlobalLocaliser:
         self._fruitless = False
         """The last search found no place."""
         self.outside = False
-        """No search has found a place for ``OUTSIDE_AFTER``."""
+        """No search has found a place for 10 s."""
         submap.grid(LEVELS)  # takes longer than a scan may
         low, high = submap.cloud.points.min(axis=0), submap.cloud.points.max(axis=0)
         self._middle = np.array((*((low + high) / 2), 0.0))
@@ -132,7 +114,8 @@ class GlobalLocaliser:
             found = None
         if found is None:
             found = self._searched(stamp)
-        self.outside = self._fruitless and stamp - self._seen_on_map >= OUTSIDE_AFTER
+        outside_after = 10 * SECOND  # time after which a robot that no search has found on the map is outside it, ns
+        self.outside = self._fruitless and stamp - self._seen_on_map >= outside_after
         if found is None or step is None:
             return None
         return compose(found, between(self._mapper.map.poses[-1], step.pose))
@@ -173,7 +156,9 @@ class GlobalLocaliser:
             if not self._due:
                 return None
             self._due, self._running = False, PiecewiseSearch(self._search())
-        if not self._running.run(ScanBudget(SHARE * BUDGET)):
+        # Share of ``BUDGET`` that one scan spends on the search, 14 to 18 ms: the local map searches for loops as well.
+        share = 0.7
+        if not self._running.run(ScanBudget(share * BUDGET)):
             return None
         result, self._running = self._running.result, None
         self._fruitless = result is None
@@ -198,20 +183,27 @@ class GlobalLocaliser:
         numbers = self._surroundings(newest)
         query = self._merged(numbers, newest)
         kept = downsample_indices(query.points, 0.1)
-        if len(kept) > QUERY_POINTS:
-            kept = kept[np.linspace(0, len(kept) - 1, QUERY_POINTS).astype(np.intp)]
+        # The time of a search is proportional to it; with 300 right places scored the same to 0.04 as with 160.
+        query_points = 100
+        if len(kept) > query_points:
+            kept = kept[np.linspace(0, len(kept) - 1, query_points).astype(np.intp)]
         points = query.points[kept]
-        if len(points) < MIN_POINTS:
+        min_points = 30
+        if len(points) < min_points:
             return None
         anywhere = (1e6, 1e6)
         grid, window = self._submap.grid(LEVELS), (self._half, math.pi)
-        rivals = RivalSearch(MIN_SEPARATION, UNIQUE_RATIO, AMBIGUOUS_RATIO)
-        peak = yield from correlation(grid, points, self._middle, window, anywhere, MIN_SCORE, rivals, WORK)
+        unique_ratio = 0.85  # a place is unique if the next best scores less than this share of it
+        ambiguous_ratio = 0.97  # a place is ambiguous if another scores more than this share of it
+        rivals = RivalSearch(1.0, unique_ratio, ambiguous_ratio)  # distance at which places are different, m
+        min_score = 0.6
+        work = 3e6  # blocks evaluated in a search, and in that for the rival, before it ends with what it has
+        peak = yield from correlation(grid, points, self._middle, window, anywhere, min_score, rivals, work)
         if peak is None:
             return None
         yield VERIFIED
-        ambiguous = peak.rival > AMBIGUOUS_RATIO * peak.score
-        unique = max(peak.rival, peak.unseen) < UNIQUE_RATIO * peak.score
+        ambiguous = peak.rival > ambiguous_ratio * peak.score
+        unique = max(peak.rival, peak.unseen) < unique_ratio * peak.score
         fit = register(query, self._submap.cloud, peak.pose)
         if fit.overlap < MIN_OVERLAP[unique]:
             return None
@@ -276,4 +268,5 @@ class GlobalLocaliser:
 def _near(led: Array, pose: Array) -> bool:
     """Whether a pose found is of the place where a hypothesis led."""
     off = between(led, pose)
-    return math.hypot(off[0], off[1]) < CONFIRM_TOLERANCE[0] and abs(float(off[2])) < CONFIRM_TOLERANCE[1]
+    confirm_tolerance = (0.3, 0.1)  # two searches found the same place if they differ by less, m and rad
+    return math.hypot(off[0], off[1]) < confirm_tolerance[0] and abs(float(off[2])) < confirm_tolerance[1]

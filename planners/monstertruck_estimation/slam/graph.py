@@ -22,10 +22,6 @@ Index = NDArray[np.int64]
 
 SWITCH: Final = 12.0
 """Squared Mahalanobis residual up to which a loop edge counts in full."""
-DOUBT: Final = 4.0
-"""Factor by which that shrinks from step to step to where it is."""
-LEVER: Final = 4.0
-"""Distance at which an error of the yaw counts as one of the translation, m."""
 SETTLED: Final = 1e-4
 """Greatest change of a pose, m or rad, at which the optimisation ends."""
 
@@ -118,7 +114,8 @@ def optimise(poses: Array, edges: Edges, iterations: int = 30) -> Array:
         settled = np.abs(step).max() < SETTLED or cost - cost_now < 1e-6 * cost
         if settled and switch == SWITCH:
             break
-        switch = max(SWITCH, switch / DOUBT)
+        doubt = 4.0  # factor by which that shrinks from step to step to where it is
+        switch = max(SWITCH, switch / doubt)
         cost = _cost(squares, edges.loop, switch)
     return poses
 
@@ -222,7 +219,8 @@ def drift(poses: Array, edges: Edges, spread: Array, source: int) -> tuple[Array
         Covariances, shape (n, 3, 3), infinite where no path leads; and the paths' summed variance, m^2, shape (n,).
     """
     count = len(poses)
-    variance = spread[:, 0] + spread[:, 1] * LEVER**2
+    lever = 4.0  # distance at which an error of the yaw counts as one of the translation, m
+    variance = spread[:, 0] + spread[:, 1] * lever**2
     low, high = np.minimum(edges.origin, edges.target), np.maximum(edges.origin, edges.target)
     order = np.lexsort((variance, high, low))
     low, high = low[order], high[order]

@@ -29,8 +29,6 @@ SCALE: Final = 256.0
 """Steps of the stored log odds per unit."""
 NONE: Final = np.empty((0, 2))
 """No points."""
-_FRACTION_BITS: Final = 16
-"""Bits behind the point while a beam is followed."""
 
 
 class OccupancyGrid:
@@ -204,7 +202,8 @@ def trace(odds, marks, stride, ends, corner, mark, model, hits):  # type: ignore
         if marks[at] != mark:
             marks[at] = mark
             odds[at] = min(odds[at] + hit, limit)
-    half = 1 << (_FRACTION_BITS - 1)
+    fraction_bits = 16  # bits behind the point while a beam is followed
+    half = 1 << (fraction_bits - 1)
     for i in range(1, n):
         if i > 1 and ends[i, 0] == ends[i - 1, 0] and ends[i, 1] == ends[i - 1, 1]:
             continue
@@ -214,12 +213,12 @@ def trace(odds, marks, stride, ends, corner, mark, model, hits):  # type: ignore
             continue
         # One cell of the longer axis a step, the shorter one in fixed point: no branch but the mark's.
         if across:
-            step, side, slope = (1 if dx > 0 else -1), stride, (dy << _FRACTION_BITS) // along
+            step, side, slope = (1 if dx > 0 else -1), stride, (dy << fraction_bits) // along
         else:
-            step, side, slope = (stride if dy > 0 else -stride), 1, (dx << _FRACTION_BITS) // along
+            step, side, slope = (stride if dy > 0 else -stride), 1, (dx << fraction_bits) // along
         at, part = y0 * stride + x0, half
         for _ in range(along):
-            cell = at + (part >> _FRACTION_BITS) * side
+            cell = at + (part >> fraction_bits) * side
             if marks[cell] != mark:
                 marks[cell] = mark
                 odds[cell] = max(odds[cell] + miss, -limit)
@@ -243,7 +242,8 @@ def passed_ends(inputs: ScanInput, reach: float) -> Array:
 
     Of a level scan only: what a tilted beam passes is not at the height of the others.
     """
-    if inputs.slopes is not None and max(map(abs, inputs.slopes)) > LEVEL:
+    level = 0.02  # slope of the scanning plane up to which beams without a return say something: 0.1 m over 5 m
+    if inputs.slopes is not None and max(map(abs, inputs.slopes)) > level:
         return NONE
     beams = np.flatnonzero(np.isposinf(inputs.ranges))
     x, y, yaw = inputs.mount
@@ -251,15 +251,9 @@ def passed_ends(inputs: ScanInput, reach: float) -> Array:
     return np.column_stack((x + far * np.cos(angles), y + far * np.sin(angles)))
 
 
-LEVEL: Final = 0.02
-"""Slope of the scanning plane up to which beams without a return say something: 0.1 m over 5 m."""
 MILLIMETRES: Final = 1000.0
 PAGE_POINTS: Final = 1 << 16
 """Points of a page, 256 kB."""
-LONGEST_POINT: Final = 32.7
-"""Points are kept as 16-bit millimetres, m."""
-REDRAW_MOTION: Final = (0.5, 0.01)
-"""The grid is rebuilt when a pose moved by more than this (cells, rad)."""
 
 
 class PointPages:
@@ -332,7 +326,8 @@ class GridBuilder:
         """
         if not len(scan) or not self._due(stamp, pose):
             return False
-        near, far = (ends[np.abs(ends).max(axis=1) < LONGEST_POINT] for ends in (scan.points, passed))
+        longest_point = 32.7  # points are kept as 16-bit millimetres, m
+        near, far = (ends[np.abs(ends).max(axis=1) < longest_point] for ends in (scan.points, passed))
         self._stamps.append(stamp)
         self._poses.append(np.array(pose))
         self._points.append(np.round(np.vstack((near, far)) * MILLIMETRES).astype(np.int16))
@@ -354,8 +349,9 @@ class GridBuilder:
             return False
         now = interpolate(stamps.astype(np.float64), poses, np.array(self._stamps, np.float64))
         off = between(np.array(self._poses), now)
-        if (np.hypot(off[:, 0], off[:, 1]) < REDRAW_MOTION[0] * self._config.resolution).all() and (
-            np.abs(off[:, 2]) < REDRAW_MOTION[1]
+        redraw_motion = (0.5, 0.01)  # the grid is rebuilt when a pose moved by more than this (cells, rad)
+        if (np.hypot(off[:, 0], off[:, 1]) < redraw_motion[0] * self._config.resolution).all() and (
+            np.abs(off[:, 2]) < redraw_motion[1]
         ).all():
             return False
         self._poses = list(now)

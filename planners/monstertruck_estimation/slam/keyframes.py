@@ -221,14 +221,6 @@ class Trajectory:
 
 Numbers = NDArray[np.intp]
 
-RECENT: Final = 5
-"""Keyframes this few apart are neighbours in time: an edge between them is no loop closure."""
-LINK_OVERLAP: Final = 0.4
-LINK_PAIRS: Final = 20
-LINK_MAX_CORRECTION: Final = (0.15, 0.1)
-"""Greatest correction of an edge between keyframes that were matched to one submap, m and rad."""
-LINK_FLOOR: Final = (0.005, 0.005, 0.002)
-"""Least standard deviation of an edge between scans, m and rad."""
 LOOSENED: Final = 30.0
 """Factor on the standard deviation of an edge of odometry that the scans contradict."""
 VIEW: Final = 0.7
@@ -356,16 +348,22 @@ class KeyframeMap:
         guess = between(self.poses[origin], self.poses[target])
         fit = register(self.frames[target].scan, self.frames[origin].cloud, guess)
         off = between(guess, fit.pose)
-        far = math.hypot(off[0], off[1]) > LINK_MAX_CORRECTION[0] or abs(off[2]) > LINK_MAX_CORRECTION[1]
-        if far or fit.overlap < LINK_OVERLAP or fit.pairs < LINK_PAIRS:
+        # Greatest correction of an edge between keyframes that were matched to one submap, m and rad.
+        link_max_correction = (0.15, 0.1)
+        far = math.hypot(off[0], off[1]) > link_max_correction[0] or abs(off[2]) > link_max_correction[1]
+        link_overlap = 0.4
+        link_pairs = 20
+        if far or fit.overlap < link_overlap or fit.pairs < link_pairs:
             return False
         place = config.drift_distance[0] + config.drift_distance[1] * math.hypot(guess[0], guess[1])
         turn = config.drift_turn[0] + config.drift_turn[1] * abs(float(guess[2]))
         covariance: Array = np.asarray(np.linalg.inv(fit.information + np.eye(3)), dtype=np.float64)
         weakest, _ = deviations(covariance)
-        information = np.linalg.inv(covariance + np.diag(np.square(LINK_FLOOR)))
+        link_floor = (0.005, 0.005, 0.002)  # least standard deviation of an edge between scans, m and rad
+        information = np.linalg.inv(covariance + np.diag(np.square(link_floor)))
         spread = (place**2 + weakest**2, turn**2)
-        self.edges.add(origin, target, fit.pose, information, spread, loop=origin < target - RECENT)
+        recent = 5  # keyframes this few apart are neighbours in time: an edge between them is no loop closure
+        self.edges.add(origin, target, fit.pose, information, spread, loop=origin < target - recent)
         return True
 
     def drift(self, source: int) -> tuple[Array, Array]:
@@ -446,11 +444,6 @@ class KeyframeMap:
         return np.asarray(np.hypot(off[:, 0], off[:, 1]) + VIEW * np.abs(off[:, 2]))
 
 
-PRUNE_SPARED: Final = 60
-"""The newest keyframes are never removed."""
-"""Metres that one radian between two views counts as."""
-
-
 def redundancy(poses: Array, part: NDArray[np.int64]) -> Array:
     """Distance, m, from every pose to the most similar view of the same submap, shape (n,): small means redundant."""
     result = np.full(len(poses), np.inf)
@@ -493,7 +486,7 @@ def pruned(
     for node in np.argsort(redundancy(poses, part), kind="stable").tolist():
         if not allowance:
             break
-        if node == 0 or node >= count - PRUNE_SPARED or not touching[node]:
+        if node == 0 or node >= count - 60 or not touching[node]:  # the newest keyframes are never removed
             continue
         others = {int(edges.origin[k] + edges.target[k] - node) for k in touching[node]}
         if any(gone[other] for other in others):
@@ -570,20 +563,16 @@ REFINE_PARTNERS: Final = 12
 REFINE_REACH: Final = 4.5
 """Greatest distance of a partner, m; an angle of view counts as REFINE_TURN metres per radian."""
 REFINE_TURN: Final = 1.0
-REFINE_SPACING: Final = 1.0
-"""At most one keyframe per this length of the trajectory is a partner, besides the neighbours in time, m."""
-REFINE_STRETCH: Final = 4
-"""Keyframes within which a registered pair replaces the edge of a loop closure."""
 REFINE_OVERLAP: Final = 0.4
-REFINE_MAX_STEP: Final = 0.2
-"""A pair whose Gauss-Newton step is longer than this, m, is left out of this round."""
 
 
 def partners(poses: Array) -> NDArray[np.int64]:
     """Pairs (earlier, later), shape (n, 2): the two preceding, and the nearest of every stretch of the trajectory."""
     result: list[tuple[int, int]] = []
     steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
-    stretch = np.floor(np.cumsum(steps) / REFINE_SPACING).astype(np.int64)
+    # At most one keyframe per this length of the trajectory is a partner, besides the neighbours in time, m.
+    refine_spacing = 1.0
+    stretch = np.floor(np.cumsum(steps) / refine_spacing).astype(np.int64)
     for k in range(1, len(poses)):
         result += [(j, k) for j in range(max(k - REFINE_NEIGHBOURS, 0), k)]
         off = between(poses[k], poses[: max(k - REFINE_NEIGHBOURS, 0)])
@@ -595,14 +584,8 @@ def partners(poses: Array) -> NDArray[np.int64]:
     return np.array(result, dtype=np.int64).reshape(-1, 2)
 
 
-WITNESS_PAUSE: Final = 60.0
-"""Seconds between two views of a place that are used to check the joint registration."""
-WITNESS_SHARE: Final = 0.25
-"""The same as a share of a shorter run."""
 WITNESSES: Final = 1500
 """Pairs that are used to check it, at most, evenly chosen."""
-WITNESS_REACH: Final = 0.05
-"""Distance within which a point agrees with the other scan, m."""
 
 
 def witnesses(keys: list[Keyframe], poses: Array, part: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -611,7 +594,8 @@ def witnesses(keys: list[Keyframe], poses: Array, part: NDArray[np.int64]) -> ND
     The joint registration has no term of theirs, so that they can check it.
     """
     stamps = np.array([key.stamp for key in keys])
-    pause = min(WITNESS_PAUSE * SECOND, WITNESS_SHARE * float(stamps[-1] - stamps[0]))
+    witness_pause = 60.0  # seconds between two views of a place that are used to check the joint registration
+    pause = min(witness_pause * SECOND, 0.25 * float(stamps[-1] - stamps[0]))  # the same as a share of a shorter run
     used = {(i, j) for i, j in partners(poses).tolist()}
     result: list[tuple[int, int]] = []
     for k in range(1, len(poses)):
@@ -626,8 +610,9 @@ def witnesses(keys: list[Keyframe], poses: Array, part: NDArray[np.int64]) -> ND
 
 
 def agreement(keys: list[Keyframe], poses: Array, pairs: NDArray[np.int64]) -> float:
-    """Sum over ``pairs`` of the share of points that lie within ``WITNESS_REACH`` of the other scan's surfaces."""
-    return float(sum(_share(keys, poses, i, j, WITNESS_REACH) for i, j in pairs.tolist()))
+    """Sum over ``pairs`` of the share of points that lie within 5 cm of the other scan's surfaces."""
+    witness_reach = 0.05  # distance within which a point agrees with the other scan, m
+    return float(sum(_share(keys, poses, i, j, witness_reach) for i, j in pairs.tolist()))
 
 
 def _share(keys: list[Keyframe], poses: Array, i: int, j: int, reach: float = CELL) -> float:
@@ -663,7 +648,7 @@ def refine(keys: list[Keyframe], poses: Array, steady: Edges, loops: Edges, roun
 
 
 def _covered(loops: Edges, pair_edges: Edges) -> NDArray[np.bool_]:
-    """Which of ``loops`` have a registered pair within about ``REFINE_STRETCH`` keyframes of both ends."""
+    """Which of ``loops`` have a registered pair within about four keyframes of both ends."""
     known = np.unique(_stretches(pair_edges.origin, pair_edges.target, 0, 0))
     result = np.zeros(len(loops), bool)
     for i, j in itertools.product((-1, 0, 1), repeat=2):
@@ -673,7 +658,8 @@ def _covered(loops: Edges, pair_edges: Edges) -> NDArray[np.bool_]:
 
 def _stretches(origin: NDArray[np.int64], target: NDArray[np.int64], i: int, j: int) -> NDArray[np.int64]:
     """One number for the two stretches that an edge joins, shifted by ``i`` and ``j``."""
-    return np.asarray((origin // REFINE_STRETCH + i) * (1 << 32) + target // REFINE_STRETCH + j)
+    refine_stretch = 4  # keyframes within which a registered pair replaces the edge of a loop closure
+    return np.asarray((origin // refine_stretch + i) * (1 << 32) + target // refine_stretch + j)
 
 
 def _linearised(keys: list[Keyframe], poses: Array, pairs: NDArray[np.int64], reach: float) -> Edges:
@@ -685,7 +671,8 @@ def _linearised(keys: list[Keyframe], poses: Array, pairs: NDArray[np.int64], re
         if found < REFINE_OVERLAP * len(keys[j].scan):
             continue
         step = -np.linalg.solve(h + np.diag((1.0, 1.0, 1.0)), g)
-        if np.hypot(step[0], step[1]) > REFINE_MAX_STEP:
+        refine_max_step = 0.2  # a pair whose Gauss-Newton step is longer than this, m, is left out of this round
+        if np.hypot(step[0], step[1]) > refine_max_step:
             continue
         measured[k], information[k], kept[k] = places[k] + step, h, True
     measured[:, 2] = wrap(measured[:, 2])

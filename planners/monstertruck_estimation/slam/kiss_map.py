@@ -4,7 +4,6 @@ All points are kept: the package's own second downsampling leaves too few of a p
 """
 
 import math
-from typing import Final
 
 import numpy as np
 from kiss_icp.config import KISSConfig
@@ -12,16 +11,6 @@ from kiss_icp.mapping import VoxelHashMap
 from kiss_icp.registration import get_registration
 
 from monstertruck_kinematics.elementary import Array
-
-VOXEL: Final = 0.1
-"""Edge of the voxels of its map, m."""
-MAX_DISTANCE: Final = 100.0
-"""Points of the map farther away are forgotten by the package, m."""
-PER_VOXEL: Final = 20
-REACH: Final = 0.5
-"""Greatest distance of a pair, m."""
-KERNEL: Final = 0.1
-"""Distance at which a pair's influence drops, m."""
 
 
 class KissMap:
@@ -31,7 +20,10 @@ class KissMap:
         config = KISSConfig()
         config.registration.max_num_threads = 1
         self._registration = get_registration(config)
-        self._map = VoxelHashMap(VOXEL, MAX_DISTANCE, PER_VOXEL)
+        voxel = 0.1  # edge of the voxels of its map, m
+        max_distance = 100.0  # points of the map farther away are forgotten by the package, m
+        per_voxel = 20
+        self._map = VoxelHashMap(voxel, max_distance, per_voxel)
 
     def clear(self) -> None:
         """Forget all points."""
@@ -49,12 +41,13 @@ class KissMap:
         """Pose, (3,), of a scan; the guess where the map is empty. Not finite where the registration failed."""
         if self._map.empty():
             return guess
+        reach = 0.5  # greatest distance of a pair, m
         found = self._registration.align_points_to_map(
             points=_spatial(points),
             voxel_map=self._map,
             initial_guess=_matrix(guess),
-            max_correspondance_distance=REACH,
-            kernel=KERNEL,
+            max_correspondance_distance=reach,
+            kernel=0.1,  # distance at which a pair's influence drops, m
         )
         return np.array((found[0, 3], found[1, 3], math.atan2(found[1, 0], found[0, 0])))
 

@@ -18,10 +18,6 @@ from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import LocalisationStatus
 
-COMPARED: Final = 5 * SECOND
-"""Time over which motions are compared, ns."""
-MAX_DISAGREEMENT: Final = 0.2
-"""Difference of those that is reported, m."""
 JUMPS: Final = frozenset({"closed", "joined", "found", "refuted"})
 """Events after which the estimate's next motion does not follow its last pose."""
 COMPARABLE: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED})
@@ -49,12 +45,13 @@ class KissWitness:
             self._poses.clear()
             return None
         self._poses.append((estimate.stamp, pose, np.array(estimate.pose)))
-        while estimate.stamp - self._poses[0][0] > COMPARED:
+        compared = 5 * SECOND  # time over which motions are compared, ns
+        while estimate.stamp - self._poses[0][0] > compared:
             self._poses.popleft()
         _, by_kiss, by_estimate = self._poses[0]
         off = between(between(by_kiss, pose), between(by_estimate, np.array(estimate.pose)))
         distance = math.hypot(off[0], off[1])
-        if distance <= MAX_DISAGREEMENT:
+        if distance <= 0.2:  # difference of those that is reported, m
             return None
         self._poses.clear()
         return distance

@@ -39,25 +39,8 @@ FOUND_COVARIANCE: Final = np.diag(np.square((0.05, 0.05, 0.02)))
 """Covariance of a pose found by global localisation, m^2 and rad^2."""
 MATCH_COVARIANCE: Final = np.diag(np.square((0.02, 0.02, 0.01)))
 """Covariance of a match itself, m^2 and rad^2."""
-LOST_DEVIATION: Final = (1.0, 0.5)
-"""Standard deviation from which the robot is searched for on the whole map, m and rad."""
 MAX_CONTRADICTION: Final = 0.3
 """Greatest share of beams that contradict the saved grid of a match that counts: people and new furniture do, too."""
-MIN_MAPPED: Final = 0.65
-"""Least share of a scan's beams that end on mapped ground."""
-ALL_MAPPED: Final = 0.95
-"""Share of beams on mapped ground from which on all beams are matched."""
-PARTIAL_OVERLAP: Final = 0.8
-"""Least overlap of the beams on mapped ground where others do not end there, and of a match far from the motion."""
-PARTIAL_CONTRADICTION: Final = 0.15
-"""Greatest share of these beams that contradict the saved grid: few walls fit in many places."""
-FAR: Final = 3.0
-"""Standard deviations of the predicted pose from which a match is far from the motion."""
-CHECKED_WAY: Final = (3.0, 9.0)
-"""Distance after which the search that confirms a place found ends, and after which it ends without having done so,
-m."""
-SAME_PLACE: Final = (0.5, 0.2)
-"""Two poses are of the same place if they differ by less, m and rad."""
 
 Predicted = tuple[Array, Array, Array]
 """Pose by the predicted motion, shape (3,), and covariances, (3, 3): of the window of its match, and as published."""
@@ -212,7 +195,9 @@ class LocalisationEstimator:
         # New obstacles lower the overlap; only a pose of large covariance is searched for.
         self._misfits = 0 if good else self._misfits + 1
         self.counts["rejected"] += not match.accepted
-        if self._misfits >= 3 * LOST_AFTER or place > LOST_DEVIATION[0] or turn > LOST_DEVIATION[1]:
+        # Standard deviation from which the robot is searched for on the whole map, m and rad.
+        lost_deviation = (1.0, 0.5)
+        if self._misfits >= 3 * LOST_AFTER or place > lost_deviation[0] or turn > lost_deviation[1]:
             self._global, self._tracking = self._search_anew(), False
             self.counts["searches"] += 1
             return match, LocalisationStatus.SEARCHING
@@ -231,13 +216,17 @@ class LocalisationEstimator:
         sensor = np.array(mount[:2])
         mapped = self._evidence.judged(guess, scan.points, sensor)
         share = float(mapped.mean()) if len(mapped) else 0.0
-        if share < MIN_MAPPED:
+        if share < 0.65:  # least share of a scan's beams that end on mapped ground
             return rejected(guess, covariance, MatchStatus.EMPTY), False
-        whole = share >= ALL_MAPPED
+        whole = share >= 0.95  # share of beams on mapped ground from which on all beams are matched
         seen = scan if whole else scan.chosen(mapped)
         match = self._front.match(seen, delta, guess, covariance, self._submap)
         contradiction = self._evidence.judge(match.pose, seen.points, sensor).contradiction
-        clear = match.overlap >= PARTIAL_OVERLAP and contradiction <= PARTIAL_CONTRADICTION
+        # Least overlap of the beams on mapped ground where others do not end there, and of a match far from the motion.
+        partial_overlap = 0.8
+        # Greatest share of these beams that contradict the saved grid: few walls fit in many places.
+        partial_contradiction = 0.15
+        clear = match.overlap >= partial_overlap and contradiction <= partial_contradiction
         if _far(match.pose, guess, published):
             good = clear and whole and not match.degenerate
         else:
@@ -264,7 +253,10 @@ class LocalisationEstimator:
         assert self._global is not None
         self._checked += math.hypot(delta[0], delta[1])
         if (found is None or not _apart(pose, found)) and not self._global.outside:
-            if self._checked >= CHECKED_WAY[0 if found is not None else 1]:
+            # Distance after which the search that confirms a place found ends, and after which it ends without having
+            # done so, m.
+            checked_way = (3.0, 9.0)
+            if self._checked >= checked_way[0 if found is not None else 1]:
                 self._global = None
             return False
         self._global, self._tracking = self._search_anew(), False
@@ -285,7 +277,8 @@ def _far(pose: Array, guess: Array, covariance: Array) -> bool:
     """Whether ``pose`` is further from ``guess``, of ``covariance``, than its motion and a match can be."""
     off = _difference(pose, guess)
     distance = math.sqrt(float(off @ np.linalg.solve(covariance + MATCH_COVARIANCE, off)))
-    return distance > FAR or _apart(pose, guess)
+    far = 3.0  # standard deviations of the predicted pose from which a match is far from the motion
+    return distance > far or _apart(pose, guess)
 
 
 def _difference(pose: Array, other: Array) -> Array:
@@ -302,7 +295,8 @@ def _strayed(match: ScanMatch, guess: Array) -> bool:
 def _apart(one: Array, other: Array) -> bool:
     """Whether two poses are not of the same place."""
     off = between(one, other)
-    return math.hypot(off[0], off[1]) > SAME_PLACE[0] or abs(float(off[2])) > SAME_PLACE[1]
+    same_place = (0.5, 0.2)  # two poses are of the same place if they differ by less, m and rad
+    return math.hypot(off[0], off[1]) > same_place[0] or abs(float(off[2])) > same_place[1]
 
 
 def patch_of(saved: SavedMap) -> GridPatch:

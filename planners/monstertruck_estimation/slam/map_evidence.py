@@ -7,7 +7,7 @@ section 7.1).
 
 import math
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Self
 
 import numpy as np
 from numba import njit
@@ -17,11 +17,6 @@ from scipy.ndimage import distance_transform_edt
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import transform
 from monstertruck_runtime.map_files import FREE, OCCUPIED, WorldMap
-
-TOLERANCE: Final = 0.15
-"""Distance of a beam's end from a wall within which both agree, m."""
-SLACK: Final = 0.03
-"""Added to that per metre of range, for the error of the yaw."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +78,7 @@ class EvidenceGrid:
         return np.asarray(_judged(grid.cells, self._far, grid.resolution, np.array(grid.origin), sensor, ends))
 
 
-AGREEING: Final = 0
-AGAINST: Final = 1
-UNJUDGED: Final = 2
+AGREEING, AGAINST, UNJUDGED = range(3)
 
 
 @njit(cache=True)
@@ -96,7 +89,8 @@ def _judged(cells, far, resolution, origin, sensor, points):  # type: ignore[no-
     for i in range(points.shape[0]):
         dx, dy = (points[i, 0] - sensor[0]) / resolution, (points[i, 1] - sensor[1]) / resolution
         reach = math.hypot(dx, dy)
-        allowed = TOLERANCE + SLACK * reach * resolution
+        tolerance = 0.15  # distance of a beam's end from a wall within which both agree, m
+        allowed = tolerance + 0.03 * reach * resolution  # added to that per metre of range, for the error of the yaw
         crossed = False
         for k in range(int(2 * (reach - allowed / resolution))):
             share = k / (2 * reach)

@@ -45,8 +45,6 @@ from monstertruck_kinematics.se2 import Pose2, Twist2, between, compose, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
-DESKEW_PERIOD: Final = (0.02, 0.5)
-"""Time between two scans, s, in which their motion gives the velocity during a scan (for deskewing)."""
 UNKNOWN: Final = np.diag((100.0**2, 100.0**2, math.pi**2))
 """Covariance of the pose of a robot that is lost."""
 
@@ -146,7 +144,9 @@ class Mapper:
         dt = 0.0 if self._stamp is None else _evenly((stamp - self._stamp) / SECOND, period)
         self._loss.arrive(stamp)
         (delta, noise), match = self._best_match(scan, self._motion.predict(dt, odom))
-        if again is not None and match.accepted and DESKEW_PERIOD[0] <= dt <= DESKEW_PERIOD[1]:
+        # Time between two scans, s, in which their motion gives the velocity during a scan (for deskewing).
+        deskew_period = (0.02, 0.5)
+        if again is not None and match.accepted and deskew_period[0] <= dt <= deskew_period[1]:
             scan = again(velocity(between(self._pose, match.pose), dt))
             match = self._matched(scan, delta, noise)
         self._since_key = _moved(*self._since_key, delta, noise)

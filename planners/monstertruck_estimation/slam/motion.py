@@ -18,18 +18,6 @@ from monstertruck_schemas.health import OdometryUse
 
 NOISE_MEMORY: Final = 40
 """Scans over which the noise of odometry, and of the motion predicted without it, is estimated."""
-MAX_INNOVATION: Final = 4.0
-"""Limit to which normalised innovations are clamped."""
-NOISE_LIMITS: Final = (1.0, 3.0)
-"""Limits of the factors on the standard deviations of odometry."""
-CLEAR_MATCH: Final = (0.15, 0.75)
-"""Least degeneracy and overlap of a match that is compared with odometry."""
-FIT_NOISE: Final = (0.01, 0.005)
-"""Standard deviation of a match itself, m and rad."""
-OFF_NOISE: Final = 2.0
-"""Standard deviations of odometry that explain a difference from it."""
-MISSING_AFTER: Final = 1.0
-"""Seconds without finite odometry after which it is missing."""
 
 
 def velocity(delta: Array, dt: float) -> Twist2:
@@ -40,25 +28,13 @@ def velocity(delta: Array, dt: float) -> Twist2:
     return vx, vy, wz
 
 
-COMPARED: Final = (5.0, 2.0)
-"""Time (s) and motion (m or rad) over which odometry is compared with the scans."""
-SAMPLE: Final = (0.25, 0.1)
-"""Least length of a step of the comparison, s and motion: the noise of single matches would add up to a distance."""
 FEWEST_SAMPLES: Final = 2
 """Fewest steps of a comparison."""
-TOLERANCE: Final = 0.3
-"""Tolerated difference of odometry and scans as a share of the distance, or of the turn."""
 SLACK: Final = (0.1, 0.2)
-"""Tolerated difference for an offset of the clocks, and at most with ``CROSSED``, m and rad."""
-CROSSED: Final = 0.1
-"""Tolerated difference of the distance per radian, m, and of the turn per metre, rad: levers, unequal wheels."""
+"""Tolerated difference for an offset of the clocks, and its largest value with that of crossed motion, m and rad."""
 CONTRADICTIONS: Final = 2
 """Comparisons in a row that contradict odometry before it is dropped, by their last scans and by their first ones: one
 scan with a late stamp contradicts nothing, wherever it lies."""
-AGREEMENT: Final = 0.4
-"""Mean error of a step, as a share of the motion, below which odometry is used again."""
-AGREED: Final = (2.0, 2.0)
-"""Motion with that agreement after which odometry is used again, m and rad."""
 
 
 class OdometryCheck:
@@ -66,7 +42,7 @@ class OdometryCheck:
 
     The differences of their motions are summed over some seconds: clocks that disagree shift both a little and change
     no sum. A slow robot's are compared over as much motion as a fast one's: within seconds alone its error would not
-    exceed ``SLACK``. What was contradicted, ways or turns, must agree step by step over ``AGREED`` before odometry
+    exceed ``SLACK``. What was contradicted, ways or turns, must agree step by step over 2 m or 2 rad before odometry
     counts again: a turn of the wrong sign agrees as long as the robot drives straight. Where ways are contradicted,
     turns count on if they agree over all that was compared, and the reverse.
     """
@@ -103,7 +79,10 @@ class OdometryCheck:
         self._odom, self._scans = compose(self._odom, odom), compose(self._scans, moved)
         self._seen &= seen
         step = np.array((self._seconds, *self._odom, *self._scans, self._seen))
-        if self._seconds < SAMPLE[0] or _motion(step) < SAMPLE[1]:
+        # Least length of a step of the comparison, s and motion: the noise of single matches would add up to a
+        # distance.
+        sample = (0.25, 0.1)
+        if self._seconds < sample[0] or _motion(step) < sample[1]:
             return
         self._steps.append(step)
         while len(self._steps) >= FEWEST_SAMPLES + CONTRADICTIONS and self._long_enough_without_oldest():
@@ -118,7 +97,8 @@ class OdometryCheck:
 
     def _long_enough_without_oldest(self) -> bool:
         later = list(self._steps)[1:]
-        return sum(float(step[0]) for step in later) > COMPARED[0] and sum(map(_motion, later)) > COMPARED[1]
+        compared = (5.0, 2.0)  # time (s) and motion (m or rad) over which odometry is compared with the scans
+        return sum(float(step[0]) for step in later) > compared[0] and sum(map(_motion, later)) > compared[1]
 
     def _judge(self) -> None:
         """Compare over the last ``FEWEST_SAMPLES`` and more steps; drop odometry, or take it back."""
@@ -128,15 +108,18 @@ class OdometryCheck:
         lengths = np.stack((_lengths(rows[:, 1:4]), _lengths(rows[:, 4:7])))
         seen = np.stack((rows[:, 7], np.ones(len(rows))), axis=1)
         motion = np.cumsum(lengths, axis=1).max(axis=0)
-        slack = np.minimum(SLACK[0] + CROSSED * motion[:, ::-1], SLACK[1])
-        beyond = (off > TOLERANCE * motion + slack)[FEWEST_SAMPLES - 1 :]
+        # Tolerated difference of the distance per radian, m, and of the turn per metre, rad: levers, unequal wheels.
+        crossed = 0.1
+        slack = np.minimum(SLACK[0] + crossed * motion[:, ::-1], SLACK[1])
+        tolerance = 0.3  # tolerated difference of odometry and scans as a share of the distance, or of the turn
+        beyond = (off > tolerance * motion + slack)[FEWEST_SAMPLES - 1 :]
         wrong = sliding_window_view(beyond, CONTRADICTIONS, axis=0).all(axis=-1).any(axis=0)
         self._row = self._row + 1 if wrong.any() else 0
         if self._row >= CONTRADICTIONS:
             if not self.contradicted:
                 self.since = float(rows[:, 0].sum())
                 # Wheels that say nothing agree with nothing.
-                self._kept = off[-1] < TOLERANCE * (lengths * seen).sum(axis=1).min(axis=0)
+                self._kept = off[-1] < tolerance * (lengths * seen).sum(axis=1).min(axis=0)
             self._wrong |= wrong
             self._kept &= ~wrong
             self._agreed[wrong] = 0.0
@@ -144,7 +127,9 @@ class OdometryCheck:
             by_odometry, by_scans = lengths[:, 0]
             error = abs(by_odometry[0] - by_scans[0]), abs(rows[0, 3] - rows[0, 6])
             self._agreed += np.stack((np.maximum(by_odometry, by_scans), error), axis=1) * seen[0][:, None]
-            enough, good = self._agreed[:, 0] >= AGREED, self._agreed[:, 1] <= AGREEMENT * self._agreed[:, 0]
+            agreement = 0.4  # mean error of a step, as a share of the motion, below which odometry is used again
+            agreed = (2.0, 2.0)  # motion with that agreement after which odometry is used again, m and rad
+            enough, good = self._agreed[:, 0] >= agreed, self._agreed[:, 1] <= agreement * self._agreed[:, 0]
             self._agreed[enough & ~good] = 0.0
             self._wrong &= ~(enough & good)
             if not self._wrong.any():
@@ -162,15 +147,6 @@ def _motion(step: Array) -> float:
     return float(max(_lengths(step[1:4]).max(), _lengths(step[4:7]).max()))
 
 
-STEPS: Final = 3
-"""Motions of which the median is the one that lasts from scan to scan."""
-CLEARLY: Final = 0.25
-"""Share of the mean squared error of the prediction by velocity below which that from scan to scan is used: half as
-far off."""
-MAX_STRETCH: Final = 3.0
-"""Greatest factor by which a pause makes a motion longer than the last one."""
-
-
 class LastMotionPredictor:
     """Predicts the motion between two scans from the last ones, without odometry.
 
@@ -185,7 +161,8 @@ class LastMotionPredictor:
     def __init__(self, config: MapperConfig) -> None:
         self._config = config
         self._times: deque[float] = deque(maxlen=NOISE_MEMORY)
-        self._steps: deque[tuple[float, Array]] = deque(maxlen=STEPS)
+        steps = 3  # motions of which the median is the one that lasts from scan to scan
+        self._steps: deque[tuple[float, Array]] = deque(maxlen=steps)
         self._predictions = np.zeros((2, 3))
         """By the velocity, and from scan to scan."""
         self._errors = np.zeros(2)
@@ -197,9 +174,13 @@ class LastMotionPredictor:
         self._times.append(dt)
         if self._steps:
             before, last = self._steps[-1]
-            lasting = last * (min(dt / before, MAX_STRETCH) if before > 0 else 0.0)
+            max_stretch = 3.0  # greatest factor by which a pause makes a motion longer than the last one
+            lasting = last * (min(dt / before, max_stretch) if before > 0 else 0.0)
             self._predictions = np.stack((lasting, np.median([step for _, step in self._steps], axis=0)))
-        from_scan_to_scan = bool(self._errors[1] < CLEARLY * self._errors[0])
+        # Share of the mean squared error of the prediction by velocity below which that from scan to scan is used: half
+        # as far off.
+        clearly = 0.25
+        from_scan_to_scan = bool(self._errors[1] < clearly * self._errors[0])
         # Where stamps are no measure of the time, the usual time has passed at least.
         seconds = max(dt, sum(self._times) / len(self._times)) if from_scan_to_scan else dt
         place = self._config.odometry_floor[0] + self._config.blind_speed[0] * seconds
@@ -220,7 +201,8 @@ class LastMotionPredictor:
 
 def _is_clear(match: ScanMatch) -> bool:
     """Whether a match says what the motion was, without the prediction's help."""
-    return match.degeneracy >= CLEAR_MATCH[0] and match.overlap >= CLEAR_MATCH[1]
+    clear_match = (0.15, 0.75)  # least degeneracy and overlap of a match that is compared with odometry
+    return match.degeneracy >= clear_match[0] and match.overlap >= clear_match[1]
 
 
 class MotionPredictor:
@@ -250,7 +232,8 @@ class MotionPredictor:
     @property
     def factors(self) -> tuple[float, float]:
         """Factors on the standard deviations of distance and turn."""
-        place, turn = np.clip(np.sqrt(self._squares), *NOISE_LIMITS).tolist()
+        noise_limits = (1.0, 3.0)  # limits of the factors on the standard deviations of odometry
+        place, turn = np.clip(np.sqrt(self._squares), *noise_limits).tolist()
         return place, turn
 
     @property
@@ -258,7 +241,7 @@ class MotionPredictor:
         """Whether odometry predicts the motion."""
         if not self._given:
             return OdometryUse.NONE
-        if not self._seen or self._missing >= MISSING_AFTER:
+        if not self._seen or self._missing >= 1.0:  # seconds without finite odometry after which it is missing
             return OdometryUse.MISSING
         return OdometryUse.CONTRADICTED if self.check.contradicted else OdometryUse.USED
 
@@ -323,14 +306,15 @@ class MotionPredictor:
         """How far ``moved``, shape (3,), is from the motion by odometry, or as the last one, whichever is nearer.
 
         Returns:
-            m and rad beyond ``OFF_NOISE`` standard deviations of odometry; None where it is not in use.
+            m and rad beyond two standard deviations of odometry; None where it is not in use.
         """
         if self.use is not OdometryUse.USED or self._by_odometry is None:
             return None
         offs = (between(delta, moved) for delta in (self._by_motion[0], self._by_odometry[0]))
         x, y, turn = min(offs, key=lambda off: math.hypot(*off)).tolist()
         noise = deviations(self._by_odometry[1])
-        return max(math.hypot(x, y) - OFF_NOISE * noise[0], 0.0), max(abs(turn) - OFF_NOISE * noise[1], 0.0)
+        off_noise = 2.0  # standard deviations of odometry that explain a difference from it
+        return max(math.hypot(x, y) - off_noise * noise[0], 0.0), max(abs(turn) - off_noise * noise[1], 0.0)
 
     def learn(self, dt: float, delta: Array, noise: Array, moved: Array, match: ScanMatch) -> None:
         """Compare the prediction ``delta`` (covariance ``noise``) with ``moved``, the motion by the match."""
@@ -348,16 +332,16 @@ class MotionPredictor:
         if not _is_clear(match) or delta is not by_odometry:
             return
         off = between(delta, moved)
-        place = (off[0] ** 2 + off[1] ** 2) / 2 / (noise[0, 0] + FIT_NOISE[0] ** 2)
-        turn = off[2] ** 2 / (noise[2, 2] + FIT_NOISE[1] ** 2)
-        innovations = np.minimum((place, turn), MAX_INNOVATION**2) * np.square(self.factors)
+        fit_noise = (0.01, 0.005)  # standard deviation of a match itself, m and rad
+        place = (off[0] ** 2 + off[1] ** 2) / 2 / (noise[0, 0] + fit_noise[0] ** 2)
+        turn = off[2] ** 2 / (noise[2, 2] + fit_noise[1] ** 2)
+        max_innovation = 4.0  # limit to which normalised innovations are clamped
+        innovations = np.minimum((place, turn), max_innovation**2) * np.square(self.factors)
         self._squares += (innovations - self._squares) / NOISE_MEMORY
 
 
 UNCONSTRAINED: Final = np.diag((1e-4, 1e-4, 1e-2))
 """Added to every information: an unconstrained direction has a standard deviation of 100 m, or of 10 rad."""
-MATCH_FLOOR: Final = (0.002, 0.001)
-"""Least standard deviation of a match, m and rad."""
 OVERLAP_DROP: Final = 0.15
 """After a rejected match the overlap must return to the running mean less this."""
 OVERLAP_GAIN: Final = 0.05
@@ -404,8 +388,9 @@ class ScanOdometry:
         turn = np.eye(3)
         turn[:2, :2] = rotation(-match.pose[2])
         covariance = turn @ np.linalg.inv(constrained(match, match.information) + UNCONSTRAINED) @ turn.T
+        match_floor = (0.002, 0.001)  # least standard deviation of a match, m and rad
         covariance = (covariance + covariance.T) / 2 + np.diag(
-            np.square((MATCH_FLOOR[0], MATCH_FLOOR[0], MATCH_FLOOR[1]))
+            np.square((match_floor[0], match_floor[0], match_floor[1]))
         )
         x, y, yaw = between(origin, match.pose).tolist()
         return ScanIncrement(since, (x, y, yaw), tuple(covariance.ravel().tolist()))
@@ -427,22 +412,10 @@ def constrained(match: ScanMatch, information: Array) -> Array:
     return information - np.outer(weight, weight) / max(float(along @ weight), 1e-9)
 
 
-OFFSET_SCANS: Final = 300
-"""Scans compared."""
 OFFSET_LEAST_SCANS: Final = 120
 """Fewest scans."""
-OFFSET_PERIOD: Final = 40
-"""Scans between two estimates."""
-OFFSET_LAGS: Final = np.arange(-12, 13) * 0.05
-"""Offsets tried, s."""
-LEAST_OFFSET: Final = 0.09
-"""Smaller offsets are within the noise, s."""
 LEAST_EXCITATION: Final = 0.05
 """Least standard deviation of the yaw rate, rad/s."""
-LEAST_CORRELATION: Final = 0.8
-"""Least correlation at the offset."""
-CORRELATION_GAIN: Final = 0.08
-"""How much better it must be than at zero."""
 
 
 class ClockOffsetEstimator:
@@ -453,7 +426,7 @@ class ClockOffsetEstimator:
     """
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[int, float, float]] = deque(maxlen=OFFSET_SCANS)
+        self._samples: deque[tuple[int, float, float]] = deque(maxlen=300)  # scans compared
         self._seen = 0
         self.offset: float | None = None
         """Seconds by which odometry runs ahead of the scans; None = not known, or none."""
@@ -464,7 +437,8 @@ class ClockOffsetEstimator:
             return
         self._samples.append((stamp, matched, odom))
         self._seen += 1
-        if self._seen % OFFSET_PERIOD == 0 and len(self._samples) >= OFFSET_LEAST_SCANS:
+        offset_period = 40  # scans between two estimates
+        if self._seen % offset_period == 0 and len(self._samples) >= OFFSET_LEAST_SCANS:
             self.offset = find_offset(*(np.array(column) for column in zip(*self._samples, strict=True)))
 
 
@@ -478,21 +452,22 @@ def find_offset(stamps: Array, matched: Array, odom: Array) -> float | None:
     """
     times = (stamps - stamps[0]) / SECOND
     wheel, scan = np.unwrap(odom), np.unwrap(matched)
-    margin = float(OFFSET_LAGS[-1])
+    offset_lags = np.arange(-12, 13) * 0.05  # offsets tried, s
+    margin = float(offset_lags[-1])
     inside = (times[:-1] >= margin) & (times[1:] <= times[-1] - margin)
     steps = np.diff(times)[inside]
     turning = np.diff(scan)[inside] / steps if len(steps) else np.zeros(0)
     if len(turning) < OFFSET_LEAST_SCANS // 2 or turning.std() < LEAST_EXCITATION:
         return None
-    likeness = np.array([_correlation(turning, times, wheel, lag, inside) for lag in OFFSET_LAGS])
-    best, still = int(np.argmax(likeness)), likeness[np.argmin(np.abs(OFFSET_LAGS))]
+    likeness = np.array([_correlation(turning, times, wheel, lag, inside) for lag in offset_lags])
+    best, still = int(np.argmax(likeness)), likeness[np.argmin(np.abs(offset_lags))]
     if (
-        abs(OFFSET_LAGS[best]) < LEAST_OFFSET
-        or likeness[best] < LEAST_CORRELATION
-        or likeness[best] - still < CORRELATION_GAIN
+        abs(offset_lags[best]) < 0.09  # smaller offsets are within the noise, s
+        or likeness[best] < 0.8  # least correlation at the offset
+        or likeness[best] - still < 0.08  # how much better it must be than at zero
     ):
         return None
-    return -float(OFFSET_LAGS[best])
+    return -float(offset_lags[best])
 
 
 def _correlation(turning: Array, times: Array, wheel: Array, lag: float, inside: NDArray[np.bool_]) -> float:

@@ -23,15 +23,8 @@ CELL: Final = 0.3
 EDGE: Final = 0.03
 """A scan point that lies further along the surface from its map point than this and half the length that the map point
 stands for is beyond the edge of what is known, m: how the surface goes on there is not, and its pair must not count."""
-COARSE: Final = (1e-3, 5e-4)
-"""Pairs beyond the edge do count, for they lead to the place from far off, until a step is shorter, m and rad."""
-KERNEL: Final = 3.0
-"""Mahalanobis distance at which a pair's influence is a quarter."""
 CORRELATION: Final = 0.2
 """Factor on the information: errors of neighbouring beams are correlated."""
-
-TAILS: Final = 4.0
-"""Squared Mahalanobis distance at which the prior's weight is half: wheels slip further than their covariance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,8 +204,9 @@ def accumulate(
         ny = s * normals[i, 0] + c * normals[i, 1]
         x, y = rx + pose[0], ry + pose[1]
         j = _nearest(x, y, nx, ny, map_points, map_normals, starts, order, reach)
+        kernel = 3.0  # mahalanobis distance at which a pair's influence is a quarter
         if j < 0:
-            stats[2] += KERNEL * KERNEL
+            stats[2] += kernel * kernel
             continue
         mx, my = map_normals[j, 0], map_normals[j, 1]
         across, along = variances[i, 0], variances[i, 1]
@@ -225,7 +219,7 @@ def accumulate(
         ex, ey = x - map_points[j, 0], y - map_points[j, 1]
         vx, vy = ixx * ex + ixy * ey, ixy * ex + iyy * ey
         m = ex * vx + ey * vy
-        w = KERNEL * KERNEL / (KERNEL * KERNEL + m)
+        w = kernel * kernel / (kernel * kernel + m)
         stats[2] += w * m
         half = map_extents[j] if map_extents[j] > 0 else math.sqrt(3 * along_m)
         w = 0.0 if abs(ey * mx - ex * my) > edge + half else w * w
@@ -240,7 +234,7 @@ def accumulate(
         g[0] += w * vx
         g[1] += w * vy
         g[2] += w * (jx * vx + jy * vy)
-        if m < KERNEL * KERNEL:
+        if m < kernel * kernel:
             stats[0] += 1.0
             stats[1] += (ex * mx + ey * my) ** 2
     h[1, 0], h[2, 0], h[2, 1] = h[0, 1], h[0, 2], h[1, 2]
@@ -298,6 +292,8 @@ def _register(
     pose = start.copy()
     edge = reach if iterations > 0 else EDGE
     done = False
+    # Squared Mahalanobis distance at which the prior's weight is half: wheels slip further than their covariance.
+    tails = 4.0
     for remaining in range(iterations, -1, -1):
         h, g, stats = accumulate(
             pose, points, normals, variances, map_points, map_normals, map_variances, map_extents, starts, order, reach,
@@ -308,7 +304,7 @@ def _register(
         off = pose - guess
         off[2] = (off[2] + math.pi) % (2 * math.pi) - math.pi
         m = off @ prior @ off
-        w = TAILS / (TAILS + m)
+        w = tails / (tails + m)
         total = h + w * prior
         for k in range(3):
             total[k, k] += 1e-6 + 1e-9 * total[k, k]
@@ -316,10 +312,12 @@ def _register(
         pose = pose + step
         way, turn = math.hypot(step[0], step[1]), abs(step[2])
         done = edge == EDGE and way < 1e-4 and turn < 2e-5
-        if way < COARSE[0] and turn < COARSE[1]:
+        # Pairs beyond the edge do count, for they lead to the place from far off, until a step is shorter, m and rad.
+        coarse = (1e-3, 5e-4)
+        if way < coarse[0] and turn < coarse[1]:
             edge = EDGE
     off = pose - guess
     off[2] = (off[2] + math.pi) % (2 * math.pi) - math.pi
-    stats[2] += TAILS * math.log(1.0 + (off @ prior @ off) / TAILS)
+    stats[2] += tails * math.log(1.0 + (off @ prior @ off) / tails)
     pose[2] = (pose[2] + math.pi) % (2 * math.pi) - math.pi
     return pose, h, stats

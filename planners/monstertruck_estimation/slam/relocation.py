@@ -28,12 +28,6 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 
-LOST_AFTER: Final = 1.5
-"""Seconds of scans that do not fit after which the robot is lost."""
-LOST_SCANS: Final = 3
-"""Number of scans that do not fit after which the robot is lost."""
-GAP: Final = (5.0, 3.0)
-"""A longer pause, s, that is also so many times the usual one, is a gap: the robot may be elsewhere after it."""
 LOST_PATH: Final = 7.0
 """Distance by wheels that agree with sparse scans, as a multiple of that between keyframes, after which the robot is
 lost. Three scans so far apart, or a turn among people, may show the same crowd. By default it is 2.1 m, less than
@@ -88,16 +82,21 @@ class LossDetector:
 
     @property
     def lost(self) -> bool:
-        """Whether scans have not fitted for ``LOST_AFTER``."""
+        """Whether scans have not fitted for 1.5 s."""
         since = (self._stamp or 0) - self.fitted
         far = not self.sparse or self.after_gap or self._path >= LOST_PATH
-        return self._misfits >= LOST_SCANS and since >= LOST_AFTER * SECOND and far
+        lost_after = 1.5  # seconds of scans that do not fit after which the robot is lost
+        lost_scans = 3  # number of scans that do not fit after which the robot is lost
+        return self._misfits >= lost_scans and since >= lost_after * SECOND and far
 
     def arrive(self, stamp: int) -> None:
         """A scan of ``stamp``, ns, is there, and will be matched."""
         if self._stamp is not None:
             dt = (stamp - self._stamp) / SECOND
-            self.after_gap |= dt > max(GAP[0], GAP[1] * self._period)
+            # A longer pause, s, that is also so many times the usual one, is a gap: the robot may be elsewhere after
+            # it.
+            gap = (5.0, 3.0)
+            self.after_gap |= dt > max(gap[0], gap[1] * self._period)
             self._period += (dt - self._period) * (PERIOD_GAIN if self._period else 1.0)
         self._stamp = stamp
 
@@ -142,14 +141,6 @@ def prediction_is_certain(covariance: Array) -> bool:
     return place <= CERTAIN_PREDICTION[0] and turn <= CERTAIN_PREDICTION[1]
 
 
-LED: Final = 1.5
-"""Mahalanobis distance from the predicted pose up to which a match is where the wheels led.
-
-Half of the right matches are so near (chi-square of three degrees of freedom: 48 %), and of wrong ones, spread over the
-matcher's ``WINDOW`` of three standard deviations on each axis, one in fifteen (a ball in a cube).
-"""
-
-
 def led_there(match: ScanMatch, guess: Array, covariance: Array) -> bool:
     """Whether ``match`` is where wheels led over a gap: ``guess``, shape (3,), of ``covariance``, shape (3, 3).
 
@@ -157,7 +148,11 @@ def led_there(match: ScanMatch, guess: Array, covariance: Array) -> bool:
     """
     off = match.pose - guess
     off[2] = math.remainder(off[2], math.tau)
-    near = float(off @ np.linalg.solve(covariance, off)) <= LED**2
+    # Mahalanobis distance from the predicted pose up to which a match is where the wheels led. Half of the right
+    # matches are so near (chi-square of three degrees of freedom: 48 %), and of wrong ones, spread over the matcher's
+    # ``WINDOW`` of three standard deviations on each axis, one in fifteen (a ball in a cube).
+    led = 1.5
+    near = float(off @ np.linalg.solve(covariance, off)) <= led**2
     return near and deviations(covariance)[0] <= CERTAIN_PREDICTION[0]
 
 
@@ -178,10 +173,6 @@ def exceeds(off: tuple[float, float], limits: tuple[float, float]) -> bool:
     return off[0] > limits[0] or off[1] > limits[1]
 
 
-NEAR: Final = 6
-"""Keyframes that a scan is compared with."""
-
-
 def contradicts(keyframes: KeyframeMap, scan: Scan, pose: Array, most: float = CONTRADICTION) -> bool:
     """Whether ``scan`` at ``pose``, shape (3,), and the keyframes around it contradict each other.
 
@@ -191,7 +182,7 @@ def contradicts(keyframes: KeyframeMap, scan: Scan, pose: Array, most: float = C
     own = np.flatnonzero(keyframes.part == keyframes.part[-1])
     off = keyframes.poses[own, :2] - pose[:2]
     far = np.hypot(off[:, 0], off[:, 1])
-    order = np.argsort(far, kind="stable")[:NEAR]
+    order = np.argsort(far, kind="stable")[:6]  # keyframes that a scan is compared with
     near = own[order[far[order] <= keyframes.config.local_reach]]
     if not len(near):
         return False
@@ -199,38 +190,14 @@ def contradicts(keyframes: KeyframeMap, scan: Scan, pose: Array, most: float = C
     return contradiction([scan], pose[None], scans, keyframes.poses[near]) > most
 
 
-LEVELS: Final = 7
-"""Levels of the pyramid of the whole map."""
-PART_KEYS: Final = 300
-"""Keyframes of the map, or of a submap, searched in, at most."""
 POINTS: Final = 160
 """Points of the surroundings searched for, at most."""
 SLICE: Final = 2e6
 """Look-ups of the first level in one slice of the search."""
-WORK: Final = 15_000
-"""Blocks evaluated below the first level in one slice, at most."""
-FEWEST_SLICES: Final = 4
-"""Slices of a search, at least."""
-ANYWHERE: Final = (1e6, 1e6)
-"""Standard deviation of the predicted pose, m and rad: nothing is known of it."""
-MIN_SCORE: Final = 0.5
-"""Mean likelihood of a place found."""
 MAX_RIVAL: Final = 0.9
 """A place is ambiguous if another one scores more than this share of its score."""
 APART: Final = (1.0, 0.5)
 """Two places differ by more, m or rad."""
-RIVAL_TURN: Final = 0.1
-"""Half width of the search for a rival that looks the same way, rad."""
-CHECKS: Final = 10
-"""Keyframes verified at a place found, at most."""
-CHECK_SPACING: Final = 2
-"""Step between these keyframes."""
-MOST_FAILED: Final = 3
-"""Failed verifications after which a place is rejected."""
-FEWEST_KEYS: Final = 2
-"""Keyframes of a submap before it is searched for, or in."""
-LAST_KEYS: Final = 12
-"""Keyframes of every open submap searched for at the end of a run, at most."""
 
 
 CONFIRMING_WAY: Final = 10.0
@@ -326,34 +293,39 @@ class Relocation:
                 if found:
                     return JoinChange.JOINED
                 failed += found is None
-                if failed > MOST_FAILED:
+                if failed > 3:  # failed verifications after which a place is rejected
                     break
         return None
 
     def _place(self, keyframes: KeyframeMap, at: int, part: int) -> Pieces[Array | None]:
         """Where in submap ``part`` the surroundings of keyframe ``at`` are; None if nowhere, or at several places."""
         origin, submap = yield from self._submap(keyframes, part)
-        yield submap.grid_cost(LEVELS)
-        grid, cloud = submap.grid(LEVELS), submap.cloud
+        levels = 7  # levels of the pyramid of the whole map
+        yield submap.grid_cost(levels)
+        grid, cloud = submap.grid(levels), submap.cloud
         low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
         middle, half = (low + high) / 2, float((high - low).max() / 2) + 1.0
         _, query = surroundings(keyframes, at)
         points = query.points[np.linspace(0, len(query) - 1, min(len(query), POINTS)).astype(np.intp)]
-        slices = max(math.ceil(look_ups(points, (half, math.pi), LEVELS) / SLICE), FEWEST_SLICES)
+        fewest_slices = 4  # slices of a search, at least
+        slices = max(math.ceil(look_ups(points, (half, math.pi), levels) / SLICE), fewest_slices)
         peaks: list[Peak] = []
+        work = 15_000  # blocks evaluated below the first level in one slice, at most
+        anywhere = (1e6, 1e6)  # standard deviation of the predicted pose, m and rad: nothing is known of it
+        min_score = 0.5  # mean likelihood of a place found
         for k in range(slices):
-            yield SLICE + WORK * len(points)
+            yield SLICE + work * len(points)
             guess = np.array((*middle, (k + 0.5) * math.tau / slices))
-            least = max(MIN_SCORE, MAX_RIVAL * max((peak.score for peak in peaks), default=0.0))
-            peak = correlate(grid, points, guess, (half, math.pi / slices), ANYWHERE, least, work=WORK)
+            least = max(min_score, MAX_RIVAL * max((peak.score for peak in peaks), default=0.0))
+            peak = correlate(grid, points, guess, (half, math.pi / slices), anywhere, least, work=work)
             peaks += [] if peak is None else [peak]
         best = _unique(peaks)
         if best is None:
             return None
         # Once more round the best, for a place that looks alike from the same direction.
-        window = half, RIVAL_TURN
-        yield look_ups(points, window, LEVELS)
-        peak = correlate(grid, points, best, window, ANYWHERE, MIN_SCORE, APART[0], WORK)
+        window = half, 0.1  # half width of the search for a rival that looks the same way, rad
+        yield look_ups(points, window, levels)
+        peak = correlate(grid, points, best, window, anywhere, min_score, APART[0], work)
         if peak is None or peak.rival > MAX_RIVAL * peak.score:
             return None
         return compose(keyframes.poses[part], between(origin, peak.pose))
@@ -363,7 +335,8 @@ class Relocation:
         numbers = np.flatnonzero(keyframes.part == part)
         known = self._submaps.get(part)
         if known is None or known[0] != len(numbers):
-            kept = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), PART_KEYS)).astype(np.intp)]
+            part_keys = 300  # keyframes of the map, or of a submap, searched in, at most
+            kept = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), part_keys)).astype(np.intp)]
             yield ELEMENT * sum(len(keyframes.frames[k].scan) for k in kept)
             known = self._submaps[part] = len(numbers), keyframes.poses[part], keyframes.submap(kept)
         return known[1:]
@@ -379,16 +352,18 @@ def _way_along(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np
 def _others(keyframes: KeyframeMap, at: int) -> list[int]:
     """Submaps that the one of keyframe ``at`` may be joined to, the map first, then the newest."""
     parts, counts = np.unique(keyframes.part, return_counts=True)
-    if counts[parts == keyframes.part[at]] < FEWEST_KEYS:
+    fewest_keys = 2  # keyframes of a submap before it is searched for, or in
+    if counts[parts == keyframes.part[at]] < fewest_keys:
         return []
-    others = parts[(parts != keyframes.part[at]) & (counts >= FEWEST_KEYS)]
+    others = parts[(parts != keyframes.part[at]) & (counts >= fewest_keys)]
     return sorted(others.tolist(), key=lambda part: -part if part else -math.inf)
 
 
 def _samples(keyframes: KeyframeMap) -> list[int]:
     """Keyframes of every open submap, evenly chosen."""
     parts = [np.flatnonzero(keyframes.part == part) for part in np.unique(keyframes.part[~keyframes.joined()])]
-    chosen = [own[np.linspace(0, len(own) - 1, min(len(own), LAST_KEYS)).astype(np.intp)] for own in parts]
+    last_keys = 12  # keyframes of every open submap searched for at the end of a run, at most
+    chosen = [own[np.linspace(0, len(own) - 1, min(len(own), last_keys)).astype(np.intp)] for own in parts]
     return [int(k) for own in chosen for k in own]
 
 
@@ -404,8 +379,10 @@ def _checks(keyframes: KeyframeMap, at: int, part: int) -> tuple[list[int], int]
     near = few[np.hypot(off[..., 0], off[..., 1]).min(axis=1) < VIEW]
     there = keyframes.poses[few, :2] - keyframes.poses[at, :2]
     middle = few[np.argmin(np.hypot(there[:, 0], there[:, 1]))]
-    near = near[np.abs(near - middle) <= CHECKS * CHECK_SPACING]
-    near = near[np.argsort(np.abs(near - middle), kind="stable")][: CHECKS * CHECK_SPACING : CHECK_SPACING]
+    checks = 10  # keyframes verified at a place found, at most
+    check_spacing = 2  # step between these keyframes
+    near = near[np.abs(near - middle) <= checks * check_spacing]
+    near = near[np.argsort(np.abs(near - middle), kind="stable")][: checks * check_spacing : check_spacing]
     return near.tolist(), int(keyframes.part[many[0]])
 
 

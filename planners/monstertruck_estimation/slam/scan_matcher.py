@@ -17,35 +17,14 @@ MIN_PAIRS: Final = 12
 """Fewest corresponding pairs of an accepted match."""
 MIN_OVERLAP: Final = 0.35
 """Least share of a scan's points that fit the submap, of an accepted match."""
-MIN_SCORE: Final = 0.2
-"""Least mean likelihood of a result of the correlative search."""
 WINDOW: Final = 3.0
 """Half width of the correlative search in standard deviations of the predicted pose."""
-MARGIN: Final = 0.15
-"""Added to it, m: stamps of odometry and scans disagree."""
-MAX_WINDOW: Final = (2.0, 1.6)
-"""Greatest half width of the search, m and rad."""
 GATE: Final = 6.0
 """Gate: a match further from the predicted pose than this many standard deviations (Mahalanobis) is rejected."""
 GATE_LOW_OVERLAP: Final = 3.0
 """The gate for matches that overlap less than ``LOW_OVERLAP``."""
 LOW_OVERLAP: Final = 0.6
 """Matches that overlap less are compared with a result of the wide search."""
-WIDE_MIN_OVERLAP: Final = 0.5
-"""Least overlap of a result of the wide search,"""
-WIDE_OVERLAP_GAIN: Final = 0.15
-"""and how much more than the first match it must overlap."""
-WIDE_FACTOR: Final = 3.0
-"""Factor on the standard deviation of the predicted pose in the wide search."""
-SPACING: Final = 0.04
-"""The mean of a scan's points in a square of this edge, m, is matched: by beams, a person or robot beside the lidar
-would outweigh all walls."""
-COARSE_POINTS: Final = 160
-"""Points of a scan used in the correlative search."""
-LEVELS: Final = 4
-"""Levels of its likelihood pyramid."""
-DEGENERATE_RATIO: Final = 0.03
-"""A match is degenerate (a corridor) below this ratio of the eigenvalues of the information on the position."""
 
 
 class MatchStatus(StrEnum):
@@ -89,7 +68,9 @@ class ScanMatch:
     @property
     def degenerate(self) -> bool:
         """Whether the scan does not constrain the position along ``direction``."""
-        return self.degeneracy < DEGENERATE_RATIO
+        # A match is degenerate (a corridor) below this ratio of the eigenvalues of the information on the position.
+        degenerate_ratio = 0.03
+        return self.degeneracy < degenerate_ratio
 
 
 class ScanMatcher(Protocol):
@@ -110,31 +91,41 @@ class ScanMatcher(Protocol):
 class PlanarMatcher:
     """Correlation in a window given by the guess's covariance, then generalised ICP with the guess as prior.
 
-    Every piece of surface counts by its length, not by the beams that met it (``SPACING``).
-    A match that is rejected or overlaps little is repeated in a window ``WIDE_FACTOR`` times as wide, because wheels
-    slip further than their covariance; its result must overlap more (``WIDE_MIN_OVERLAP``).
+    Every piece of surface counts by its length, not by the beams that met it.
+    A match that is rejected or overlaps little is repeated in a window three times as wide, because wheels
+    slip further than their covariance; its result must overlap more.
     """
 
     def match(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
         """See ``ScanMatcher``."""
-        scan = scan.averaged(SPACING)
+        # The mean of a scan's points in a square of this edge, m, is matched: by beams, a person or robot beside the
+        # lidar would outweigh all walls.
+        spacing = 0.04
+        scan = scan.averaged(spacing)
         if len(scan) < MIN_PAIRS or len(submap.cloud) < MIN_PAIRS:
             return rejected(guess, covariance, MatchStatus.EMPTY)
         match = self._match_in_window(scan, guess, covariance, submap)
         if match.accepted and match.overlap >= LOW_OVERLAP:
             return match
-        least = match.overlap + WIDE_OVERLAP_GAIN if match.accepted else 0.0
-        again = self._match_in_window(scan, guess, covariance * WIDE_FACTOR**2, submap)
-        if again.accepted and again.overlap >= max(WIDE_MIN_OVERLAP, least):
+        wide_overlap_gain = 0.15  # and how much more than the first match it must overlap
+        least = match.overlap + wide_overlap_gain if match.accepted else 0.0
+        wide_factor = 3.0  # factor on the standard deviation of the predicted pose in the wide search
+        again = self._match_in_window(scan, guess, covariance * wide_factor**2, submap)
+        if again.accepted and again.overlap >= max(0.5, least):  # least overlap of a result of the wide search,
             return again
         return match
 
     def _match_in_window(self, scan: Scan, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
         deviation = deviations(covariance)
-        window = min(WINDOW * deviation[0] + MARGIN, MAX_WINDOW[0]), min(WINDOW * deviation[1], MAX_WINDOW[1])
+        margin = 0.15  # added to it, m: stamps of odometry and scans disagree
+        max_window = (2.0, 1.6)  # greatest half width of the search, m and rad
+        window = min(WINDOW * deviation[0] + margin, max_window[0]), min(WINDOW * deviation[1], max_window[1])
         prior: Array = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-        points = scan.points[np.linspace(0, len(scan) - 1, min(len(scan), COARSE_POINTS)).astype(np.intp)]
-        peak = correlate(submap.grid(LEVELS), points, guess, window, deviation, MIN_SCORE)
+        coarse_points = 160  # points of a scan used in the correlative search
+        points = scan.points[np.linspace(0, len(scan) - 1, min(len(scan), coarse_points)).astype(np.intp)]
+        min_score = 0.2  # least mean likelihood of a result of the correlative search
+        levels = 4  # levels of its likelihood pyramid
+        peak = correlate(submap.grid(levels), points, guess, window, deviation, min_score)
         fit = register(scan, submap.cloud, guess, prior)
         if peak is not None:
             other = register(scan, submap.cloud, guess, prior, start=peak.pose)

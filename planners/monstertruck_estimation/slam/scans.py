@@ -23,18 +23,10 @@ RELATIVE_NOISE: Final = 0.005
 """What is added per metre of range (beam width, URG-04LX: 1 % of the range as limits)."""
 REACH: Final = 0.2
 """Neighbours up to this far away along the surface make its normal, m; the next on either side does anyway."""
-GRAZING: Final = 0.12
-"""Neighbouring beams hit one surface if the line through their ends is steeper to the beam than this, rad."""
-SLANTED: Final = 3.0
-"""Two lone neighbours this many times as far apart as beams are lie on a wall seen at a slant."""
 SLIDE: Final = 5.0
 """Standard deviation along a line, m: unconstrained."""
-GOLDEN: Final = (math.sqrt(5.0) - 1.0) / 2.0
-"""Multiples of it, less their whole part, are an even mixture of early and late beams."""
 
 
-GROUND: Final = 0.05
-"""Beams that end this near to ground or ceiling hit those, m."""
 STEEPEST: Final = math.sin(math.radians(60))
 
 
@@ -167,9 +159,10 @@ def level_ranges(inputs: ScanInput) -> Array:
     if inputs.height is not None:
         with np.errstate(invalid="ignore"):
             ends = inputs.height + ranges * rise
-            hit = ends < GROUND
+            ground = 0.05  # beams that end this near to ground or ceiling hit those, m
+            hit = ends < ground
             if inputs.ceiling is not None:
-                hit |= ends > inputs.ceiling - GROUND
+                hit |= ends > inputs.ceiling - ground
         result[hit] = np.nan
     return result
 
@@ -225,7 +218,9 @@ def _joined(points, beams, reach, increment, a, b):  # type: ignore[no-untyped-d
         return False
     r = min(reach[a], reach[b])
     apart = math.hypot(points[a, 0] - points[b, 0], points[a, 1] - points[b, 1])
-    return apart < r * increment * gap / GRAZING + 3.0 * (RANGE_NOISE + RELATIVE_NOISE * r)
+    # Neighbouring beams hit one surface if the line through their ends is steeper to the beam than this, rad.
+    grazing = 0.12
+    return apart < r * increment * gap / grazing + 3.0 * (RANGE_NOISE + RELATIVE_NOISE * r)
 
 
 @njit(cache=True)
@@ -261,8 +256,9 @@ def _surface(points, origins, joined, reach, increment, i, normals, variances, e
     length = math.hypot(bx, by)
     if length < 1e-9:
         bx, by, length = 1.0, 0.0, 1.0
+    slanted = 3.0  # two lone neighbours this many times as far apart as beams are lie on a wall seen at a slant
     # Two points far apart are the thin end of a wall along the beam; two close together may be a leg of a chair.
-    if count >= 3 or (count == 2 and furthest > SLANTED * spacing):
+    if count >= 3 or (count == 2 and furthest > slanted * spacing):
         mx, my = sx / count, sy / count
         cxx, cxy, cyy = sxx / count - mx * mx, sxy / count - mx * my, syy / count - my * my
         middle, half = (cxx + cyy) / 2, math.hypot((cxx - cyy) / 2, cxy)
@@ -295,7 +291,9 @@ def downsample_indices(points: Array, cell: float) -> NDArray[np.intp]:
     Which one must not depend on its noise: the first in beam order would be the one that noise moved across the edge,
     and every wall would be rotated a little.
     """
-    order = np.argsort(np.arange(len(points)) * GOLDEN % 1.0, kind="stable")
+    # Multiples of it, less their whole part, are an even mixture of early and late beams.
+    golden = (math.sqrt(5.0) - 1.0) / 2.0
+    order = np.argsort(np.arange(len(points)) * golden % 1.0, kind="stable")
     _, first = np.unique(_cells(points[order], cell), return_index=True)
     return np.sort(order[first])
 

@@ -39,16 +39,8 @@ from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
 
 TARGET: Final = "monstertruck_estimation.slam.worker:SlamWorker"
-START_TIMEOUT: Final = 180.0
-"""Real seconds the worker may take to start: numba compiles at the first start."""
-HISTORY: Final = 128
-"""Poses of odometry kept: 2.5 s at 50 Hz."""
-STALE: Final = SECOND // 5
-"""Odometry older than the scan by more than this is not used, ns."""
 UNMATCHED: Final = SECOND
 """Time without a usable scan after which the pose is predicted by odometry alone and the lidar is no source, ns."""
-UNSCANNED: Final = 1.0
-"""Seconds to wait for a usable scan with which a requested map is saved; then it is saved without one."""
 CORRECTIONS: Final = {
     "closed": (Reason.LOOP_CLOSED, Severity.INFO, "closure {}"),
     "joined": (Reason.LOOP_CLOSED, Severity.INFO, "two submaps are joined"),
@@ -56,8 +48,6 @@ CORRECTIONS: Final = {
 }
 """Event text of a step that has corrected the map; {} is the number of closures."""
 MATCHED: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE})
-QUIET: Final = 30 * SECOND
-"""Least time between two events about scans that leave a direction undetermined, ns: in a corridor they alternate."""
 
 
 class SlamService:
@@ -104,7 +94,7 @@ class SlamService:
         self._scan, self._odometry, self._angles = scan, odometry, angles
         self._motions = motion
         self._pose, self._whole, self._tiles, self._health, self._events = pose, whole, tiles, health, events
-        self._history: deque[tuple[int, Pose2]] = deque(maxlen=HISTORY)
+        self._history: deque[tuple[int, Pose2]] = deque(maxlen=128)  # poses of odometry kept: 2.5 s at 50 Hz
         self._correction = SmoothedCorrection(config.slew, config.jump)
         self._newest: SlamEstimate | None = None
         self._latest: Odometry | None = None
@@ -160,13 +150,14 @@ class SlamService:
             DamagedFileError: the saved map cannot be read.
         """
         config = self._config
+        start_timeout = 180.0  # real seconds the worker may take to start: numba compiles at the first start
         worker = WorkerActor(
             self.name,
             TARGET,
             self._clock,
             latency=config.latency,
             deadline=config.deadline,
-            start_timeout=START_TIMEOUT,
+            start_timeout=start_timeout,
         )
         async with worker:
             await worker.start()
@@ -249,7 +240,9 @@ class SlamService:
         while True:
             await self._asked.wait()
             self._asked.clear()
-            await self._clock.sleep(UNSCANNED)
+            # Seconds to wait for a usable scan with which a requested map is saved; then it is saved without one.
+            unscanned = 1.0
+            await self._clock.sleep(unscanned)
             async with self._one_step:
                 if self._started and self._due["save"] == 0 and self._config.mode == "mapping":
                     self._due["save"] = self._clock.now() + round(self._config.save_period * SECOND)
@@ -294,7 +287,8 @@ class SlamService:
     def _motion(self, begin: int, end: int) -> tuple[Pose2 | None, Twist2]:
         """Base in odom at ``begin``, and the velocity until ``end``; both ns."""
         history = self._history
-        if not history or begin - history[-1][0] > STALE or begin < history[0][0]:
+        stale = SECOND // 5  # odometry older than the scan by more than this is not used, ns
+        if not history or begin - history[-1][0] > stale or begin < history[0][0]:
             return None, (0.0, 0.0, 0.0)
         first = max(bisect_left(history, begin, key=lambda row: row[0]) - 1, 0)
         rows = list(history)[first:]
@@ -393,7 +387,10 @@ class SlamService:
             return
         before, self._status = self._status, estimate.status
         said, now = self._degenerate_said, self._clock.now()
-        if estimate.status is LocalisationStatus.DEGENERATE and (said is None or now - said >= QUIET):
+        # Least time between two events about scans that leave a direction undetermined, ns: in a corridor they
+        # alternate.
+        quiet = 30 * SECOND
+        if estimate.status is LocalisationStatus.DEGENERATE and (said is None or now - said >= quiet):
             self._degenerate_said = now
             text = f"along {estimate.direction:.2f} rad in map"
             self._events(Reason.MATCH_DEGENERATE, Severity.WARNING, self.name, text)

@@ -234,28 +234,18 @@ def _require_extent(path: Path, points: Array, poses: Array) -> None:
         raise InputError(f"{path}: surfaces over {width:g} m x {height:g} m: expected at most {MOST_CELLS} cells")
 
 
-NORMAL_REACH: Final = 0.2
-"""Faces up to this far away make the normal, m; at least ``NORMAL_CELLS``."""
-NORMAL_CELLS: Final = 4.0
-"""Least reach in cells: the steps of an oblique wall must be averaged."""
-NORMAL_AGREEMENT: Final = 0.5
-"""Cosine between first guesses of normals that may belong to one side of one wall."""
-STRAIGHTNESS: Final = 0.1
-"""Faces lie on a line if they spread across it by less than this part of the variance along it."""
-WALL_NOISE: Final = 0.02
-"""Least standard deviation of a drawn wall, m."""
-
-
 def surface_elements(grid: WorldMap) -> Scan:
     """Surface elements in map of all walls next to free cells."""
     step = grid.resolution
     cells, towards = _faces(grid.cells)
     if not len(cells):
         return elements(np.zeros((0, 2)), normals=np.zeros((0, 2)), variances=np.zeros((0, 2)))
-    normals, straight, aside = _fitted(cells, towards, max(NORMAL_REACH / step, NORMAL_CELLS))
+    normal_reach = 0.2  # faces up to this far away make the normal, m
+    normal_cells = 4.0  # least reach in cells: the steps of an oblique wall must be averaged
+    normals, straight, aside = _fitted(cells, towards, max(normal_reach / step, normal_cells))
     # A free cell next to a wall is one cell from the middle of the wall's cells.
     points = (cells + aside - normals + 0.5) * step + np.array(grid.origin)
-    across = WALL_NOISE**2 + step**2 / 12
+    across = 0.02**2 + step**2 / 12  # least standard deviation of a drawn wall, m
     variances = np.stack((np.full(len(points), across), np.where(straight, SLIDE**2, across)), axis=-1)
     return elements(points, normals=normals, variances=variances, extents=np.where(straight, step / 2, 0.0))
 
@@ -289,7 +279,8 @@ def _fitted(cells: Array, towards: Array, reach: float) -> tuple[Array, NDArray[
     first, second = cKDTree(cells).query_pairs(reach, output_type="ndarray").T
     here = np.concatenate((first, second, np.arange(count)))
     there = np.concatenate((second, first, np.arange(count)))
-    same = (towards[here] * towards[there]).sum(axis=1) > NORMAL_AGREEMENT
+    normal_agreement = 0.5  # cosine between first guesses of normals that may belong to one side of one wall
+    same = (towards[here] * towards[there]).sum(axis=1) > normal_agreement
     here, there = here[same], there[same]
 
     def total(values: Array) -> Array:
@@ -302,7 +293,8 @@ def _fitted(cells: Array, towards: Array, reach: float) -> tuple[Array, NDArray[
     cyy = total(off[:, 1] ** 2) / near - my * my
     cxy = total(off[:, 0] * off[:, 1]) / near - mx * my
     middle, half = (cxx + cyy) / 2, np.hypot((cxx - cyy) / 2, cxy)
-    straight = (near >= 3) & (middle - half < STRAIGHTNESS * (middle + half))
+    straightness = 0.1  # faces lie on a line if they spread across it by less than this part of the variance along it
+    straight = (near >= 3) & (middle - half < straightness * (middle + half))
     angle = 0.5 * np.arctan2(2 * cxy, cxx - cyy)
     normals = np.stack((-np.sin(angle), np.cos(angle)), axis=-1)
     normals *= np.where((normals * towards).sum(axis=1) < 0, -1.0, 1.0)[:, None]

@@ -26,9 +26,6 @@ from monstertruck_schemas.health import OdometryUse
 if TYPE_CHECKING:
     from monstertruck_estimation.slam.kiss_witness import KissWitness
 
-MIN_POINTS = 3
-"""A scan with fewer points is left out."""
-
 
 class SlamWorker:
     """Holds the map; building it compiles all numba functions."""
@@ -62,7 +59,7 @@ class SlamWorker:
                 wrong = estimator.odometry is OdometryUse.CONTRADICTED
                 swept = replace(inputs.scan, twist=estimator.twist) if wrong else inputs.scan
                 scan = prepare_input(swept, self._longest, estimator.twist)
-                if len(scan) < MIN_POINTS:
+                if len(scan) < 3:  # a scan with fewer points is left out
                     left_out, refused = (
                         ScanLeftOut.EMPTY,
                         f"only {len(scan)} of {len(inputs.scan.ranges)} beams have a return",

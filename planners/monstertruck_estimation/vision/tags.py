@@ -113,8 +113,6 @@ class TagReader:
         ]
 
 
-SHARP_PART: Final = (0.12, 0.88)
-"""Part of an edge that is looked at: its ends are rounded by blur."""
 ACROSS: Final = np.linspace(-2.5, 2.5, 21)
 """Pixels from an edge, over which its step is looked for."""
 
@@ -129,7 +127,8 @@ def along_edges(picture: Picture, corners: Array) -> Array:
         length = float(np.hypot(*(end - start)))
         along = (end - start) / length
         across = np.array((along[1], -along[0]))
-        points = start + np.linspace(*SHARP_PART, max(8, int(length)))[:, None] * length * along
+        sharp_part = (0.12, 0.88)  # part of an edge that is looked at: its ends are rounded by blur
+        points = start + np.linspace(*sharp_part, max(8, int(length)))[:, None] * length * along
         samples = (points[:, None] + ACROSS[:, None] * across).astype(np.float32)
         values = np.asarray(cv2.remap(picture, samples, None, cv2.INTER_LINEAR), dtype=np.float64)
         steps = np.abs(np.diff(values, axis=1))

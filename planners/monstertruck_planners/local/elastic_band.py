@@ -295,10 +295,6 @@ def _relax(
     return count, True
 
 
-BUBBLE_SPACING = 0.2
-"""Largest distance of bubbles, m."""
-
-
 @dataclass(frozen=True)
 class BandResult:
     """A band after relaxation."""
@@ -338,7 +334,7 @@ def band_parameters(config: BandConfig, cover: CoveringDiscs) -> BandParameters:
     return BandParameters(
         config.overlap, config.internal_gain, config.external_gain, config.iterations, config.depth,
         config.overshoot, config.significant, config.tiny, config.largest,
-        1.0, 0.5 * cover.reach, BUBBLE_SPACING, False,
+        1.0, 0.5 * cover.reach, 0.2, False,  # largest distance of bubbles, m
     )  # fmt: skip
 
 

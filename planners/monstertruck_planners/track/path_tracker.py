@@ -212,10 +212,6 @@ class Command:
     """DRIVING, GOAL_REACHED, GOAL_MISSED, CUSP_MISSED, PATH_LOST, NOT_FINITE, or of the service STUCK."""
 
 
-LEAST_CURVATURE: Final = 1e-6
-"""Curvatures (1/m) and turns (rad) are taken to be no smaller."""
-
-
 class SpeedProfile:
     """Speed from which every curve ahead is reached at what its curvature allows, and at which the axles keep up.
 
@@ -226,8 +222,9 @@ class SpeedProfile:
 
     def __init__(self, config: TrackerConfig, reference: Reference) -> None:
         s = reference.places
-        allowed = config.lateral_acceleration / np.maximum(np.abs(reference.at(s).curvature), LEAST_CURVATURE)
-        change = np.maximum(reference.axle_change(config.steering_distance), LEAST_CURVATURE)
+        least_curvature = 1e-6  # curvatures (1/m) and turns (rad) are taken to be no smaller
+        allowed = config.lateral_acceleration / np.maximum(np.abs(reference.at(s).curvature), least_curvature)
+        change = np.maximum(reference.axle_change(config.steering_distance), least_curvature)
         turning = config.steering_distance * config.steering_rate / change
         gained = 2 * config.deceleration * s
         least = np.minimum.accumulate((np.minimum(allowed, turning**2) + gained)[::-1])[::-1]

@@ -200,14 +200,11 @@ class ResponseEstimator:
         return ResponseEstimate(response, total_deviation, dead_time_deviation, self._samples)
 
 
-LAG_STEP: Final = 0.05
-"""Estimated lags are rounded to multiples of this, s: every lag needs gains of its own."""
-
-
 def rounded(estimate: ResponseEstimate) -> Response:
-    """The estimated delay: dead time alone until it shows how it is divided; the lag is a multiple of ``LAG_STEP``."""
+    """The estimated delay: dead time alone until it shows how it is divided; the lag is a multiple of 0.05 s."""
     found = estimate.response
-    lag = LAG_STEP * round(found.lag / LAG_STEP) if estimate.shape_deviation < LAG_STEP / 2 else 0.0
+    lag_step = 0.05  # estimated lags are rounded to multiples of this, s: every lag needs gains of its own
+    lag = lag_step * round(found.lag / lag_step) if estimate.shape_deviation < lag_step / 2 else 0.0
     return Response(max(found.total - lag, 0.0), lag)
 
 

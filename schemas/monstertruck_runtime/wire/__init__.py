@@ -20,8 +20,6 @@ from monstertruck_schemas.topics import Topic
 
 M = TypeVar("M", bound=Message)
 
-WIRE_VERSION: Final = 1
-"""Version of every schema; counts changes that are not plain growth."""
 
 _BYTE: Final = re.compile("[\udc80-\udcff]")
 """What Python reads for a byte that it cannot decode (PEP 383)."""
@@ -91,7 +89,8 @@ def decode(topic: Topic[M], data: bytes) -> M:
 def encoding(topic: Topic[Any]) -> str:
     """Zenoh encoding: media type, schema name and version."""
     media = "application/json" if topic.foxglove is None else "application/protobuf"
-    return f"{media};{topic.schema_name};v={WIRE_VERSION}"
+    wire_version = 1  # version of every schema; counts changes that are not plain growth
+    return f"{media};{topic.schema_name};v={wire_version}"
 
 
 @cache

@@ -9,7 +9,6 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Final
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.event import Event, Severity
@@ -21,8 +20,6 @@ from monstertruckd.tools.logs.report.states import StateTrack, Tone, merged_span
 
 WIDTH, HEIGHT = 1000.0, 100.0
 """View box of every plot."""
-
-_TIME_STEPS: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +62,8 @@ def round_step(about: float) -> float:
 
 def time_ticks(seconds: float) -> list[float]:
     """Round instants of a run of ``seconds``."""
-    step = next((s for s in _TIME_STEPS if seconds / s <= 9), 86400.0)  # ticks of the time axis at most
+    time_steps = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400)
+    step = next((s for s in time_steps if seconds / s <= 9), 86400.0)  # ticks of the time axis at most
     return [n * step for n in range(math.floor(seconds / step) + 1)]
 
 

@@ -25,8 +25,6 @@ DIAGONAL: Final = math.radians(45)
 """Angle between the side sonar and the diagonal one."""
 FOLLOWING: Final = ("follow", "free")
 """Phases in which a lap may begin: the robot drives along the wall."""
-GAP_EDGE: Final = 0.1
-"""Distance behind the edge of a gap over which the side sonar may measure the gap's own side wall, m."""
 
 Phase = Literal["approach", "follow", "turn_away", "free", "turn_back", "stop"]
 
@@ -300,9 +298,11 @@ class WallPd(_Wall):
         # look into a gap, m
         jump = 0.06, 0.15
         niche = side is None and bool(before) and before[-1].side - ranges.side > jump[1]
+        # Distance behind the edge of a gap over which the side sonar may measure the gap's own side wall, m.
+        gap_edge = 0.1
         if before and ranges.side - min(sample.side for sample in before) > jump[0]:
             side = now if side is None else side
-        elif side is not None and ranges.side < self._config.seen and now - side > GAP_EDGE:
+        elif side is not None and ranges.side < self._config.seen and now - side > gap_edge:
             side = None
         known = before[-1].diagonal if before else ranges.side / math.cos(DIAGONAL)
         if ranges.diagonal - known > jump[1]:
