@@ -1,4 +1,4 @@
-"""Configuration reference: one page for each section of the file, made from the models that check it."""
+"""Configuration reference, generated from the models that validate it: one page per section."""
 
 from collections.abc import Iterator
 
@@ -7,22 +7,22 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from pages.markdown import Page, join
 from pages.models import Definitions, Json, label, plain
 
-DRIVER = "And `driver`: the settings of the device's kind, on the device's page."
+DRIVER = "The settings under `driver` are on the page of the device kind."
 DRIVERS = {kind.settings_class().__name__: kind for kind in DEVICES.values()}
 
 
 def pages() -> list[Page]:
-    """The whole file, then each section that has keys of its own."""
+    """Return the overview and a page per section."""
     models = Definitions(SimulatedTruckConfig)
     sections = {name: field for name, field in models.root["properties"].items() if any(models.models_in(field))}
     places = {model: f"{name}.md" for name, field in sections.items() for model in models.models_in(field)}
     text = join(
         "# Configuration",
-        "One YAML file for each robot or experiment. `include: FILE` at its top merges it over another one, relative "
-        "to itself. Keys that are not listed here are refused, with file, line and a suggestion; `monstertruckd config "
-        "show FILE` prints what comes out, with the origin of every value. Defaults are those of the author's truck.",
+        "A robot or experiment is one YAML file. `include: FILE` merges it over another file, relative "
+        "to its own folder. Unknown keys are refused with file, line and a suggestion. `monstertruckd config "
+        "show FILE` prints the result with the origin of each value. The defaults describe the thesis author's truck.",
         models.fields(models.root, places.get),
-        "`sim` is for simulated trucks only.",
+        "Only simulated trucks have `sim`.",
     )
     first = Page("configuration/index.md", "The file", text)
     return [first, *(_section(models, name, field) for name, field in sections.items())]
@@ -56,7 +56,7 @@ def _section(models: Definitions, key: str, field: Json) -> Page:
 
 
 def _walk(models: Definitions, key: str, field: Json) -> Iterator[tuple[str, str]]:
-    """Headings and models, each model once, from the outside in; drivers have pages of their own."""
+    """Yield headings and models, outermost first and each once; drivers have separate pages."""
     waiting, seen = [(key, field)], set()
     while waiting:
         at, schema = waiting.pop(0)
@@ -72,7 +72,7 @@ def _walk(models: Definitions, key: str, field: Json) -> Iterator[tuple[str, str
 
 
 def _one_of_all(name: str) -> str:
-    """Devices differ by their drivers only: one stands for all."""
+    """Map all device models to one: they differ only in their drivers."""
     return "Device" if name.startswith("Device_") else name
 
 

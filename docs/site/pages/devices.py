@@ -1,4 +1,4 @@
-"""One page for each kind of device: from the catalog, the settings, and what driver and emulator say of themselves."""
+"""Device reference: a page per kind, from the catalog, the settings and the docstrings of driver and emulator."""
 
 import re
 import sys
@@ -17,18 +17,18 @@ from pages.topics import anchor
 CONFIG = Path(__file__).resolve().parents[3] / "configs" / "truck.yaml"
 
 LINE_FAULTS = """\
-And of the cable: `unplug`, `plug`, `power-cycle`,
+Faults of the cable: `unplug`, `plug`, `power-cycle`,
 `line stalled|deaf|delay|chunk|flip_rate|drop_rate|lose_rate|double_rate|garbage VALUE`.
-And of every signal, that is each value the device reports and each command it obeys: `signal NAME FAULT [VALUE]`,
+Faults of a signal (a reported value or a received command): `signal NAME FAULT [VALUE]`,
 `signal NAME off`; `signal help` lists both.
 [`emulate`](../commands/emulate.md) and [`simulate`](../commands/simulate.md) take faults on standard input."""
 
 
 def pages(sections: dict[str, str]) -> list[Page]:
-    """A page for each kind.
+    """Return a page per kind.
 
     Args:
-        sections: heading of ``devices.md`` by role, in lower case.
+        sections: Heading in ``devices.md`` by role, in lower case.
     """
     return [_page(kind, sections.get(kind.role.name)) for kind in DEVICES.values()]
 
@@ -39,12 +39,14 @@ def _page(kind: DeviceKind, habits: str | None) -> Page:
     models = Definitions(kind.settings_class())
     text = join(
         f"# {kind.doc}",
-        f"How the daemon drives `{kind.name}`, what its settings are, and which faults its emulator knows.",
+        f"Driver, settings and emulated faults of `{kind.name}`.",
         _facts(kind),
-        f"What its emulator does as the device does, test by test: [table](../devices.md#{habits})." if habits else "",
+        f"Tests that compare the emulator with the device's documented behaviour: [table](../devices.md#{habits})."
+        if habits
+        else "",
         "## Driver",
         prose(driver.__doc__),
-        "Its session ends, and is tried again by the restart policy, with:",
+        "These errors end a session; the restart policy starts the next:",
         table(("error", "when"), [(f"`{name}`", when) for name, when in raised(driver.run.__doc__)]),
         "## Settings",
         _example(kind),
@@ -86,7 +88,7 @@ def _topics(ends: Mapping[str, Topic[Any]]) -> str:
 
 
 def _example(kind: DeviceKind) -> str:
-    """What the author's truck says of it."""
+    """Return the section of the thesis author's truck as an example."""
     group, role = _group(kind), kind.role.name
     said = load_tree(CONFIG).data.get(group, {}).get(role)
     if said is None:
@@ -121,10 +123,10 @@ def _without_faults(docstring: str | None) -> str:
 
 
 def _faults(emulator: Any) -> str:
-    """What an emulator, or its ``inject``, says of its faults.
+    """Return the faults listed in the docstring of an emulator or of its ``inject``.
 
     Raises:
-        ValueError: neither does.
+        ValueError: Neither docstring lists them.
     """
     in_class = FAULTS.search(prose(emulator.__doc__))
     if in_class is not None:

@@ -9,18 +9,18 @@ from pydantic import BaseModel
 from pages.markdown import table
 
 HUGE = 2**53
-"""Limits beyond this only say that a number is one of 64 bits."""
+"""Larger limits only state the 64-bit range and are not shown."""
 
 Json = dict[str, Any]
 Link = Callable[[str], str | None]
-"""Where the model of a definition is described; None = nowhere."""
+"""Link to the description of a model, or None."""
 
 
 class Definitions:
-    """The JSON Schema of a model, with all models in it.
+    """JSON Schema of a model and of all models that it contains.
 
     Args:
-        model: the root.
+        model: Root model.
     """
 
     def __init__(self, model: type[BaseModel]) -> None:
@@ -31,7 +31,7 @@ class Definitions:
         return self._models[name]
 
     def models_in(self, schema: Json) -> Iterator[str]:
-        """Names of the models a value may be, enums left out."""
+        """Yield the names of the models that a value may have, without enums."""
         if "$ref" in schema:
             name = schema["$ref"].rpartition("/")[2]
             if "properties" in self._models[name]:
@@ -43,7 +43,7 @@ class Definitions:
                 yield from self.models_in(schema[key])
 
     def fields(self, schema: Json, link: Link, leave_out: frozenset[str] = frozenset()) -> str:
-        """Table of a model's fields."""
+        """Return the table of a model's fields."""
         required = schema.get("required", ())
         shown = [item for item in schema.get("properties", {}).items() if item[0] not in leave_out]
         rows = [
@@ -58,20 +58,20 @@ class Definitions:
         return table(("field", "type", "default", "meaning"), rows)
 
     def common(self, names: list[str]) -> frozenset[str]:
-        """Fields that all these models have alike."""
+        """Return the fields that are identical in all these models."""
         first, *others = (self._models[name]["properties"] for name in names)
         alike = (name for name, field in first.items() if all(other.get(name) == field for other in others))
         return frozenset(alike) if others else frozenset()
 
     def meaning(self, field: Json) -> str:
-        """What a field is for; where it says nothing, the first sentence about the one model it holds."""
+        """Return a field's description, or the first paragraph of the one model that it holds."""
         if "description" in field:
             return plain(field["description"])
         names = list(self.models_in(field))
         return plain(self._models[names[0]].get("description", "")).partition("\n\n")[0] if len(names) == 1 else ""
 
     def kind(self, schema: Json, link: Link) -> str:
-        """What a value may be."""
+        """Return the type of a value."""
         if "$ref" in schema:
             name = schema["$ref"].rpartition("/")[2]
             model = self._models[name]
@@ -108,10 +108,10 @@ class Definitions:
                 return "any"
 
     def default(self, field: Json) -> str:
-        """Default of a field; of a model, what differs from the model's own defaults."""
+        """Return the default of a field; for a model, only the values that differ from the model's defaults."""
         value = field.get("default")
         if "const" in field:
-            return "may be left out"
+            return "optional"
         if not isinstance(value, dict):
             return f"`{json.dumps(value)}`"
         names = list(self.models_in(field))
@@ -123,7 +123,7 @@ class Definitions:
 
 
 def label(model: Json, name: str) -> str:
-    """Short name of a model: its kind if it has one."""
+    """Return the kind of a model, else its title."""
     if name.startswith("Device_"):
         return "device"
     kind = model.get("properties", {}).get("kind", {}).get("const")
@@ -131,7 +131,7 @@ def label(model: Json, name: str) -> str:
 
 
 def plain(text: str) -> str:
-    """A docstring as Markdown."""
+    """Return a docstring as Markdown."""
     return text.replace("``", "`").strip()
 
 

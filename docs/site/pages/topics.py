@@ -1,4 +1,4 @@
-"""Topic reference: one page for each group, made from the topic table."""
+"""Topic reference, generated from the topic table: one page per group."""
 
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import TOPICS, Topic, topics_of
@@ -6,20 +6,20 @@ from pages.markdown import Page, join, prose, table
 from pages.models import Definitions, label, plain
 
 GROUPS = {
-    "sensor": "What the devices measured.",
-    "state": "What is known of the truck: pose, map, frames, the gate.",
-    "plan": "What planners want.",
-    "cmd": "What the gate sends to the actuators.",
-    "health": "How the daemon, its services and the computer are.",
-    "event": "What happened, and why.",
-    "req": "What stations ask for: the only keys that lead into the robot.",
-    "stand": "What a test stand sees of the robot from outside; nothing in the robot reads it.",
+    "sensor": "Sensor measurements.",
+    "state": "State of the robot: pose, map, frames, gate.",
+    "plan": "Output of the planners.",
+    "cmd": "Commands from the gate to the actuators.",
+    "health": "Health of the daemon, its services and the computer.",
+    "event": "Events and their causes.",
+    "req": "Requests from stations: the only keys that the robot receives.",
+    "stand": "Measurements of a test stand; the robot records them and uses none.",
 }
 HEADER = frozenset(Message.model_fields)
 
 
 def pages() -> list[Page]:
-    """Overview, then a page for each group."""
+    """Return the overview and a page per group."""
     groups = dict.fromkeys(topic.group for topic in TOPICS)
     return [_overview(), *(_group(group) for group in groups)]
 
@@ -39,14 +39,14 @@ def _overview() -> Page:
     header = Definitions(Message)
     text = join(
         "# Topics",
-        "Every key is `mt/<robot>/<name>`, a name is `<group>/<topic>`. This is the table that bus, recorder, health "
-        "and access rules are derived from; `monstertruckd topics` prints it too. How to read and write them from "
-        "outside: [Zenoh](../zenoh.md).",
-        table(("name", "Hz", "stale after s", "writer", "kept", "what"), rows),
-        "Hz is the nominal rate, empty for what is published on change. A message older than *stale after* counts no "
-        "more. *Logged* topics go to the log, *retained* ones reach late joiners at once.",
+        "A key is `mt/<robot>/<name>`; a name is `<group>/<topic>`. Bus, recorder, health "
+        "and access rules are derived from this table, and `monstertruckd topics` prints it. To use the topics in your "
+        "own program, see [Zenoh](../zenoh.md).",
+        table(("name", "Hz", "stale after s", "writer", "kept", "meaning"), rows),
+        "Hz is the nominal rate, empty for topics published on change. A message older than *stale after* is "
+        "invalid. *Logged* topics go to the log; *retained* topics reach late joiners at once.",
         "## Header",
-        "Every message begins with these fields.",
+        "Every message starts with these fields.",
         header.fields(header.root, lambda _: None),
     )
     return Page("topics/index.md", "All topics", text)
@@ -58,7 +58,7 @@ def _group(group: str) -> Page:
     for topic in topics_of(group):
         parts += [f"## {topic.name} {{ #{anchor(topic)} }}", f"{topic.doc}.", _facts(topic)]
         same = shown.setdefault(topic.model, topic)
-        parts += [f"Fields as of [{same.name}](#{anchor(same)})."] if same is not topic else _fields(topic)
+        parts += [f"Same fields as [{same.name}](#{anchor(same)})."] if same is not topic else _fields(topic)
     return Page(f"topics/{group}.md", group, join(*parts))
 
 
@@ -67,10 +67,10 @@ def _facts(topic: Topic[Message]) -> str:
     rows = [
         ("key", f"`{topic.key('<robot>')}`"),
         ("message", f"`{topic.model.__module__}.{topic.model.__name__}`"),
-        ("on the wire", form),
+        ("encoding", form),
         ("rate", f"{_hertz(topic)} Hz" if topic.rate else "on change"),
         ("stale after", f"{_seconds(topic)} s" if topic.stale_after else "never"),
-        ("written by", topic.writer.value),
+        ("writer", topic.writer.value),
         ("kept", _kept(topic) or "no"),
     ]
     return table(("", " "), rows)
@@ -99,7 +99,7 @@ def _fields(topic: Topic[Message]) -> list[str]:
 
 
 def anchor(topic: Topic[Message]) -> str:
-    """Where a topic is on the page of its group."""
+    """Return the anchor of a topic on its group's page."""
     return topic.name.replace("/", "-").replace("_", "-")
 
 
