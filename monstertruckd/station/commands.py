@@ -9,8 +9,8 @@ from monstertruck_schemas.base import first_mistake
 from monstertruck_schemas.req import UNCONDITIONAL, BehaviourOrder, ExploreOrder, GoalOrder, MissionOrder, Order, Role
 from monstertruck_schemas.roles import AccessRole
 
-LONGEST_MESSAGE: Final = 16_384
-"""Size of a message; a longer one ends the connection."""
+LONGEST_MESSAGE: Final = 262_144
+"""Bytes of a command at most: the file of a raceline of some kilometres."""
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Place = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
@@ -130,6 +130,17 @@ class Track(Asked):
     points: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=2, max_length=400)]
 
 
+class TrackFile(Asked):
+    """Follow the path of a file, in the frame map."""
+
+    do: Literal["track_file"]
+    name: Annotated[str, Field(max_length=128)]
+    """Of the file; its suffix says whether it is a table or YAML."""
+    text: Annotated[str, Field(max_length=LONGEST_MESSAGE)]
+    closed: bool = False
+    """The path is a lap."""
+
+
 class StartPath(Asked):
     """Drive the configured path."""
 
@@ -213,6 +224,7 @@ AnyCommand = (
     | Explore
     | DoMission
     | Track
+    | TrackFile
     | StartPath
     | AskToDrive
     | HandOver

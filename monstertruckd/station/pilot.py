@@ -10,6 +10,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
+from pathlib import Path as FilePath
 from typing import Any, Final
 
 import numpy as np
@@ -23,6 +24,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.drives import named, send_path
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.path_files import has_waypoints, mission_from, path_from
 from monstertruck_runtime.threads import in_thread
 from monstertruck_schemas.base import first_mistake
 from monstertruck_schemas.mission import Mission
@@ -50,6 +52,7 @@ from monstertruckd.station.commands import (
     SetGoal,
     StartPath,
     Track,
+    TrackFile,
 )
 from monstertruckd.station.viewer import Viewer
 
@@ -204,7 +207,10 @@ def _call(client: TruckClient, command: Asked, clock: Clock) -> Coroutine[Any, A
         case DoMission():
             return _mission(client, command)
         case Track():
-            return _track(client, command, clock)
+            return _track(client, lambda: drawn_path(command.points), clock)
+        case TrackFile():
+            file = FilePath(FilePath(command.name).name)
+            return _track(client, lambda: path_from(command.text, file, closed=command.closed, frame="map"), clock)
         case StartPath():
             return client.start_path(command.path)
         case _:
@@ -232,10 +238,10 @@ def _other_call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]
             raise AssertionError(command)
 
 
-async def _track(client: TruckClient, command: Track, clock: Clock) -> None:
-    path = named(drawn_path(command.points), clock)
+async def _track(client: TruckClient, make: Callable[[], Path], clock: Clock) -> None:
+    path = await in_thread(make)
     with client.subscribe(PATH, latest()) as present:
-        await send_path(client, clock, path, present)
+        await send_path(client, clock, named(path, clock), present)
 
 
 async def _mission(client: TruckClient, command: DoMission) -> dict[str, Any]:
@@ -246,11 +252,13 @@ async def _mission(client: TruckClient, command: DoMission) -> dict[str, Any]:
 
 
 def read_mission(text: str) -> Mission:
-    """The mission of a file's text.
+    """Return the mission in a file's text, or one that drives to each of its waypoints.
 
     Raises:
         InputError: it is none, or has aliases, of which a few lines can mean gigabytes; names the first mistake.
     """
+    if has_waypoints(text):
+        return mission_from(text, FilePath("mission.yaml"))
     try:
         if any(isinstance(event, AliasEvent) for event in YAML(typ="safe", pure=True).parse(text)):
             raise InputError("mission: has an alias (*name): expected every value written out")

@@ -19,7 +19,15 @@ def read_table(file: Path, expected: str, most: int) -> list[tuple[int, list[str
     Raises:
         InputError: it cannot be read, is too long, is not UTF-8, or is no table; names the line where there is one.
     """
-    text = text_of(file, expected, most)
+    return rows_of(text_of(file, expected, most), file, expected)
+
+
+def rows_of(text: str, file: Path, expected: str) -> list[tuple[int, list[str]]]:
+    """Return the rows of a table's text; see ``read_table``.
+
+    Raises:
+        InputError: it is no table; names the line.
+    """
     rows = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if _counts(line)]
     delimiter = max(DELIMITERS, key=rows[0][1].count) if rows else DELIMITERS[0]
     found = []

@@ -34,6 +34,9 @@ class Path(Message):
     clearance: Float64Array = Field(default_factory=lambda: np.zeros(0))
     """Shape (n,): distance from the footprint to the nearest obstacle at each pose, m, as far as it was looked for;
     empty = not known."""
+    speeds: Float64Array = Field(default_factory=lambda: np.zeros(0))
+    """Shape (n,): greatest speed at each pose, m/s, zero or more; empty = the tracker's. The tracker's speed and the
+    limits of curves, ground and obstacles hold as well."""
     closed: bool = False
     """A closed path is a lap: it ends where it began."""
     halts: bool = False

@@ -30,6 +30,8 @@ export class Work {
     byId("explore-start").onclick = () => this.begin("task.explore", { do: "explore", order: "start" });
     byId("explore-stop").onclick = () => this.ask("task.explore", { do: "explore", order: "stop" });
     byId("path-start").onclick = () => this.begin("task.path", { do: "start_path", path: this.link.newest.facts.path });
+    byId("path-open").onclick = () => byId("path-file").click();
+    byId("path-file").onchange = () => this.startPath();
     byId("mission-start").onclick = () => byId("mission-file").click();
     byId("mission-file").onchange = () => this.startMission();
     byId("mission-resume").onclick = () => this.resumeMission();
@@ -82,8 +84,10 @@ export class Work {
     byId("explore-stop").hidden = !exploring || observer;
     text("explore-state", exploring ? words("task.explore.state", { frontiers: explore.frontiers, known: number(explore.known, 0), metres: number(explore.travelled, 0) })
       : explore?.number ? explore.text || reason(explore.outcome) : words("task.none"));
-    byId("task-path").hidden = !facts?.path;
-    byId("path-start").hidden = observer;
+    byId("task-path").hidden = !facts?.tracks;
+    byId("path-note").hidden = !facts?.path;
+    byId("path-start").hidden = !facts?.path || observer;
+    byId("path-open").hidden = byId("path-lap").hidden = observer;
     text("path-start", words("task.path.start", { name: facts?.path ?? "" }));
     byId("task-mission").hidden = !facts?.goals;
     byId("mission-start").hidden = mission?.running || observer;
@@ -106,7 +110,14 @@ export class Work {
     }
     text("behaviour-state", behaviour?.running ? words("task.behaviour.state", { name: title(behaviour.behaviour), phase: behaviour.phase, seconds: number(behaviour.elapsed, 0) })
       : behaviour?.number ? behaviour.text || reason(behaviour.outcome) : words("task.none"));
-    byId("tasks-none").hidden = Boolean(facts?.explores || facts?.path || facts?.goals || names.length);
+    byId("tasks-none").hidden = Boolean(facts?.explores || facts?.tracks || facts?.goals || names.length);
+  }
+
+  async startPath() {
+    const [file] = byId("path-file").files;
+    byId("path-file").value = "";
+    const closed = byId("path-closed").checked;
+    if (file) this.begin("task.path", { do: "track_file", name: file.name, text: await file.text(), closed });
   }
 
   async startMission() {

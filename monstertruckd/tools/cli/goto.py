@@ -1,4 +1,4 @@
-"""``goto``, ``track`` and ``path``: send the robot to a pose or along a path, and follow it there."""
+"""``goto``, ``track`` and ``path``: send the robot to a pose or along a path, and follow it there; ``convert-path``."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.path_forms import PathForm
 from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, ViaOption, parse_pose, require_finite
 from monstertruckd.tools.cli.output import JsonOption, print_end, print_json
@@ -19,6 +20,16 @@ ROUTE_TIMEOUT: Final = 6.0
 """Seconds to wait for a first route."""
 
 ArmOption = Annotated[bool, typer.Option("--arm", help="Arm the robot as well; it drives off at once.")]
+
+
+PathArgument = Annotated[
+    Path,
+    typer.Argument(help="Table (CSV) of a path or raceline, or waypoints of Nav2 (YAML).", show_default=False),
+]
+ClosedOption = Annotated[bool, typer.Option("--closed", help="The path is a lap: its end is its start.")]
+ColumnsOption = Annotated[
+    str | None, typer.Option(help="Names of the table's columns, e.g. x,y,yaw,speed.", show_default=False)
+]
 
 
 def goto(
@@ -51,8 +62,9 @@ def goto(
 
 
 def track(
-    file: Annotated[Path, typer.Argument(help="CSV: x,y,yaw,direction.", show_default=False)],
-    closed: Annotated[bool, typer.Option("--closed", help="The path is a lap: its end is its start.")] = False,
+    file: PathArgument,
+    closed: ClosedOption = False,
+    columns: ColumnsOption = None,
     arm: ArmOption = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
@@ -65,9 +77,10 @@ def track(
     """
     from monstertruck_planners.track.paths import load_path
     from monstertruck_runtime.drives import follow
+    from monstertruck_runtime.path_files import names_of
     from monstertruckd.tools.cli.goto_session import on_the_terminal
 
-    path = load_path(file, closed=closed)
+    path = load_path(file, closed=closed, columns=names_of(columns))
 
     async def main(client: "TruckClient", clock: "Clock") -> "Arrival":
         localised = (await client.call("config")).get("slam") is not None
@@ -108,3 +121,26 @@ def path(
         print_json({"path": end}) if json_output else typer.echo(end)
     else:
         print_end(end.reason, end.text, end.as_json(), json_output=json_output)
+
+
+def convert_path(
+    file: PathArgument,
+    output: Annotated[Path, typer.Argument(help="File to write.", show_default=False)],
+    form: Annotated[PathForm, typer.Option("--format", "-f", help="Form of the output.")] = PathForm.CSV,
+    closed: ClosedOption = False,
+    columns: ColumnsOption = None,
+    speed: Annotated[
+        float | None, typer.Option(min=0.0, help="Speed of a raceline without speeds, m/s.", show_default=False)
+    ] = None,
+    width: Annotated[
+        float | None, typer.Option(min=0.0, help="Track on each side of a centreline, m.", show_default=False)
+    ] = None,
+) -> None:
+    """Write a path in the form of another program: racelines of F1TENTH and TUM, centrelines, waypoints of Nav2."""
+    from monstertruck_planners.track.paths import load_path
+    from monstertruck_runtime.path_files import names_of, path_text
+    from monstertruck_runtime.small_files import replace_file
+
+    path = load_path(file, closed=closed, columns=names_of(columns))
+    replace_file(output, path_text(path, form, speed=speed, width=width).encode())
+    typer.echo(f"{output}: {len(path.poses) // 3} poses")

@@ -81,6 +81,7 @@ app.command("plan", context_settings={"ignore_unknown_options": True})(plan.plan
 app.command("goto", context_settings={"ignore_unknown_options": True})(goto.goto)
 app.command("track")(goto.track)
 app.command("path")(goto.path)
+app.command("convert-path")(goto.convert_path)
 app.command("move")(move.move)
 app.command("get")(settings.get)
 app.command("set", context_settings={"ignore_unknown_options": True})(settings.set_value)

@@ -22,12 +22,14 @@ app = command_group("Missions: steps that the robot does one after the other.")
 
 WITHOUT = "does no missions"
 MISSIONS = shipped("configs/missions")
-FileArgument = Annotated[Path, typer.Argument(help="Mission (YAML).", show_default=False)]
+FileArgument = Annotated[Path, typer.Argument(help="Mission or waypoints of Nav2 (YAML).", show_default=False)]
 
 
 @app.command("run")
 def run_command(
-    file: Annotated[Path | None, typer.Argument(help="Mission (YAML).", show_default=False)] = None,
+    file: Annotated[
+        Path | None, typer.Argument(help="Mission or waypoints of Nav2 (YAML).", show_default=False)
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Resume the mission that a restart interrupted.")] = False,
     moved: Annotated[
         bool, typer.Option("--moved", help="Resume although the robot is not where it was: its pose is right.")
@@ -118,12 +120,18 @@ def stop_command(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAUL
 
 
 def load(file: Path) -> "Mission":
-    """The mission of a file.
+    """Read a mission, or a file of waypoints as one that drives to each of them.
 
     Raises:
         ConfigError: one line per mistake, each naming file, line, key and what was expected.
+        InputError: a waypoint is invalid, or the file cannot be read.
     """
+    from monstertruck_runtime.outside import text_of
+    from monstertruck_runtime.path_files import has_waypoints, mission_from
+    from monstertruck_runtime.yaml_files import LARGEST_YAML
     from monstertruck_schemas.mission import Mission
     from monstertruckd.config.load import load_config
 
+    if file.is_file() and has_waypoints(text := text_of(file, "a mission", LARGEST_YAML, ConfigError)):
+        return mission_from(text, file)
     return load_config(file, Mission)[0]

@@ -213,21 +213,23 @@ class Command:
 
 
 class SpeedProfile:
-    """Speed from which every curve ahead is reached at what its curvature allows, and at which the axles keep up.
+    """Speed from which every place ahead is reached at what its curvature and the path allow, and the axles keep up.
 
     Args:
         config: accelerations, and the distance within which the axles can turn.
-        reference: of a segment.
+        segment: part of a path, with its speeds.
+        reference: of the segment.
     """
 
-    def __init__(self, config: TrackerConfig, reference: Reference) -> None:
+    def __init__(self, config: TrackerConfig, segment: Segment, reference: Reference) -> None:
         s = reference.places
         least_curvature = 1e-6  # curvatures (1/m) and turns (rad) are taken to be no smaller
         allowed = config.lateral_acceleration / np.maximum(np.abs(reference.at(s).curvature), least_curvature)
         change = np.maximum(reference.axle_change(config.steering_distance), least_curvature)
         turning = config.steering_distance * config.steering_rate / change
         gained = 2 * config.deceleration * s
-        least = np.minimum.accumulate((np.minimum(allowed, turning**2) + gained)[::-1])[::-1]
+        limits = np.minimum(np.minimum(allowed, turning**2), segment.speeds(s) ** 2)
+        least = np.minimum.accumulate((limits + gained)[::-1])[::-1]
         self._rows = np.column_stack((s, np.maximum(least - gained, 0.0)))
 
     def at(self, s: float) -> float:
@@ -516,7 +518,7 @@ class PathTracker(ABC, Generic[C]):
             if len(self._prepared) >= MAX_RUNS:
                 self._prepared.clear()
             reference = Reference(segment, self.geometry, self.config.steering)
-            known = self._prepared[id(segment)] = (segment, reference, SpeedProfile(self.config, reference))
+            known = self._prepared[id(segment)] = (segment, reference, SpeedProfile(self.config, segment, reference))
         return known[1:]
 
     def _project(self, truck: TruckState, segment: Segment, s: float) -> Projection:

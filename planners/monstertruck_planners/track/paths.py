@@ -1,17 +1,16 @@
-"""Paths drawn beforehand or sent from outside, published for the trackers."""
+"""Configured paths and paths of operators, published for the trackers."""
 
+from collections.abc import Sequence
 from pathlib import Path as FilePath
 from typing import Any
-
-import numpy as np
 
 from monstertruck_planners.track.segments import check_path
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
-from monstertruck_runtime.outside import QUOTED
+from monstertruck_runtime.outside import text_of
+from monstertruck_runtime.path_files import EXPECTED, LARGEST, path_from
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import Sequences, does_not_drive, examine, parse_request
-from monstertruck_runtime.tables import read_table
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import BehaviourState, Path
 from monstertruck_schemas.reasons import Reason
@@ -19,51 +18,19 @@ from monstertruck_schemas.req import PathRequest, PathStart, Request
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateState
 
-HEADER = ["x", "y", "yaw", "direction"]
 
-
-def load_path(file: FilePath, *, closed: bool, frame: str = "odom") -> Path:
-    """Read a path in ``frame`` from CSV: header ``x,y,yaw,direction``; metres, metres, radians, +1 or -1.
-
-    The table may have semicolons or tabs instead of commas, comments and empty lines (see ``read_table``).
+def load_path(file: FilePath, *, closed: bool, frame: str = "odom", columns: Sequence[str] = ()) -> Path:
+    """Read a path that can be tracked; see ``path_from``.
 
     Raises:
         InputError: naming file and line, and what was expected.
     """
-    # 10_000_000: size of a file of poses at most: a hundred thousand and more
-    rows = read_table(file, f"a table {','.join(HEADER)}", 10_000_000)
-    if not rows or rows[0][1] != HEADER:
-        line, met = rows[0] if rows else (1, [])
-        found = f"found {','.join(met)[:QUOTED]}" if rows else "the file is empty"
-        raise InputError(f"{file}:{line}: expected the header {','.join(HEADER)}, {found}")
-    values = np.array([_numbers(file, line, row) for line, row in rows[1:]])
-    if len(values) < 2:
-        raise InputError(f"{file}: expected at least two poses, found {len(values)}")
-    path = Path(
-        stamp=0,
-        received=0,
-        seq=0,
-        frame=frame,
-        poses=values[:, :3].ravel(),
-        directions=values[:, 3],
-        closed=closed,
-        name=file.stem,
-    )
+    path = path_from(text_of(file, EXPECTED, LARGEST), file, closed=closed, frame=frame, columns=columns)
     try:
         check_path(path)
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
     return path
-
-
-def _numbers(file: FilePath, line: int, row: list[str]) -> list[float]:
-    try:
-        numbers = [float(cell) for cell in row]
-    except ValueError as error:
-        raise InputError(f"{file}:{line}: expected four numbers, found {','.join(row)[:QUOTED]}") from error
-    if len(numbers) != len(HEADER) or not np.isfinite(numbers).all() or numbers[3] not in (1.0, -1.0):
-        raise InputError(f"{file}:{line}: expected x,y,yaw and a direction of 1 or -1, found {','.join(row)[:QUOTED]}")
-    return numbers
 
 
 class PathService:

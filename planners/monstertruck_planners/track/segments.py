@@ -59,6 +59,8 @@ class PathSteps(NamedTuple):
     """Of each step, or empty."""
     clearance: Array
     """Shape (n,), m; +inf where it is not known."""
+    speeds: Array
+    """Shape (n,), m/s; +inf where the path sets none."""
 
 
 class Segment:
@@ -73,6 +75,7 @@ class Segment:
         steering: of each own step, or empty.
         lap: the extension is the path's own beginning.
         clearance: between footprint and obstacles at its end, m.
+        speeds: greatest ones at the own points, shape (last + 1,), m/s; None: the path sets none.
     """
 
     def __init__(
@@ -86,6 +89,7 @@ class Segment:
         *,
         lap: bool = False,
         clearance: float = math.inf,
+        speeds: Array | None = None,
     ) -> None:
         steps = np.diff(points, axis=0)
         lengths, tangents = np.hypot(steps[:, 0], steps[:, 1]), np.arctan2(steps[:, 1], steps[:, 0])
@@ -100,6 +104,7 @@ class Segment:
         self.yaws = np.zeros(last + 1) if yaws is None else yaws
         self.steering = steering
         self.clearance = clearance
+        self._speeds = speeds
 
     @property
     def vertices(self) -> Array:
@@ -110,6 +115,12 @@ class Segment:
         """Points at ``s`` metres, shape (m, 2)."""
         x, y = self._points.T
         return np.column_stack((np.interp(s, self._s, x), np.interp(s, self._s, y)))
+
+    def speeds(self, s: Array) -> Array:
+        """Greatest speeds that the path sets at ``s`` metres, m/s; +inf if it sets none."""
+        if self._speeds is None:
+            return np.full(len(s), math.inf)
+        return np.interp(np.remainder(s, self.length) if self.end > self.length else s, self.vertices, self._speeds)
 
     def at(self, s: float) -> Projection:
         """Point at ``s`` metres."""
@@ -207,6 +218,8 @@ def check_path(path: Path) -> None:
         _refuse(path, f"{len(path.steering)} ways of steering: expected one for each of the {count} poses, or none")
     if len(path.clearance) not in (0, count) or np.isnan(path.clearance).any():
         _refuse(path, f"{len(path.clearance)} clearances: expected a number for each of the {count} poses, or none")
+    if len(path.speeds) not in (0, count) or not (np.isfinite(path.speeds) & (path.speeds >= 0.0)).all():
+        _refuse(path, f"{len(path.speeds)} speeds: expected zero or more for each of the {count} poses, or none")
     if np.count_nonzero(stops(path.directions[1:], path.steering[1:])) >= MAX_RUNS:
         _refuse(path, f"direction or crab changes too often: expected at most {MAX_RUNS} runs")
     if not np.isfinite(poses).all() or np.abs(poses).max() > MAX_COORDINATE:
@@ -231,11 +244,12 @@ def _steps(path: Path) -> PathSteps:
     directions = path.directions if len(path.directions) else np.ones(len(points))
     arriving, steering = directions[1:], path.steering[1:]
     clearance = path.clearance if len(path.clearance) else np.full(len(points), math.inf)
+    speeds = path.speeds if len(path.speeds) else np.full(len(points), math.inf)
     if path.closed:
         points, yaws = np.concatenate((points, points[:1])), np.concatenate((yaws, yaws[:1]))
         arriving, steering = np.concatenate((arriving, directions[:1])), steering + path.steering[:1]
-        clearance = np.concatenate((clearance, clearance[:1]))
-    return _distinct(PathSteps(points, yaws, arriving, steering, clearance), path)
+        clearance, speeds = np.concatenate((clearance, clearance[:1])), np.concatenate((speeds, speeds[:1]))
+    return _distinct(PathSteps(points, yaws, arriving, steering, clearance, speeds), path)
 
 
 def _distinct(steps: PathSteps, path: Path) -> PathSteps:
@@ -256,8 +270,9 @@ def _distinct(steps: PathSteps, path: Path) -> PathSteps:
     arriving = kept[1:] - 1
     steering = tuple(steps.steering[i] for i in arriving.tolist()) if steps.steering else ()
     return PathSteps(
-        points[kept], np.unwrap(steps.yaws[kept]), steps.directions[arriving], steering, steps.clearance[kept]
-    )
+        points[kept], np.unwrap(steps.yaws[kept]), steps.directions[arriving], steering, steps.clearance[kept],
+        steps.speeds[kept],
+    )  # fmt: skip
 
 
 def _rolled(steps: PathSteps, first: int) -> PathSteps:
@@ -265,8 +280,8 @@ def _rolled(steps: PathSteps, first: int) -> PathSteps:
     points = np.concatenate((steps.points[first:-1], steps.points[: first + 1]))
     yaws = np.unwrap(np.concatenate((steps.yaws[first:-1], steps.yaws[: first + 1])))
     steering = steps.steering[first:] + steps.steering[:first]
-    clearance = np.concatenate((steps.clearance[first:-1], steps.clearance[: first + 1]))
-    return PathSteps(points, yaws, np.roll(steps.directions, -first), steering, clearance)
+    clearance, speeds = (np.concatenate((row[first:-1], row[: first + 1])) for row in (steps.clearance, steps.speeds))
+    return PathSteps(points, yaws, np.roll(steps.directions, -first), steering, clearance, speeds)
 
 
 def _nearest(points: Array, directions: Array, start: tuple[float, float, float], *, closed: bool) -> int:
@@ -306,6 +321,7 @@ def _segments(steps: PathSteps, beyond: float, *, closed: bool) -> tuple[Segment
             steps.steering[begin:end],
             lap=lap,
             clearance=float(steps.clearance[end]),
+            speeds=steps.speeds[begin : end + 1] if np.isfinite(steps.speeds[begin]) else None,
         )
         segments.append(segment)
         before += segment.length

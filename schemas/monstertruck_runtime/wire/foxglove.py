@@ -226,6 +226,7 @@ def _write_path(path: Path, proto: Any) -> None:
     proto.directions = path.directions.tobytes()
     proto.steering.extend(path.steering)
     proto.clearance = path.clearance.tobytes()
+    proto.speeds = path.speeds.tobytes()
     proto.closed = path.closed
     proto.halts = path.halts
     proto.name = path.name
@@ -239,6 +240,7 @@ def _read_path(proto: Any) -> _Fields:
         "directions": _array(proto.directions),
         "steering": tuple(proto.steering),
         "clearance": _array(proto.clearance),
+        "speeds": _array(proto.speeds),
         "closed": proto.closed,
         "halts": proto.halts,
         "name": proto.name,

@@ -91,6 +91,7 @@ paths = st.builds(
     directions=doubles(st.integers(0, 5)),
     steering=st.lists(st.sampled_from(get_args(Steering)), max_size=5).map(tuple),
     clearance=doubles(st.integers(0, 5)),
+    speeds=doubles(st.integers(0, 5)),
     closed=st.booleans(),
     halts=st.booleans(),
     name=st.text(),

@@ -32,11 +32,11 @@ def test_marks_empty_lines_comments_and_delimiters(tmp_path: Path, data: bytes, 
 @pytest.mark.parametrize(
     ("data", "text"),
     [
-        (b"x,y,yaw,direction\n0,0,0,1\n1,a,0,1\n", r"p\.csv:3: expected four numbers, found 1,a,0,1"),
-        (b"x;y;yaw;direction\n0;0;0;1\n1,5;0;0;1\n", r"p\.csv:3: expected four numbers, found 1,5,0,0,1"),
-        (b"\n# path\na,b\n", r"p\.csv:3: expected the header x,y,yaw,direction, found a,b"),
-        (b"", r"p\.csv:1: expected the header x,y,yaw,direction, the file is empty"),
-        (b"x,y,yaw,direction\n\xff\n", r"p\.csv:2: expected a table x,y,yaw,direction: not UTF-8 text"),
+        (b"x,y,yaw,direction\n0,0,0,1\n1,a,0,1\n", r"p\.csv:3: expected numbers, found 1,a,0,1"),
+        (b"x;y;yaw;direction\n0;0;0;1\n1,5;0;0;1\n", r"p\.csv:3: expected numbers, found 1,5,0,0,1"),
+        (b"\n# path\na,b\n", r"p\.csv:3: expected columns x,y,yaw,direction, or x_m and y_m .*; found a,b"),
+        (b"", r"p\.csv: expected a path: the file is empty"),
+        (b"x,y,yaw,direction\n\xff\n", r"p\.csv:2: expected a path: not UTF-8 text"),
     ],
 )
 def test_a_path_names_what_it_met(tmp_path: Path, data: bytes, text: str):

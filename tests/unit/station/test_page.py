@@ -298,13 +298,21 @@ async def a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page: 
 async def the_configured_path_is_started_by_its_name(page: Page) -> None:
     await say(page, FACTS)
     assert not await page.is_visible("#path-start"), "this robot has none"
-    await say(page, FACTS | {"path": "lap"})
+    await say(page, FACTS | {"path": "lap", "tracks": True})
     assert await page.inner_text("#path-start") == "Start lap"
     await page.evaluate("void (window.sent = [])")
     await page.click("#path-start")
     asked = await page.evaluate("window.sent.find((each) => each.id !== undefined)")
     assert {key: asked[key] for key in ("do", "path")} == {"do": "start_path", "path": "lap"}
     await say(page, {"kind": "answer", "id": asked["id"], "ok": True, "value": {"path": "lap-1"}})
+    await page.evaluate("void (window.sent = [])")
+    await page.check("#path-closed")
+    await page.set_input_files("#path-file", {"name": "ring.csv", "mimeType": "text/csv", "buffer": b"0,0\n1,0\n"})
+    pick = "window.sent.find((each) => each.id !== undefined)"
+    while (asked := await page.evaluate(pick)) is None:
+        await asyncio.sleep(0.02)
+    assert asked == {"do": "track_file", "name": "ring.csv", "text": "0,0\n1,0\n", "closed": True, "id": asked["id"]}
+    await say(page, {"kind": "answer", "id": asked["id"], "ok": True})
 
 
 async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path: Path):

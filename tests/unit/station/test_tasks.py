@@ -39,6 +39,7 @@ from monstertruckd.tools.demo.runs import free_endpoint
         ({"do": "explore", "order": "start"}, AccessRole.PILOT),
         ({"do": "mission", "order": "start", "text": "steps: []"}, AccessRole.PILOT),
         ({"do": "track", "points": [[0, 0], [1, 0]]}, AccessRole.PILOT),
+        ({"do": "track_file", "name": "lap.csv", "text": "0,0\n1,0\n"}, AccessRole.PILOT),
         ({"do": "start_path", "path": "loop"}, AccessRole.PILOT),
         ({"do": "ask"}, AccessRole.PILOT),
         ({"do": "hand_over", "to": "bob"}, AccessRole.PILOT),
@@ -71,7 +72,7 @@ async def test_a_path_that_is_refused_by_the_station_is_answered():
     pilot = Pilot(RobotAddress("truck", "tcp/127.0.0.1:1"), "page", viewer, WallClock())
     pilot._client = object()
     pilot.ask(commands.parse(json.dumps({"do": "track", "id": 7, "points": [[0, 0], [0.1, 0]]})))
-    (answer,) = await shown(viewer)
+    answer = await next_answer(viewer)
     assert (answer["kind"], answer["id"], answer["ok"]) == ("answer", 7, False)
 
 
@@ -97,9 +98,19 @@ async def test_a_drawn_path_is_answered_once_the_robot_follows_it_or_refuses_it(
     pilot = Pilot(RobotAddress("truck", "tcp/127.0.0.1:1"), "page", viewer, WallClock())
     pilot._client = Truck()
     pilot.ask(commands.parse(json.dumps({"do": "track", "id": 7, "points": [[0, 0], [1, 0]]})))
-    (answer,) = await shown(viewer)
+    answer = await next_answer(viewer)
     assert answer["ok"] is not refused
     assert not refused or answer["text"] == "path refused"
+    boxes.clear()
+    lap = {"do": "track_file", "id": 8, "name": "lap.csv", "text": "# x_m, y_m, vx_mps\n0,0,.1\n1,0,.2\n1,1,.1\n"}
+    pilot.ask(commands.parse(json.dumps(lap | {"closed": True})))
+    answer = await next_answer(viewer)
+    assert answer["ok"] is not refused, answer
+    sent = boxes[topics.PATH.name].latest
+    assert refused or (sent.closed, sent.frame, sent.speeds.tolist()) == (True, "map", [0.1, 0.2, 0.1])
+    pilot.ask(commands.parse(json.dumps(lap | {"text": "a,b\n"})))
+    answer = await next_answer(viewer)
+    assert "lap.csv:1: expected columns" in answer["text"]
 
 
 async def test_a_mission_is_resumed_as_the_page_says():
@@ -120,6 +131,7 @@ async def test_a_mission_is_resumed_as_the_page_says():
 def test_a_mission_is_read_and_a_wrong_one_refused_by_field():
     mission = read_mission("version: 2\nname: round\nsteps:\n  - {do: goto, x: 1, y: 2, yaw: 0}\n")
     assert mission.steps[0].x == 1.0
+    assert read_mission("waypoints: [{x: 3, y: 2, yaw: 0}]").steps[0].x == 3.0
     for text, said in (
         ("version: 2\nname: round\nsteps: [{do: fly}]", "steps"),
         ("steps: [", "not valid YAML"),
@@ -275,6 +287,11 @@ class RecordedDrive:
             if i % 10 == 0:
                 event = Event(**header, reason=Reason.OK, severity=Severity.INFO, source="test", text=f"at {i // 10}")
                 yield Recorded(topics.EVENT, event, at)
+
+
+async def next_answer(viewer) -> dict:
+    """The next frame, for which a thread may compute."""
+    return json.loads(await asyncio.wait_for(viewer.next(), 10.0))
 
 
 async def shown(viewer) -> list:

@@ -202,6 +202,8 @@ IMPOSSIBLE = {
     "wound up": path(straight(1.0), yaws=1e308),
     "too few clearances": ROUTE.model_copy(update={"clearance": np.zeros(2)}),
     "unknown clearance": ROUTE.model_copy(update={"clearance": np.full(len(ROUTE.poses) // 3, np.nan)}),
+    "too few speeds": ROUTE.model_copy(update={"speeds": np.zeros(2)}),
+    "negative speed": ROUTE.model_copy(update={"speeds": np.full(len(ROUTE.poses) // 3, -0.1)}),
     "zigzag": path(straight(10.0), [1.0 - 2.0 * (i % 2) for i in range(201)]),
     "long name": ROUTE.model_copy(update={"name": "x" * 129}),
     "odd count": ROUTE.model_copy(update={"poses": np.zeros(7)}),

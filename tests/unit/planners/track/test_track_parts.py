@@ -80,8 +80,9 @@ def test_one_spot_is_as_one_of_many():
 
 def test_the_pace_lets_every_curve_ahead_be_reached_slowly_enough():
     config = PurePursuitConfig(lateral_acceleration=0.02, deceleration=0.05, steering_distance=0.1, steering_rate=0.5)
-    found = course(path(figure_eight(), closed=True), "front")
-    pace = SpeedProfile(config, found)
+    line = SegmentedPath(path(figure_eight(), closed=True), (0.0, 0.0, 0.0), 0.8)
+    found = Reference(line.segments[0], STEERING, "front")
+    pace = SpeedProfile(config, line.segments[0], found)
     s = found.places
     speed = np.array([pace.at(place) for place in s.tolist()])
     curvature = np.maximum(np.abs(found.at(s).curvature), 1e-6)

@@ -381,3 +381,16 @@ def test_a_path_waits_for_a_truck_that_comes_to_rest():
         await asyncio.gather(following, return_exceptions=True)
 
     run_virtual(main)
+
+
+def test_a_path_is_written_in_the_form_of_another_program(tmp_path):
+    (tmp_path / "log.csv").write_text("0,0,0,.1\n1,0,0,.2\n2,0,0,.1\n")
+    line = ["convert-path", str(tmp_path / "log.csv"), str(tmp_path / "out.csv"), "-f", "tum"]
+    done = CliRunner().invoke(app, line)
+    assert done.exit_code == 3
+    assert "log.csv:1: expected columns" in done.stderr
+    done = CliRunner().invoke(app, [*line, "--columns", "x,y,yaw,speed"])
+    assert (done.exit_code, done.stdout) == (0, f"{tmp_path / 'out.csv'}: 3 poses\n")
+    head, first, *_ = (tmp_path / "out.csv").read_text().splitlines()
+    assert head == "# s_m; x_m; y_m; psi_rad; kappa_radpm; vx_mps; ax_mps2"
+    assert first.split(";")[5] == "0.1000000"

@@ -129,3 +129,14 @@ def test_what_a_step_waits_for_and_why_the_robot_stands_is_said_once():
     assert followed(starts, starts, step)[1:] == ["     0 s  it waits: the planner is starting"]
     stands = "     0 s  it stands: the robot is disarmed; `monstertruckd arm` lets it drive"
     assert followed(starts, step, step, mode=GateMode.DISARMED)[1:] == [stands], "though more becomes stale"
+
+
+def test_waypoints_of_nav2_are_a_mission(tmp_path: Path):
+    file = tmp_path / "way.yaml"
+    file.write_text("waypoints:\n  waypoint0: {pose: [1.0, 2.0, 0.0], orientation: [1.0, 0.0, 0.0, 0.0]}\n")
+    done = CliRunner().invoke(app, ["mission", "check", str(file)])
+    assert done.exit_code == 0, done.output
+    assert done.stdout.splitlines()[1].split() == ["1", "0", "-", "abort", "goto", "1", "2", "0"]
+    file.write_text("waypoints: [{x: 1}]\n")
+    done = CliRunner().invoke(app, ["mission", "check", str(file)])
+    assert (done.exit_code, done.stderr) == (3, f"{file}: waypoints 0: expected x and y, position, or pose\n")

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[4]
 WRONG = (
     ("track /nonexistent.csv", 3, "/nonexistent.csv: cannot be read: No such file or directory"),
     ("calibrate camera --square 30 --marker 40", 3, "--marker 40: expected less than --square 30, in which it lies"),
-    ("track configs/truck.yaml", 3, "configs/truck.yaml:3: expected the header x,y,yaw,direction, found include:"),
+    ("track configs/truck.yaml", 3, "configs/truck.yaml: expected a mapping with waypoints, or with the poses of"),
     ("statu", 2, "Error: No such command 'statu'. Did you mean 'status', 'station', 'study'? Try '"),
     (
         "arm -e nonsense",
