@@ -5,6 +5,7 @@ package index (checked by sha256), lets it build ``.venv`` next to ``pyproject.t
 and runs the command there. A second run finds everything in place.
 
     python3 -m monstertruckd.bootstrap demo     the truck drives a lap
+    python3 -m monstertruckd.bootstrap try      emulated truck, mapping, planner and page at once
     python3 -m monstertruckd.bootstrap check    lint, types, import contracts, all tests
     python3 -m monstertruckd.bootstrap sync     all packages, nothing run
 """
@@ -57,7 +58,7 @@ KERNELS: tuple[Path, str, str] = (VENV / "bin" / "python", "-m", "monstertruckd.
 BYTECODE = ("-m", "compileall", "-q", "-j", "2", "monstertruckd", "drivers", "planners", "schemas", "tests")
 """Python's arguments that compile our own packages and the tests, once for the hundreds of processes that the tests
 start: where PYTHONDONTWRITEBYTECODE is set none of them would leave its work to the next."""
-EXTRAS = {"demo": ("sim",), "check": ("dev",), "sync": ("dev",)}
+EXTRAS = {"demo": ("sim",), "try": ("sim", "slam", "planning", "station"), "check": ("dev",), "sync": ("dev",)}
 
 
 def main(arguments: list[str]) -> int:
@@ -74,6 +75,14 @@ def main(arguments: list[str]) -> int:
         return code
     if command == "check":
         return check(rest)
+    if command == "try":
+        compile_kernels()
+        return run(VENV / "bin" / "monstertruckd", "try", *rest)
+    return compile_kernels()
+
+
+def compile_kernels() -> int:
+    """Compile what goals and maps need; the exit code."""
     print("Compiling the kernels of planners and mapping: seconds, the first time a minute or two ...", file=sys.stderr)
     return run(*KERNELS)
 
@@ -99,7 +108,7 @@ def sync(extras: tuple[str, ...]) -> None:
     ]
     environment = {name: value for name, value in os.environ.items() if name != "VIRTUAL_ENV"}
     if not VENV.exists():
-        size = "about 570 MB" if extras == EXTRAS["demo"] else "a gigabyte or two"
+        size = "a gigabyte or two" if extras == EXTRAS["sync"] else "about 570 MB"
         print(f"Setting up {VENV}: {size}, the first time only ...", file=sys.stderr)
     code = subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
     if code:

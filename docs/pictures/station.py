@@ -8,6 +8,8 @@ ask the robot for something are those of an emulated truck that explores.
 
 import asyncio
 import contextlib
+import re
+import sys
 import tempfile
 from pathlib import Path
 
@@ -56,6 +58,32 @@ async def main() -> None:
             async with station(made) as url, chromium(made.folder) as browser:
                 for theme, view, size in (("light", "", DESK), ("dark", "", DESK), ("dark", "-phone", PHONE)):
                     await asking(browser, url, theme, view, size)
+    with tempfile.TemporaryDirectory() as name:
+        await tried(Path(name))
+
+
+async def tried(folder: Path) -> None:
+    """The page of ``monstertruckd try``, with an obstacle and a device that was unplugged."""
+    said = folder / "said.txt"
+    with said.open("wb") as output:
+        words = ("-m", "monstertruckd", "try", "--no-browser", "--output", str(folder / "try"))
+        process = await asyncio.create_subprocess_exec(sys.executable, *words, stdout=output, stderr=output)
+    try:
+        while (found := re.search(r"http://127[0-9.:]+/", said.read_text())) is None:
+            await asyncio.sleep(0.1)
+        async with chromium(folder) as browser:
+            page = await browser.new_page(viewport=DESK)
+            await page.goto(found[0])
+            await page.wait_for_selector("#map[data-drawn=true]", timeout=60_000)
+            await page.click("#tab-tryout")
+            await page.click("#obstacle-add")
+            await page.click("#map", position={"x": 560, "y": 330})
+            await page.select_option("#fault-compass", "unplugged")
+            await asyncio.sleep(3.0)
+            await page.evaluate("document.querySelectorAll('#banners button').forEach((button) => button.click())")
+            await page.screenshot(path=HERE / "station-try.png")
+    finally:
+        await end(process)
 
 
 async def asking(browser: Browser, url: str, theme: str, view: str, size: dict[str, int]) -> None:

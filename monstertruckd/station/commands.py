@@ -12,6 +12,8 @@ from monstertruck_schemas.roles import AccessRole
 LONGEST_MESSAGE: Final = 262_144
 """Bytes of a command at most: the file of a raceline of some kilometres."""
 
+DeviceFault = Literal["none", "unplugged", "deaf", "noise"]
+"""Of an emulated device: works; its cable is unplugged; it hears nothing; one bit in 50 bytes is wrong."""
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Place = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
 """x, y (m) and optionally yaw (rad)."""
@@ -203,6 +205,22 @@ class ReplayRecording(Asked):
     name: Annotated[str, Field(max_length=128)]
 
 
+class InjectFault(Asked):
+    """Let a device of an emulated robot fail, or work again."""
+
+    do: Literal["fault"]
+    device: Annotated[str, Field(max_length=64)]
+    fault: DeviceFault
+
+
+class PlaceObstacle(Asked):
+    """Put an obstacle into the world of an emulated robot."""
+
+    do: Literal["obstacle"]
+    at: tuple[Number, Number] | None
+    """Place, m; None removes all obstacles."""
+
+
 class ControlReplay(_Command):
     """Go to a time of the recording that is shown, s since its beginning; play or pause; play at another rate."""
 
@@ -234,6 +252,8 @@ AnyCommand = (
     | ListRecordings
     | DeleteRecording
     | ReplayRecording
+    | InjectFault
+    | PlaceObstacle
     | ControlReplay
 )
 Command = Annotated[AnyCommand, Field(discriminator="do")]

@@ -9,7 +9,7 @@ import secrets
 import shutil
 import ssl
 import tempfile
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Sequence
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +28,19 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruckd import __version__
 from monstertruckd.station import commands, frames
 from monstertruckd.station.address import RobotAddress
-from monstertruckd.station.commands import ControlReplay, EchoRequest, Heartbeat, LookAtFleet, ReplayRecording, Watch
+from monstertruckd.station.commands import (
+    ControlReplay,
+    EchoRequest,
+    Heartbeat,
+    InjectFault,
+    LookAtFleet,
+    PlaceObstacle,
+    ReplayRecording,
+    Watch,
+)
 from monstertruckd.station.discovery import Discovery
 from monstertruckd.station.downloads import download, fetch
+from monstertruckd.station.emulated import EmulatedWorld
 from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.fleet import FleetBoard
 from monstertruckd.station.listener import WebListener
@@ -126,6 +136,7 @@ class Station:
         place: where to listen.
         routers: endpoints whose robots are shown as they appear.
         open_log: opens recordings that are to be replayed; None = none are.
+        emulated: takes faults and obstacles of an emulated robot; None = the robots are not this program's.
     """
 
     def __init__(
@@ -135,8 +146,10 @@ class Station:
         place: Place = Place(),
         routers: Sequence[str] = (),
         open_log: LogOpener | None = None,
+        emulated: EmulatedWorld | None = None,
     ) -> None:
         self._clock = clock
+        self._emulated = emulated
         self.place = place
         self.feeds = {address.name: RobotFeed(address, clock) for address in robots}
         if len(self.feeds) != len(robots):
@@ -285,6 +298,28 @@ class Station:
             self.replays[title] = feed
         self._follow(feed)
         return title
+
+    def show_emulated(self, viewers: Iterable[Viewer]) -> None:
+        """Send the faults and obstacles of the emulated robot, if there is one."""
+        if self._emulated is not None:
+            frame = frames.text("emulated", **self._emulated.state())
+            for viewer in viewers:
+                viewer.show("emulated", frame)
+
+    def emulate(self, command: InjectFault | PlaceObstacle) -> None:
+        """Change the emulated robot or its world.
+
+        Raises:
+            InputError: no robot is emulated here, or it refuses that.
+        """
+        if self._emulated is None:
+            raise InputError("no robot of this station is emulated")
+        match command:
+            case InjectFault():
+                self._emulated.inject(command.device, command.fault)
+            case PlaceObstacle():
+                self._emulated.place(command.at)
+        self.show_emulated(self._viewers)
 
     def _found(self, address: RobotAddress) -> None:
         """A robot appeared: follow it, and offer it in every browser."""
@@ -487,6 +522,7 @@ class _Browser:
         self._ending: set[asyncio.Task[None]] = set()
         self.viewer.send(frames.text("hello", version=__version__, user=user.name, role=user.role.value))
         self.viewer.send(frames.text("robots", names=station.names))
+        station.show_emulated((self.viewer,))
 
     def take(self, data: str) -> None:
         """Obey one message.
@@ -507,19 +543,31 @@ class _Browser:
                 if isinstance(self._feed, ReplayFeed):
                     self._feed.control(command.at, command.playing, command.rate)
             case ReplayRecording():
-                if len(self._ending) >= MOST_REPLAYS:
-                    raise self._answered(command, InputError("recordings are being fetched already"))
-                self._begin(self._replay(command))
+                self._fetch(command)
             case EchoRequest():
                 self.viewer.send(frames.text("pong", at=command.at, now=self._clock.now() / 1e6))
             case LookAtFleet():
                 self._board.show(self.viewer, command.on)
             case Watch():
                 self._watch(command.robot)
+            case InjectFault() | PlaceObstacle():
+                self._emulate(command)
             case _:
                 if self._pilot is None:
                     raise self._answered(command, InputError("no robot is looked at"))
                 self._pilot.ask(command)
+
+    def _emulate(self, command: InjectFault | PlaceObstacle) -> None:
+        try:
+            self._station.emulate(command)
+        except InputError as error:
+            raise self._answered(command, error) from None
+        self.viewer.send(frames.text("answer", id=command.id, ok=True))
+
+    def _fetch(self, command: ReplayRecording) -> None:
+        if len(self._ending) >= MOST_REPLAYS:
+            raise self._answered(command, InputError("recordings are being fetched already"))
+        self._begin(self._replay(command))
 
     def _answered(self, command: commands.AnyCommand, error: TruckError) -> TruckError:
         """The error, reported as the outcome of a command that has one."""

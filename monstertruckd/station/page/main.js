@@ -4,6 +4,7 @@ import { MapView } from "./map.js";
 import { element, Panels } from "./panels.js";
 import { ReplayBar } from "./replay.js";
 import { Link } from "./socket.js";
+import { Tryout } from "./tryout.js";
 import { Work } from "./work.js";
 import { degrees, loadWords, number, reason, words } from "./words.js";
 
@@ -59,6 +60,8 @@ const panels = new Panels(link);
 const fleet = new FleetView(link, map, chosen);
 new ReplayBar(link, chosen); // first: the others look at what it says of the page
 new Work(link, { outcome, order, stopDriving, letPlannersDrive, watch: chosen });
+
+const tryout = new Tryout(link, { outcome, aim: (on) => aim(on, "tryout.hint") });
 
 link.on("robots", ({ names }) => {
   const select = byId("robots");
@@ -143,15 +146,22 @@ byId("tool-heading").onclick = () => {
 byId("tool-in").onclick = () => map.zoom(1.3);
 byId("tool-out").onclick = () => map.zoom(1 / 1.3);
 byId("tool-fit").onclick = () => map.fit();
-byId("tool-goal").onclick = () => aim(!map.aiming);
+byId("tool-goal").onclick = () => {
+  const on = !map.aiming || tryout.placing;
+  tryout.place(false);
+  aim(on);
+};
 
-byId("tool-draw").onclick = () => draw(!map.drawing);
+byId("tool-draw").onclick = () => {
+  tryout.place(false);
+  draw(!map.drawing);
+};
 
-function aim(on) {
+function aim(on, why = "goal.hint") {
   if (on) draw(false);
   map.setAiming(on);
-  press("tool-goal", on);
-  hint(on ? "goal.hint" : null);
+  press("tool-goal", on && why === "goal.hint");
+  hint(on ? why : null);
 }
 
 function draw(on) {
@@ -167,6 +177,7 @@ function hint(key) {
 }
 
 function aimed(pose, line = null) {
+  if (tryout.take(pose)) return void map.take("pending", null);
   aim(false);
   draw(false);
   map.pending = pose;

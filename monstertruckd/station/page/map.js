@@ -45,6 +45,7 @@ export class MapView {
     this.points = null;
     this.trail = [];
     this.grid = null;
+    this.canvas.dataset.drawn = false;
     this.tiles = new Map();
     this.path = this.route = null;
     this.pending = this.drawn = null;
@@ -166,6 +167,7 @@ export class MapView {
     if (robot !== this.link.robot || this.wanted !== message.version || cells.length !== message.width * message.height) return;
     for (const [place, { version }] of this.tiles) if (version < message.version) this.tiles.delete(place);
     this.grid = this.paint({ ...message, cells });
+    this.canvas.dataset.drawn = true;
     this.dirty = true;
   }
 

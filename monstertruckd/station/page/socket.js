@@ -2,7 +2,7 @@
 const RETRY = 1000;
 const PING = 500;
 const ECHOES = 20; // answers to pings, of which the quickest one counts
-const KEPT = ["open", "hello", "robots", "fleet", "pilot", "stops"]; // what the station says, not a robot
+const KEPT = ["open", "hello", "robots", "fleet", "pilot", "stops", "emulated"]; // what the station says, not a robot
 
 export class Link {
   constructor() {

@@ -59,7 +59,7 @@ def demo(
         raise InputError(f"--film {film}: expected --fast, engine mujoco, and a name.gif")
     if film is not None:
         require_place(film)
-    folder = _fresh(output)
+    folder = fresh(output)
     remark(f"starting the emulated robot and its daemon; log, map and outputs go to {folder}")
     screen = on_terminal(sys.stdout) and not json_output
     try:
@@ -79,7 +79,7 @@ def demo(
         finish(Reason.INTERNAL)
 
 
-def _fresh(folder: Path) -> Path:
+def fresh(folder: Path) -> Path:
     """``folder``, or the first of ``folder-2``, ``folder-3`` ... that is not there yet: no run overwrites another."""
     names = itertools.chain([folder], (folder.with_name(f"{folder.name}-{n}") for n in itertools.count(2)))
     return next(name for name in names if not name.exists())
@@ -115,6 +115,7 @@ def simulate(
 
     Faults are read from standard input as with `emulate`, each line beginning with the device's role, the monitor's
     name, or `usb` (an unknown word lists what it knows); with several robots the robot's name stands before it.
+    `room post X Y` puts an obstacle into the world, `room clear` removes all.
     `tape mark` and `tape` measure how far the robot really is from a mark, as who calibrates it is asked.
     With `--film` nothing is served: robot and daemon run for some seconds on the virtual clock, the robot drives its
     path or explores, and a moving picture of it is written.

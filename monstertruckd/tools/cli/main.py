@@ -32,6 +32,7 @@ from monstertruckd.tools.cli import (
     stand,
     station,
     study,
+    tryout,
     tune,
     usb,
 )
@@ -62,6 +63,7 @@ def _options(
 
 
 app.command("demo")(demo.demo)
+app.command("try")(tryout.try_out)
 app.command("simulate")(demo.simulate)
 app.command("drill")(drill.drill)
 app.command("run")(robot.run)

@@ -4,7 +4,7 @@ import asyncio
 import signal
 import sys
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -35,9 +35,11 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig, needs_co
 from monstertruckd.tools.simulation.emulate import claimed
 from monstertruckd.tools.simulation.fleet import shared_scene
 from monstertruckd.tools.simulation.program import program
+from monstertruckd.tools.simulation.room import EmulatedRoom
 from monstertruckd.tools.simulation.tape import EmulatedTape
 
 Say = Callable[[str], None]
+Beside = Callable[[Commanded], Coroutine[Any, Any, None]]
 ANOTHER: Final = (
     "probably another `simulate` on this computer; Ctrl-C in its terminal ends it. "
     "A second robot beside it needs a configuration with a `robot` and `zenoh: listen` of its own"
@@ -76,6 +78,7 @@ async def serve(
     say: Say,
     truth: Path | None = None,
     daemons_of: Sequence[Path] = (),
+    beside: Beside | None = None,
 ) -> int:
     """Serve the devices of robots in one world behind ptys at their configured ports until SIGTERM or SIGINT.
 
@@ -89,6 +92,7 @@ async def serve(
         truth: file of what really happened.
         daemons_of: configurations of daemons that are run meanwhile: stopped before the devices go, and when all have
             ended by themselves the devices go, too.
+        beside: runs meanwhile with what takes the commands; its end ends everything.
 
     Returns:
         The exit code of the first daemon that failed by itself, else 0.
@@ -115,7 +119,7 @@ async def serve(
             folder = Path(stack.enter_context(TemporaryDirectory(prefix="monstertruck-")))
             stack.enter_context(_linked(config, folder))
             robots.append(ServedRobot(config, clock, folder, scene, say, keeps_truth=truth is not None))
-        return await _serve(clock, robots, say, truth, daemons_of)
+        return await _serve(clock, robots, say, truth, daemons_of, beside)
 
 
 @contextmanager
@@ -187,6 +191,7 @@ class ServedRobot:
         emulated |= {name: EmulatedFiles(files) for name, files in self._robot.monitored.items()}
         body = config.sim.world.truck.length, config.sim.world.truck.width
         emulated |= {"usb": self._computer, "tape": EmulatedTape(self._robot.world, clock, body, say)}
+        emulated["room"] = EmulatedRoom(self._robot.world, clock, body)
         self.console = CommandedGroup("device", emulated)
 
     def tasks(self, say: Say) -> Iterator[asyncio.Task[Any]]:
@@ -208,7 +213,12 @@ class ServedRobot:
 
 
 async def _serve(
-    clock: Clock, robots: Sequence[ServedRobot], say: Say, truth: Path | None, daemons_of: Sequence[Path]
+    clock: Clock,
+    robots: Sequence[ServedRobot],
+    say: Say,
+    truth: Path | None,
+    daemons_of: Sequence[Path],
+    beside: Beside | None,
 ) -> int:
     alone = len(robots) == 1
     stop = asyncio.Event()
@@ -219,8 +229,11 @@ async def _serve(
         prefix = "" if alone else f"{robot.config.robot}: "
         tasks += robot.tasks(lambda line, prefix=prefix: say(prefix + line))  # type: ignore[misc]
     known = CommandedGroup("robot", {robot.config.robot: robot.console for robot in robots})
-    console = FaultConsole(robots[0].console if alone else known, sys.stdin, say)
+    target = robots[0].console if alone else known
+    console = FaultConsole(target, sys.stdin, say)
     tasks.append(asyncio.create_task(console.run(), name="console"))
+    if beside is not None:
+        tasks.append(asyncio.create_task(beside(target), name="beside"))
     waiting = asyncio.create_task(stop.wait())
     settle()
     if not daemons_of:  # who will say themselves when all of their services are

@@ -85,6 +85,7 @@ INSTEAD = {
     "monstertruckd station --robot ann@tcp/192.168.1.7:7447 --robot bob@tcp/192.168.1.8:7447": Instead(
         None, "serves until it is stopped"
     ),
+    "monstertruckd try": Instead(None, "serves until it is stopped; tests/daemon/test_tryout_wall.py opens its page"),
     "monstertruckd station --foxglove": Instead(None, "serves until it is stopped; test_foxglove.py connects to it"),
     "monstertruckd ros2": Instead(None, "serves until it is stopped; tests/unit/ros2/test_face.py runs it"),
     "monstertruckd station --rerun": Instead(None, "serves until it is stopped; test_live.py draws without a viewer"),
@@ -180,6 +181,7 @@ INSTEAD |= {
 }
 FOREIGN = {
     "python3 -m monstertruckd.bootstrap demo": "sets up .venv, then `monstertruckd demo`, which has its own tests",
+    "python3 -m monstertruckd.bootstrap try": "sets up .venv, then `monstertruckd try`, which has its own tests",
     "python3 -m monstertruckd.bootstrap check": "runs this very test",
     "python3 -m monstertruckd.bootstrap sync": "sets up .venv; tests/unit/test_bootstrap.py checks what it runs",
     "python docs/site/build.py": "test_site.py builds it into another folder",

@@ -315,6 +315,30 @@ async def the_configured_path_is_started_by_its_name(page: Page) -> None:
     await say(page, {"kind": "answer", "id": asked["id"], "ok": True})
 
 
+async def an_emulated_robot_fails_and_gets_obstacles_by_hand(page: Page) -> None:
+    await say(page, {"kind": "emulated", "faults": {}})
+    assert not await page.is_visible("#tab-tryout"), "this robot is real"
+    await say(page, {"kind": "emulated", "faults": {"lidar": "none", "drive": "deaf"}, "obstacles": []})
+    await page.click("#tab-tryout")
+    assert await page.input_value("#fault-drive") == "deaf"
+    assert await page.is_disabled("#obstacle-clear")
+    await page.evaluate("void (window.sent = [])")
+    await page.select_option("#fault-lidar", "unplugged")
+    await page.click("#obstacle-add")
+    assert await page.get_attribute("#tool-goal", "aria-pressed") == "false"
+    await page.click("#map", position={"x": 200, "y": 150})
+    assert await page.get_attribute("#obstacle-add", "aria-pressed") == "false"
+    assert not await page.is_visible("#goal-go"), "this place is no goal"
+    asked = [each for each in await page.evaluate("window.sent") if "id" in each]
+    assert [(each["do"], each.get("fault")) for each in asked] == [("fault", "unplugged"), ("obstacle", None)]
+    assert len(asked[1]["at"]) == 2
+    await say(page, {"kind": "answer", "id": asked[0]["id"], "ok": False, "reason": "input", "text": "no such device"})
+    await page.wait_for_function("document.querySelector('#fault-lidar').value === 'none'")
+    assert "no such device" in await page.inner_text("#refusal")
+    await say(page, {"kind": "answer", "id": asked[1]["id"], "ok": True})
+    await page.click("#tab-drive")
+
+
 async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path: Path):
     """All in one browser, for it takes seconds to start."""
     async with serving() as (station, _), chromium(tmp_path) as browser:
@@ -339,4 +363,5 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page)
         await a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page)
         await the_configured_path_is_started_by_its_name(page)
+        await an_emulated_robot_fails_and_gets_obstacles_by_hand(page)
         assert errors == []

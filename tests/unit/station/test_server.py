@@ -32,15 +32,21 @@ async def serving(
     robots: Sequence[RobotAddress] = (NOBODY,), routers: Sequence[str] = ()
 ) -> AsyncIterator[tuple[Station, aiohttp.ClientSession]]:
     station = Station(robots, WallClock(), Place(port=free_port()), routers)
+    async with running(station) as session:
+        yield station, session
+
+
+@asynccontextmanager
+async def running(station: Station) -> AsyncIterator[aiohttp.ClientSession]:
     ready = asyncio.Event()
-    running = asyncio.create_task(station.run(ready.set))
+    serves = asyncio.create_task(station.run(ready.set))
     try:
         await ready.wait()
         async with aiohttp.ClientSession(station.place.url) as session:
-            yield station, session
+            yield session
     finally:
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
+        serves.cancel()
+        await asyncio.gather(serves, return_exceptions=True)
 
 
 def connected(station: Station, session: aiohttp.ClientSession) -> AbstractAsyncContextManager[Any]:

@@ -1,0 +1,58 @@
+"""An emulated robot that runs in the station's own process: faults of its devices, obstacles in its world."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+from monstertruck_runtime.errors import InputError
+from monstertruckd.station.commands import DeviceFault
+
+FAULTS: Final[Mapping[DeviceFault, Sequence[str]]] = {
+    "none": ("plug", "line deaf off", "line flip_rate 0"),
+    "unplugged": ("unplug",),
+    "deaf": ("line deaf on",),
+    "noise": ("line flip_rate 0.02",),
+}
+"""Commands that make a fault; those of ``none`` end all faults."""
+
+
+class EmulatedWorld:
+    """Faults and obstacles of one emulated robot.
+
+    Args:
+        devices: roles of its emulated devices.
+        command: carries out one command of the emulator's console; raises InputError.
+    """
+
+    def __init__(self, devices: Sequence[str], command: Callable[[list[str]], None]) -> None:
+        self._command = command
+        self._faults: dict[str, DeviceFault] = dict.fromkeys(devices, "none")
+        self._obstacles: list[tuple[float, float]] = []
+
+    def state(self) -> dict[str, Any]:
+        """Present faults by device, and places of obstacles, m."""
+        return {"faults": self._faults, "obstacles": self._obstacles}
+
+    def inject(self, device: str, fault: DeviceFault) -> None:
+        """Replace the fault of a device.
+
+        Raises:
+            InputError: there is no such device, or its emulator refuses.
+        """
+        if device not in self._faults:
+            raise InputError(f"device {device!r}: expected one of {', '.join(self._faults)}")
+        for line in (*FAULTS["none"], *(FAULTS[fault] if fault != "none" else ())):
+            self._command([device, *line.split()])
+        self._faults[device] = fault
+
+    def place(self, at: tuple[float, float] | None) -> None:
+        """Put an obstacle at a place of the world, m; None removes all.
+
+        Raises:
+            InputError: the robot is there.
+        """
+        if at is None:
+            self._command(["room", "clear"])
+            self._obstacles.clear()
+        else:
+            self._command(["room", "post", *map(str, at)])
+            self._obstacles.append(at)
