@@ -20,6 +20,7 @@ from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_estimation.slam.service import SlamService
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.steps import CODEC
 from monstertruck_runtime.actors.actor import ActorFactory
@@ -188,7 +189,7 @@ class Daemon:
                 self._start_serving(estimation, service)
             for service in self._peer_services():
                 self._start(estimation, service)
-            for service in build_planners(*parts, None if slam is None else slam.save_soon):
+            for service in build_planners(*parts, slam.save_soon if isinstance(slam, SlamService) else None):
                 self._start_serving(planners, service)
             if self._notify is not None:
                 self._notify.up()

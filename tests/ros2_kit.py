@@ -157,7 +157,7 @@ def answering(robot, clock):
 
 
 @asynccontextmanager
-async def scene(options=None):
+async def scene(options=None, facts=FACTS):
     options = options or FaceOptions()
     async with running_robot() as robot:
         clock, ros = WallClock(), free_endpoint()
@@ -186,7 +186,7 @@ async def scene(options=None):
                     lambda _, text: texts.append(text),
                 )
                 ready = asyncio.Event()
-                face = RosFace(client, node, operators, FACTS, options, clock)
+                face = RosFace(client, node, operators, facts, options, clock)
                 running.append(tasks.create_task(face.run(ready.set)))
                 await asyncio.wait_for(ready.wait(), 10)
                 requests = robot.bus.subscribe(t.REQ_DRIVE, fifo(1000))

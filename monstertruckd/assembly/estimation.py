@@ -20,6 +20,7 @@ from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.points.service import READER_START_TIMEOUT as READER_START
 from monstertruck_estimation.points.service import TARGET as READER
 from monstertruck_estimation.points.service import PointFolders, PointInputs, PointService
+from monstertruck_estimation.slam.outside import OutsideLocalisation
 from monstertruck_estimation.slam.service import SlamService
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount, quaternion_from_rpy
 from monstertruck_kinematics.chassis import Chassis
@@ -92,7 +93,7 @@ def build_estimation(
     clock: Clock,
     body: Body,
     actors: ActorFactory,
-    slam: SlamService | None,
+    slam: SlamService | OutsideLocalisation | None,
     run: str = "",
 ) -> Iterator[Service]:
     """Transforms always; odometry where the robot can drive and steer. ``run`` names this run in saved maps."""
@@ -126,7 +127,8 @@ def build_estimation(
     if ground is not None:
         yield ground
     if config.points is not None:
-        yield _build_points(config, config.points, bus, clock, slam, run)
+        mapper = slam if isinstance(slam, SlamService) else None
+        yield _build_points(config, config.points, bus, clock, mapper, run)
 
 
 def _build_consistency(
@@ -178,7 +180,7 @@ def _build_ground(config: TruckConfig, bus: Bus, clock: Clock, run: str) -> Grou
     if config.ground is None or config.planner is None or devices.compass is None:
         return None
     lidar = devices.lidar
-    known = slam.map if slam is not None else config.planner.map
+    known = config.planner.map if slam is None or slam.mode == "ros2" else slam.map
     geometry = config.geometry
     return GroundService(
         config.ground,
@@ -210,7 +212,8 @@ def _build_points(
     camera, slam = config.devices.camera, config.slam
     if camera is not None and find_spec("cv2") is None:
         raise not_installed("points: opencv", "vision")
-    known = slam.map if slam is not None else None if config.planner is None else config.planner.map
+    planned = None if config.planner is None else config.planner.map
+    known = planned if slam is None or slam.mode == "ros2" else slam.map
     folder = _folder(known)
     mapping = slam is not None and slam.mode == "mapping"
     return PointService(
@@ -241,9 +244,21 @@ def _build_points(
     )
 
 
-def build_slam(config: TruckConfig, bus: Bus, clock: Clock, run: str = "") -> SlamService | None:
-    """Where the robot makes a map, or finds its place in one. ``run`` names this run in saved maps."""
+def build_slam(config: TruckConfig, bus: Bus, clock: Clock, run: str = "") -> SlamService | OutsideLocalisation | None:
+    """Build what makes a map, localises in one, or follows a client. ``run`` names this run in saved maps."""
     devices = config.devices
+    if config.slam is not None and config.slam.mode == "ros2":
+        return OutsideLocalisation(
+            config.slam,
+            clock,
+            requests=bus.subscribe(topics.REQ_LOCALISATION, fifo(16)),
+            gate=bus.subscribe(topics.GATE, latest()),
+            odometry=bus.subscribe(topics.ODOMETRY, fifo(ODOMETRIES)),
+            pose=bus.publisher(topics.POSE, Writer.ESTIMATION),
+            health=bus.publisher(topics.SLAM, Writer.ESTIMATION),
+            events=bus.event_sink(),
+            max_age=config.gate.max_request_age,
+        )
     if config.slam is None or devices.lidar is None:
         return None
     return SlamService(

@@ -190,7 +190,8 @@ def build_goals(
     lidar, mapped = config.devices.lidar, config.slam is not None
     assert config.tracker is not None
     planner = _within_reach(planner, chassis.reached_angle)
-    planner = planner.model_copy(update={"map": None}) if mapped else planner
+    if config.slam is not None and config.slam.mode != "ros2":
+        planner = planner.model_copy(update={"map": None})
     mount = lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0)
     obstacle = config.gate.obstacle
     setup = Setup(

@@ -24,7 +24,16 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, Order, Request
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.sensor import StandPose
-from monstertruck_schemas.topics import ESTOP_WAY, REQ_CONTROL, REQ_DRIVE, REQ_PATH, STAND_POSE, Topic, owner_of
+from monstertruck_schemas.topics import (
+    ESTOP_WAY,
+    REQ_CONTROL,
+    REQ_DRIVE,
+    REQ_LOCALISATION,
+    REQ_PATH,
+    STAND_POSE,
+    Topic,
+    owner_of,
+)
 from monstertruckd.bus.access import Sender, role_needed
 from monstertruckd.bus.local import Bus
 
@@ -52,6 +61,7 @@ LIMITS: Final = {
     REQ_DRIVE.name: Limit(rate=200.0),
     REQ_CONTROL.name: Limit(rate=None),
     REQ_PATH.name: Limit(size=131_072),
+    REQ_LOCALISATION.name: Limit(rate=20.0),
 }
 """All others: ``Limit()``. What an order asks is known once it is decoded: see ``ORDER_RATE``. A path of 2000 poses
 fits."""

@@ -279,10 +279,7 @@ class TruckConfig(Schema):
             raise ValueError(f"peers.{self.robot}: expected other robots than this one")
         if self.lidar_sonars is not None and (self.devices.lidar is None or self.devices.sonar is not None):
             raise ValueError("lidar_sonars needs the device lidar, and no device sonar")
-        if self.slam is not None and self.devices.lidar is None:
-            raise ValueError("slam needs the device lidar")
-        if self.slam is not None and self.slam.mode == "localisation" and self.slam.map is None:
-            raise ValueError("slam.mode localisation needs slam.map, the folder of a saved map")
+        self._check_slam()
         measuring = [place for place, _ in packs(self.devices, self.monitors)]
         if len(measuring) > 1:
             raise ValueError(f"{' and '.join(measuring)} both measure the battery; set the other one null")
@@ -327,14 +324,25 @@ class TruckConfig(Schema):
                 f"{math.degrees(WHEEL_REACH):.0f} of wheels that are steered one by one"
             )
 
+    def _check_slam(self) -> None:
+        slam = self.slam
+        if slam is None:
+            return
+        if slam.mode == "ros2" and (lack := self.missing_actuators()):
+            raise ValueError(f"slam.mode ros2 needs {lack}: it corrects odometry")
+        if slam.mode != "ros2" and self.devices.lidar is None:
+            raise ValueError("slam needs the device lidar, except in mode ros2")
+        if slam.mode == "localisation" and slam.map is None:
+            raise ValueError("slam.mode localisation needs slam.map, the folder of a saved map")
+
     def _check_planner(self) -> None:
         planner = self.planner
         if planner is None:
             return
         if self.tracker is None:
             raise ValueError("a planner needs a tracker, which follows its routes")
-        if self.slam is None and planner.map is None:
-            raise ValueError("a planner needs a map: planner.map, or slam")
+        if (self.slam is None or self.slam.mode == "ros2") and planner.map is None:
+            raise ValueError("a planner needs a map: planner.map, or slam that makes or has one")
         if planner.angle > self.tracker.angle:
             raise ValueError(f"planner.angle {planner.angle} rad: expected at most tracker.angle, {self.tracker.angle}")
         chassis = self.chassis()

@@ -61,6 +61,8 @@ class FaceOptions:
     """Publish ``/clock``."""
     drives: bool = True
     """Whether ROS 2 nodes may ask for anything but an emergency stop."""
+    plans: bool = True
+    """Whether the robot's own planner serves goals; False where Nav2 does and drives by ``cmd_vel``."""
 
 
 class RosFace:
@@ -96,6 +98,8 @@ class RosFace:
         """Whether there is dead reckoning: it moves base in odom more often than the frame tree does."""
         self._fixed: list[Any] = []
         """Fixed transforms as published last."""
+        self._localised_at = 0
+        """When a correction of the pose was passed on last, ns."""
         self._map: Grid | None = None
         self._steering: SteeringFeedback | None = None
         self._stabiliser: StabiliserFeedback | None = None
@@ -114,15 +118,16 @@ class RosFace:
             raise NoAnswerError(f"robot {self._client.robot!r} does not publish {t.CLOCK.name}") from None
         self._describe()
         self._listen()
+        navigation = None
         if self._options.drives:
-            navigation = Navigation(
-                self._node, self._operators, self._client, self._goal_in, lambda: self._names, self._clock
-            )
             RosParameters(self._node, self._operators, self._client)
+            if self._options.plans:
+                arguments = self._goal_in, lambda: self._names, self._clock
+                navigation = Navigation(self._node, self._operators, self._client, *arguments)
         try:
             await self._serve(clock, ready)
         finally:
-            if self._options.drives:
+            if navigation is not None:
                 navigation.close()
 
     async def _serve(self, clock: Mailbox[ClockOffset], ready: Callable[[], object]) -> None:
@@ -201,7 +206,7 @@ class RosFace:
         moving, fixed = [], []
         for row in message.transforms:
             if row.child == "odom":
-                moving += [row] if self._options.map_to_odom else []
+                moving += [row] if self._options.map_to_odom and self._facts.localised else []
             elif row.child == "base":
                 moving += [row] if self._options.odom_to_base and not self._odometry else []
             elif row.child == "stabiliser":
@@ -326,9 +331,13 @@ class RosFace:
         self._node.subscribe("cmd_vel", "geometry_msgs/msg/Twist", self._twist)
         self._node.subscribe("cmd_vel", "geometry_msgs/msg/TwistStamped", self._twist_stamped)
         self._node.subscribe("ackermann_cmd", "ackermann_msgs/msg/AckermannDriveStamped", self._ackermann)
-        self._node.subscribe("goal_pose", "geometry_msgs/msg/PoseStamped", self._goal)
-        interface = "geometry_msgs/msg/PoseWithCovarianceStamped"
-        self._node.subscribe("initialpose", interface, self._initial_pose)
+        if self._options.plans:
+            self._node.subscribe("goal_pose", "geometry_msgs/msg/PoseStamped", self._goal)
+        if self._facts.localised:
+            interface = "geometry_msgs/msg/PoseWithCovarianceStamped"
+            self._node.subscribe("initialpose", interface, self._initial_pose)
+        else:
+            self._node.subscribe("/tf", "tf2_msgs/msg/TFMessage", self._localise)
 
     async def _order(self, order: Order, _: RosMessage, sender: RosSender | None) -> Mapping[str, Any]:
         if order is Order.ESTOP:
@@ -399,6 +408,24 @@ class RosFace:
         position, orientation = goal["pose"]["position"], goal["pose"]["orientation"]
         yaw = yaw_of((orientation["x"], orientation["y"], orientation["z"], orientation["w"]))
         return (position["x"], position["y"], yaw), frames[frame]
+
+    def _localise(self, arrival: RosArrival) -> None:
+        """Pass on where odom is in map; ``amcl`` dates it ahead, so only the time of sending is checked."""
+        ends = self._names.frame("map"), self._names.frame("odom")
+        rows = [
+            row
+            for row in arrival.message["transforms"]
+            if (row["header"]["frame_id"].lstrip("/"), row["child_frame_id"].lstrip("/")) == ends
+        ]
+        now, period = self._clock.now(), SECOND // 10  # between two corrections that are passed on, ns
+        if not rows or now - self._localised_at < period:
+            return
+        sender = self._operators.accepted("/tf", arrival, lambda _: None)
+        if sender is not None:
+            self._localised_at = now
+            place, turn = rows[-1]["transform"]["translation"], rows[-1]["transform"]["rotation"]
+            correction = place["x"], place["y"], yaw_of((turn["x"], turn["y"], turn["z"], turn["w"]))
+            self._operators.drive(sender, "/tf", lambda client: client.localise(correction))
 
     def _initial_pose(self, arrival: RosArrival) -> None:
         node = "an unknown publisher" if arrival.sender is None else arrival.sender.node

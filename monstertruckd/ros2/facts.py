@@ -31,6 +31,8 @@ class RobotFacts:
     description: str | None = None
     """URDF with the robot's own names of frames; None = its body has none."""
     joints: "WheelJoints | None" = None
+    localised: bool = True
+    """Whether the robot finds its place by itself; False where it takes map to odom from ROS 2."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -29,9 +29,6 @@ GoalPose = tuple[tuple[float, float, float], str]
 
 PoseReader = Callable[[RosMessage], GoalPose]
 """Reads a ``geometry_msgs/msg/PoseStamped``; raises ``InputError`` for another frame."""
-
-STILL: Final = 0.02
-"""Speed below which no time of arrival is estimated, m/s."""
 
 
 def _require_own_planner(goal: RosMessage) -> None:
@@ -126,7 +123,7 @@ class GoalAction(RobotAction[PosesToReach]):
         }
         if pose is not None:
             values["current_pose"] = {"header": names.header(pose), "pose": convert.pose_of(pose.pose)}
-            if (speed := abs(pose.twist.vx)) > STILL:
+            if (speed := abs(pose.twist.vx)) > 0.02:  # m/s; below it the time of arrival is not known
                 values["estimated_time_remaining"] = _duration(state.remaining / speed)
         return values
 

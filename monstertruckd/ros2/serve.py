@@ -10,6 +10,7 @@ from typing import Any, Final
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.stations import tls_for
+from monstertruck_schemas.req import Role
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.ros2.face import FaceOptions, RosFace
 from monstertruckd.ros2.facts import RobotFacts
@@ -73,13 +74,17 @@ async def serve_face(
     tls = tls_for(address.endpoint)
     owner = None if tls is None else tls.owner()
 
-    def connect(source: str) -> TruckClient:
-        return TruckClient(address.name, address.endpoint, source=source, clock=clock, timeout=TIMEOUT, tls=tls)
-
     async with address.session("ros2", clock, TIMEOUT) as client:
         running = await client.call("config")
         running.pop("sim", None)
         config = TruckConfig.model_validate_json(json.dumps(running))
+
+        def connect(source: str) -> TruckClient:
+            role = Role.TRACKER if source in config.gate.remote_trackers else Role.STATION
+            return TruckClient(
+                address.name, address.endpoint, source=source, role=role, clock=clock, timeout=TIMEOUT, tls=tls
+            )
+
         async with join() as node:
             operators = Operators(connect, owner, clock, remarks.add)
             try:

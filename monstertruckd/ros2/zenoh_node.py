@@ -260,7 +260,8 @@ class ZenohNode:
 
         self._token(EntityKind.SUBSCRIPTION, name, interface)
         handler = in_network_thread(receive)
-        self._kept.append(self._session.declare_subscriber(self._key(name, interface), handler))
+        others = zenoh.Locality.REMOTE  # not this node's own messages
+        self._kept.append(self._session.declare_subscriber(self._key(name, interface), handler, allowed_origin=others))
 
     # Services
 

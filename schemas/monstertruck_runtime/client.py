@@ -29,7 +29,7 @@ from monstertruck_runtime.requests import Operator
 from monstertruck_runtime.robots import only_robot
 from monstertruck_runtime.stations import ClientTls, own_source, require_certificates, session_config, tls_for
 from monstertruck_runtime.threads import ThreadHop, in_daemon_thread, in_thread
-from monstertruck_schemas.base import Message
+from monstertruck_schemas.base import Message, Pose2D
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import Path as DrivePath
 from monstertruck_schemas.points import PointOrder
@@ -40,6 +40,7 @@ from monstertruck_schemas.req import (
     DriveRequest,
     ExploreOrder,
     GoalOrder,
+    LocalisationRequest,
     MissionOrder,
     Order,
     PathRequest,
@@ -52,6 +53,7 @@ from monstertruck_schemas.topics import (
     GATE,
     REQ_CONTROL,
     REQ_DRIVE,
+    REQ_LOCALISATION,
     REQ_PATH,
     SOURCE_NAME,
     STAND_POSE,
@@ -492,6 +494,15 @@ class TruckClient(Operator):
     async def path(self, path: DrivePath, lease: float = 1.0) -> None:
         """Request to follow a path computed here. Raises as ``drive`` does."""
         self._put(REQ_PATH, PathRequest(**await self.header(lease), frame=path.frame, path=path))
+
+    async def localise(self, map_from_odom: tuple[float, float, float], lease: float = 1.0) -> None:
+        """Tell a robot with ``slam.mode: ros2`` the pose of odom in map (m, m, rad); it stands for ``lease`` seconds.
+
+        Raises as ``drive`` does.
+        """
+        x, y, yaw = map_from_odom
+        correction = Pose2D(x=x, y=y, yaw=yaw)
+        self._put(REQ_LOCALISATION, LocalisationRequest(**await self.header(lease), correction=correction))
 
     def _put(self, topic: Topic[M], message: M, key: Callable[[str, str], str] | None = None) -> None:
         assert topic.writer is Writer.OUTSIDE

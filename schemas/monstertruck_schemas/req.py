@@ -321,6 +321,12 @@ class PathRequest(Request):
     path: Path
 
 
+class LocalisationRequest(Request):
+    """Pose of odom in map, found by a localisation off board; it stands for the lease."""
+
+    correction: Pose2D
+
+
 class PathStart(Request):
     """Drive the path of the configuration once, until its end or until the robot is disarmed."""
 

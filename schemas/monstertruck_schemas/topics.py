@@ -38,7 +38,14 @@ from monstertruck_schemas.plan import (
     TrackerState,
 )
 from monstertruck_schemas.points import PointsOfInterest
-from monstertruck_schemas.req import ControlRequest, DriveRequest, GoalControl, GoalRequest, PathRequest
+from monstertruck_schemas.req import (
+    ControlRequest,
+    DriveRequest,
+    GoalControl,
+    GoalRequest,
+    LocalisationRequest,
+    PathRequest,
+)
 from monstertruck_schemas.sensor import (
     Attitude,
     Battery,
@@ -334,6 +341,9 @@ REQ_CONTROL: Final = Topic("req/control", ControlRequest, W.OUTSIDE, "Arm, disar
 REQ_GOAL: Final = Topic("req/goal", GoalRequest, W.OUTSIDE, "A pose to drive to")
 REQ_GOAL_CONTROL: Final = Topic("req/goal_control", GoalControl, W.OUTSIDE, "Pause, resume or cancel the goal")
 REQ_PATH: Final = Topic("req/path", PathRequest, W.OUTSIDE, "A path computed off board")
+REQ_LOCALISATION: Final = Topic(
+    "req/localisation", LocalisationRequest, W.OUTSIDE, "Pose of odom in map, by a localisation off board"
+)
 
 STAND_POSE: Final = Topic(
     "stand/pose",

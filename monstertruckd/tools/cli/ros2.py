@@ -25,6 +25,13 @@ class Face(StrEnum):
     RCLPY = "rclpy"
 
 
+class Planning(StrEnum):
+    """Who plans."""
+
+    ROBOT = "robot"
+    ROS2 = "ros2"
+
+
 class Distribution(StrEnum):
     """ROS 2 distributions by their type hashes."""
 
@@ -72,6 +79,10 @@ def ros2(
     odom_to_base: Annotated[
         bool, typer.Option(help="Publish odom to base_link; off where robot_localization does.")
     ] = True,
+    planner: Annotated[
+        Planning,
+        typer.Option("--planner", help="ros2: Nav2 serves goals and drives by cmd_vel, so no action is offered here."),
+    ] = Planning.ROBOT,
     clock: Annotated[bool, typer.Option("--clock", help="Publish /clock, for nodes with use_sim_time.")] = False,
     drive: Annotated[
         bool, typer.Option(help="Let ROS 2 nodes drive, arm and send goals; the emergency stop they always may.")
@@ -95,7 +106,7 @@ def ros2(
 
     address = RobotAddress.default() if robot is None else RobotAddress.parse(robot)
     own = free_endpoint(listen)
-    options = FaceOptions(prefix, map_to_odom, odom_to_base, clock, drive)
+    options = FaceOptions(prefix, map_to_odom, odom_to_base, clock, drive, planner is Planning.ROBOT)
     hashed = distribution is not Distribution.HUMBLE
 
     node = (address.name, namespace)
@@ -134,4 +145,5 @@ def robot_facts(config: "TruckConfig") -> "RobotFacts":
     if config.body.kind in ("truck", "ackermann"):
         wheels = WheelJoints(config.chassis(), geometry.track, geometry.drive_ratio)
     lens = None if camera is None else getattr(camera.driver, "lens", None)
-    return RobotFacts(geometry.length, geometry.width, lens, description, wheels)
+    localised = config.slam is None or config.slam.mode != "ros2"
+    return RobotFacts(geometry.length, geometry.width, lens, description, wheels, localised)

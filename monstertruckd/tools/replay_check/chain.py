@@ -15,7 +15,7 @@ from monstertruck_planners.track.paths import PathService
 from monstertruck_runtime import wire
 from monstertruck_runtime.actors.actor import use_delivery
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError
 from monstertruck_runtime.ports import Publisher
 from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
@@ -69,8 +69,11 @@ def replayable(config: TruckConfig) -> TruckConfig:
 
     Raises:
         NotFoundError: the saved map it localises in is not there.
+        InputError: it was localised off board.
     """
     slam = config.slam
+    if slam is not None and slam.mode == "ros2":
+        raise InputError("slam.mode ros2: where the robot was came from outside, and is not computed again")
     if slam is not None:
         if slam.mode == "localisation" and (slam.map is None or not slam.map.is_dir()):
             raise NotFoundError(f"slam.map: {slam.map}: no such folder; the log does not hold it")

@@ -83,9 +83,10 @@ class GridConfig(Schema):
 
 
 class SlamConfig(Schema):
-    """Simultaneous localisation and mapping, or localisation in a saved map."""
+    """Simultaneous localisation and mapping, or localisation in a saved map, or by a program off board."""
 
-    mode: Literal["mapping", "localisation"] = "mapping"
+    mode: Literal["mapping", "localisation", "ros2"] = "mapping"
+    """`ros2`: a client localises, such as `monstertruckd ros2` with amcl or slam_toolbox; no scan is matched here"""
     map: Path | None = None
     """Folder of the saved map; needed for localisation"""
     save: Path | None = None
@@ -109,6 +110,8 @@ class SlamConfig(Schema):
     """Rate at which the pose in map follows corrections at most, m/s and rad/s, so that it does not jump."""
     jump: Positive = 1.0
     """Corrections greater than this are applied immediately, m"""
+    deviation: tuple[Positive, Positive] = (0.1, 0.05)
+    """Standard deviation of a pose that was localised off board, m and rad"""
     latency: Annotated[float, Field(gt=0, le=1)] = 0.03
     """Seconds after which a step of the worker counts on the virtual clock"""
     deadline: Annotated[float, Field(gt=0, le=60)] = 20.0

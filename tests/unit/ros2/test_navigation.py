@@ -3,26 +3,30 @@
 import asyncio
 import math
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
+from monstertruck_estimation.transforms import planar
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.mailbox import latest
+from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import HealthTable, ServiceHealth, ServiceState
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
+from monstertruck_schemas.state import Transforms
 from monstertruckd.ros2.actions import GoalStatus
 from monstertruckd.ros2.cdr import decode
+from monstertruckd.ros2.face import FaceOptions
 from monstertruckd.ros2.interfaces import action_edition
 from monstertruckd.ros2.navigation import NavigateThroughPoses, path_in
-from monstertruckd.ros2.rmw import data_key
+from monstertruckd.ros2.rmw import RELIABLE, data_key
 from tests.bus_kit import odometry
-from tests.ros2_kit import asking, pose, scene
+from tests.ros2_kit import FACTS, Reader, asking, pose, scene
 
 THROUGH, FOLLOW = "nav2_msgs/action/NavigateThroughPoses", "nav2_msgs/action/FollowPath"
 
@@ -290,3 +294,53 @@ def test_positions_in_the_order_of_the_message():
     path = path_in({"header": {}, "poses": [heading(0.0, 0.0), heading(1.0, 0.0)]}, read_pose, 5)
     assert np.array_equal(path.poses, [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
     assert path.stamp == 5
+
+
+# ROS 2 in the robot's place
+
+
+def map_to_odom(x, parent="map", child="odom"):
+    row = {"translation": {"x": x}, "rotation": {"w": 1.0}}
+    return {"transforms": [{"header": {"frame_id": parent}, "child_frame_id": child, "transform": row}]}
+
+
+async def publish_tf(node, rows):
+    publish = node.publisher("/tf", "tf2_msgs/msg/TFMessage", RELIABLE)
+    await asyncio.sleep(0.3)  # until the graph has it
+    for row in rows:
+        publish(row)
+        await asyncio.sleep(0.11)
+
+
+async def test_a_robot_that_ros_2_localises_gets_map_to_odom_and_publishes_none():
+    facts = replace(FACTS, localised=False)
+    async with scene(facts=facts) as found, found.node("amcl") as node:
+        corrections = found.robot.bus.subscribe(t.REQ_LOCALISATION, fifo(100))
+        reader = Reader(found)
+        reader.follow("/tf", "tf2_msgs/msg/TFMessage")
+        tree = Transforms(
+            stamp=9, received=9, seq=1, frame="map", transforms=(planar("map", "odom", 9, (7.0, 0.0, 0.0)),)
+        )
+        found.robot.bus.publisher(t.TRANSFORMS, t.TRANSFORMS.writer).put(tree)
+        foreign = [map_to_odom(9.0, "map", "other"), map_to_odom(9.0, "world", "odom")]
+        await publish_tf(node, [*foreign, *(map_to_odom(step / 10) for step in range(1, 9))])
+        await found.until(lambda: corrections.latest is not None)
+        received = corrections.drain()
+        assert {request.source for request in received} == {"ros2:amcl"}
+        assert received[-1].correction.x == pytest.approx(0.8)
+        assert 9.0 not in {request.correction.x for request in received}
+        sent = reader.messages.get("/tf", {"transforms": []})["transforms"]
+        assert 7.0 not in {row["transform"]["translation"]["x"] for row in sent}
+        reader.close()
+
+
+async def test_where_nav2_plans_no_goal_is_taken_from_ros_2():
+    async with scene(FaceOptions(plans=False)) as found, found.node("rviz") as node, asking(found) as client:
+        publish = node.publisher("goal_pose", "geometry_msgs/msg/PoseStamped", RELIABLE)
+        await asyncio.sleep(0.3)
+        publish(pose(1.0))
+        tokens = await asyncio.to_thread(lambda: list(client.session.liveliness().get("@ros2_lv/0/**", timeout=0.5)))
+        served = [str(reply.ok.key_expr) for reply in tokens if "/truck/" in str(reply.ok.key_expr)]
+        assert any("%cmd_vel" in key for key in served)
+        assert not any("navigate" in key or "lifecycle" in key or "goal_pose" in key for key in served)
+        assert not found.outcomes

@@ -163,6 +163,7 @@ FIELDS: dict[t.Topic[Any], dict[str, Any]] = {
             st.text(), st.none() | st.booleans() | st.integers(-(2**40), 2**40) | number | st.text(), max_size=3
         )
     },
+    t.REQ_LOCALISATION: {"correction": poses},
     t.SLAM: {"overlap": st.floats(0, 1)},
     t.SCAN_MOTION: {"motion": poses, "covariance": hnp.arrays(np.float64, 9, elements=number)},
     t.STOP: {"number": st.integers(1, 2**40), "causes": st.lists(causes, min_size=1, max_size=3).map(tuple)},

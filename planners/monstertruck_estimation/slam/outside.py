@@ -1,0 +1,167 @@
+"""Localisation by a program off board: pose in map from odometry and the corrections that clients send."""
+
+import asyncio
+
+import numpy as np
+
+from monstertruck_estimation.correction import SmoothedCorrection
+from monstertruck_estimation.slam.config import SlamConfig
+from monstertruck_estimation.slam.service import carried_on
+from monstertruck_estimation.transforms import planar
+from monstertruck_kinematics.se2 import Pose2
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import RequestRefusedError
+from monstertruck_runtime.mailbox import Mailbox
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_runtime.requests import Sequences, examine
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.health import LocalisationStatus, OdometryUse, SlamHealth
+from monstertruck_schemas.plan import MAX_COORDINATE
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import LocalisationRequest
+from monstertruck_schemas.roles import ServiceName
+from monstertruck_schemas.state import GateState, Odometry, Transform
+
+
+class OutsideLocalisation:
+    """Follows odometry by the newest correction of one client, which must renew it within its lease.
+
+    Requests are examined as those for driving are: nonce, sequence, age and role of the sender. While the lease of one
+    source runs, corrections of others are refused. Without corrections the pose goes on by odometry and counts as lost.
+
+    Args:
+        config: slew, jump and deviation.
+        clock: time.
+        requests: ``req/localisation``.
+        gate: state of the gate.
+        odometry: pose in odom.
+        pose: ``state/pose``.
+        health: ``health/slam``.
+        events: where refusals, and pose lost and found, are reported.
+        max_age: see ``GateConfig.max_request_age``, s.
+    """
+
+    name = ServiceName.SLAM.value
+
+    def __init__(
+        self,
+        config: SlamConfig,
+        clock: Clock,
+        *,
+        requests: Mailbox[LocalisationRequest],
+        gate: Subscription[GateState],
+        odometry: Mailbox[Odometry],
+        pose: Publisher[Odometry],
+        health: Publisher[SlamHealth],
+        events: EventSink,
+        max_age: float,
+    ) -> None:
+        self._clock = clock
+        self._requests, self._gate, self._odometry = requests, gate, odometry
+        self._pose, self._health, self._events = pose, health, events
+        self._max_age = max_age
+        self._sequences = Sequences(max_age)
+        self._correction = SmoothedCorrection(config.slew, config.jump)
+        deviation, turn = config.deviation
+        self._covariance = np.diag((deviation**2, deviation**2, turn**2)).ravel()
+        self._latest: Odometry | None = None
+        self._corrected_at: Odometry | None = None
+        """Odometry at the newest correction."""
+        self._source, self._until = "", 0
+        """Client that localises, and the end of its lease, ns."""
+        self._status = LocalisationStatus.SEARCHING
+        self._corrections = 0
+        self._refused = 0
+        self._said: dict[Reason, int] = {}
+        """When a refusal was reported last, ns, by reason."""
+        self._due = 0
+
+    def frames(self) -> tuple[Transform, ...]:
+        """Odom in map as published."""
+        stamp = 1 if self._latest is None else self._latest.stamp
+        return (planar("map", "odom", stamp, self._correction.value),)
+
+    async def run(self, ready: Ready) -> None:
+        """Serve until cancelled."""
+        ready()
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._take_corrections())
+            tasks.create_task(self._follow())
+
+    async def _take_corrections(self) -> None:
+        async for request in self._requests:
+            try:
+                self._take(request)
+            except RequestRefusedError as error:
+                self._refused += 1
+                now, quiet = self._clock.now(), SECOND  # between two events for one reason, ns
+                if now - self._said.get(error.refusal, -quiet) >= quiet:
+                    self._said[error.refusal] = now
+                    self._events(error.refusal, Severity.WARNING, request.source, f"localisation refused: {error}")
+
+    def _take(self, request: LocalisationRequest) -> None:
+        """Follow a correction.
+
+        Raises:
+            RequestRefusedError: the sender may not, another one localises, or it is no pose.
+        """
+        now, correction = self._clock.now(), request.correction
+        examine(request, self._gate.latest, self._sequences, now, self._max_age)
+        if now < self._until and request.source != self._source:
+            raise RequestRefusedError(Reason.BUSY, f"{self._source} localises the robot")
+        numbers = (correction.x, correction.y, correction.yaw)
+        if max(map(abs, numbers)) > MAX_COORDINATE:
+            raise RequestRefusedError(Reason.BAD_INPUT, f"correction: expected at most {MAX_COORDINATE:g} m and rad")
+        found = self._status is not LocalisationStatus.LOCALISED
+        self._correction.set_target(numbers, at_once=found)
+        self._source, self._until = request.source, now + round(request.lease * SECOND)
+        self._corrected_at = self._latest
+        self._corrections += 1
+        if found:
+            self._status = LocalisationStatus.LOCALISED
+            self._events(Reason.POSE_FOUND, Severity.INFO, self.name, f"by {request.source}")
+
+    async def _follow(self) -> None:
+        async for message in self._odometry:
+            before, self._latest = self._latest, message
+            elapsed = 0.0 if before is None else max(message.stamp - before.stamp, 0) / SECOND
+            odom: Pose2 = (message.pose.x, message.pose.y, message.pose.yaw)
+            x, y, yaw = self._correction.pose(odom, elapsed)
+            covariance = self._covariance
+            if self._corrected_at is not None:
+                covariance = carried_on(covariance, self._corrected_at, message, self._correction.value[2])
+            update = {
+                "frame": "map",
+                "seq": self._pose.next_seq(),
+                "pose": Pose2D(x=x, y=y, yaw=yaw),
+                "pose_covariance": covariance,
+            }
+            self._pose.put(message.model_copy(update=update))
+            self._report(self._clock.now())
+
+    def _report(self, now: int) -> None:
+        if self._status is LocalisationStatus.LOCALISED and now >= self._until:
+            self._status = LocalisationStatus.LOST
+            text = f"{self._source} sends no correction any more: the pose is odometry"
+            self._events(Reason.POSE_LOST, Severity.WARNING, self.name, text)
+        if now < self._due:
+            return
+        self._due = now + SECOND // 10
+        self._health.put(
+            SlamHealth(
+                stamp=now,
+                received=now,
+                seq=self._health.next_seq(),
+                frame="map",
+                standing=self._status,
+                accepted=self._status is LocalisationStatus.LOCALISED,
+                overlap=0.0,
+                residual=0.0,
+                degeneracy=0.0,
+                direction=0.0,
+                scans=self._corrections,
+                rejected=self._refused,
+                odometry=OdometryUse.USED,
+            )
+        )

@@ -1,0 +1,141 @@
+"""A node of ROS 2 in the place of Nav2 and amcl: it localises the robot, drives it to a goal by cmd_vel, and dies."""
+
+import asyncio
+import math
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.errors import NotFoundError, RequestRefusedError
+from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_schemas import topics
+from monstertruck_schemas.health import LocalisationStatus
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.state import GateMode
+from monstertruckd.ros2.rmw import RELIABLE
+from monstertruckd.ros2.zenoh_node import ZenohNode, session_settings
+from tests.daemon.wall_kit import end, free_endpoint, robot
+
+pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
+
+OFFSET = (5.0, 3.0)
+"""Odom in map, m: what only the node knows."""
+
+
+class Nav2:
+    """``/amcl`` localises by odometry, ``/nav2`` steers straight at a goal in map, each 20 times a second."""
+
+    def __init__(self, node: ZenohNode, amcl: ZenohNode) -> None:
+        self.goal = (0.0, 0.0)
+        self.odom: tuple[float, float, float] | None = None
+        self._cmd_vel = node.publisher("cmd_vel", "geometry_msgs/msg/Twist", RELIABLE)
+        self._tf = amcl.publisher("/tf", "tf2_msgs/msg/TFMessage", RELIABLE)
+        self.children: set[str] = set()
+        """Moving frames that the face publishes."""
+        node.subscribe("odom", "nav_msgs/msg/Odometry", self._take)
+        node.subscribe("/tf", "tf2_msgs/msg/TFMessage", self._see)
+
+    def _take(self, arrival) -> None:
+        pose = arrival.message["pose"]["pose"]
+        yaw = 2.0 * math.atan2(pose["orientation"]["z"], pose["orientation"]["w"])
+        self.odom = pose["position"]["x"], pose["position"]["y"], yaw
+
+    def _see(self, arrival) -> None:
+        if arrival.sender is not None and arrival.sender.node == "/truck":
+            self.children.update(row["child_frame_id"] for row in arrival.message["transforms"])
+
+    @property
+    def left(self) -> float:
+        """Distance to the goal, m."""
+        assert self.odom is not None
+        return math.dist((self.odom[0] + OFFSET[0], self.odom[1] + OFFSET[1]), self.goal)
+
+    def localise(self) -> None:
+        transform = {"translation": {"x": OFFSET[0], "y": OFFSET[1]}, "rotation": {"w": 1.0}}
+        row = {"header": {"frame_id": "map"}, "child_frame_id": "odom", "transform": transform}
+        self._tf({"transforms": [row]})
+
+    def drive(self) -> None:
+        assert self.odom is not None
+        x, y, yaw = self.odom
+        bearing = math.atan2(self.goal[1] - OFFSET[1] - y, self.goal[0] - OFFSET[0] - x)
+        turn = max(min(math.remainder(bearing - yaw, math.tau), 0.2), -0.2)
+        self._cmd_vel({"linear": {"x": 0.2}, "angular": {"z": turn}})
+
+
+async def test_a_node_localises_and_drives_the_robot_as_its_planner_and_mapper(tmp_path: Path):
+    overlay = {
+        "slam": {"mode": "ros2"},
+        "path": None,
+        "tracker": None,
+        "map": None,
+        "gate": {"remote_trackers": ["ros2:nav2"]},
+    }
+    async with robot(tmp_path, overlay) as made:
+        await made.start_simulator()
+        await made.start_daemon()
+        ros = free_endpoint()
+        async with made.client() as client:
+            face = await made.spawn("ros2", "--robot", f"truck@{made.endpoint}", "--listen", ros, "--planner", "ros2")
+            try:
+                await drive_by_nodes(client, ros)
+            finally:
+                await end(face)
+
+
+@asynccontextmanager
+async def ros_node(name: str, ros: str) -> AsyncIterator[ZenohNode]:
+    """A node, once the face listens."""
+    async with AsyncExitStack() as stack:
+        async with asyncio.timeout(30):
+            while True:
+                with suppress(NotFoundError):
+                    node = ZenohNode((name, "/"), 0, session_settings(ros, ""), WallClock())
+                    await stack.enter_async_context(node)
+                    break
+                await asyncio.sleep(0.5)
+        yield node
+
+
+async def drive_by_nodes(client, ros: str) -> None:
+    gates = client.subscribe(topics.GATE, fifo(1000))
+    health, poses = client.subscribe(topics.SLAM, latest()), client.subscribe(topics.POSE, latest())
+    async with ros_node("nav2", ros) as node, ros_node("amcl", ros) as amcl:
+        nav = Nav2(node, amcl)
+        async with asyncio.timeout(30):
+            while nav.odom is None or health.latest is None:
+                await asyncio.sleep(0.05)
+        assert health.latest.standing is LocalisationStatus.SEARCHING
+        x, y, yaw = nav.odom
+        nav.goal = x + OFFSET[0] + 0.8 * math.cos(yaw), y + OFFSET[1] + 0.8 * math.sin(yaw)
+        localising = asyncio.create_task(every(0.05, nav.localise))
+        try:
+            async with asyncio.timeout(20):
+                while health.latest.standing is not LocalisationStatus.LOCALISED:
+                    await asyncio.sleep(0.05)
+            async with asyncio.timeout(60):
+                while nav.left > 0.15:
+                    if gates.latest is None or gates.latest.mode is GateMode.DISARMED:
+                        with suppress(RequestRefusedError):
+                            await client.arm()
+                    nav.drive()
+                    await asyncio.sleep(0.05)
+        finally:
+            localising.cancel()
+        place = poses.latest.pose
+        assert math.dist((place.x, place.y), nav.goal) < 0.35
+        holders = {(state.holder, state.role) for state in gates.drain() if state.holder is not None}
+        assert holders == {("ros2:nav2", Role.TRACKER)}
+        assert nav.children == {"base_link"}
+        async with asyncio.timeout(20):  # without a driver and without corrections
+            while health.latest.standing is not LocalisationStatus.LOST or gates.latest.mode.moving:
+                await asyncio.sleep(0.05)
+
+
+async def every(seconds: float, do) -> None:
+    while True:
+        do()
+        await asyncio.sleep(seconds)
