@@ -9,6 +9,16 @@ from monstertruck_schemas.base import Schema
 Colour = Literal["red", "yellow", "green", "blue", "magenta"]
 
 
+TagFamily = Literal[
+    "36h11", "25h9", "16h5", "aruco_original",
+    "aruco_4x4_50", "aruco_4x4_100", "aruco_4x4_250", "aruco_4x4_1000",
+    "aruco_5x5_50", "aruco_5x5_100", "aruco_5x5_250", "aruco_5x5_1000",
+    "aruco_6x6_50", "aruco_6x6_100", "aruco_6x6_250", "aruco_6x6_1000",
+    "aruco_7x7_50", "aruco_7x7_100", "aruco_7x7_250", "aruco_7x7_1000",
+]  # fmt: skip
+"""Families of tags that OpenCV reads."""
+
+
 class BoardConfig(Schema):
     """Printed ChArUco board, its markers of family 36h11."""
 

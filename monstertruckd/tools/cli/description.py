@@ -51,6 +51,31 @@ def description(
             file.write(text)
 
 
+def import_urdf(
+    file: Annotated[Path, typer.Argument(help="URDF of a robot with four wheels.", show_default=False)],
+    links: Annotated[
+        list[str] | None, typer.Option("--link", help="Link of a device, e.g. lidar=base_scan.", show_default=False)
+    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="New file; default: standard output.")] = None,
+) -> None:
+    """Print geometry and sensor mounts of a robot's own URDF as sections of a configuration.
+
+    Lidar, camera and IMU are found by the names of their links.
+    """
+    from monstertruck_runtime.yaml_files import yaml_text
+    from monstertruckd.tools.urdf import SENSORS, load_urdf
+
+    chosen = dict(word.split("=", 1) for word in links or () if "=" in word)
+    if len(chosen) < len(links or ()) or not chosen.keys() <= SENSORS.keys():
+        raise InputError(f"--link: expected DEVICE=LINK once for each device, which is one of {', '.join(SENSORS)}")
+    text = yaml_text(load_urdf(file, chosen).sections())
+    if output is None:
+        typer.echo(text, nl=False)
+    else:
+        with output.open("x", encoding="utf-8") as stream:
+            stream.write(text)
+
+
 def described(config: "TruckConfig") -> "Description":
     """The robot with the frames of its sensors.
 

@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from monstertruck_schemas.base import Positive, Schema
+from monstertruck_schemas.board import TagFamily
 
 Size = Annotated[float, Field(gt=0.005, le=2)]
 
@@ -13,9 +14,11 @@ Size = Annotated[float, Field(gt=0.005, le=2)]
 class PointsConfig(Schema):
     """What is taken for a tag in the camera's pictures; the camera's lens and mount are its device's."""
 
+    family: TagFamily = "36h11"
+    """Family of the tags: of AprilTag, or a dictionary of ArUco"""
     size: Size = 0.1
     """Side of the tags' black square, m"""
-    sizes: dict[Annotated[int, Field(ge=0, le=586)], Size] = Field(default_factory=dict)
+    sizes: dict[Annotated[int, Field(ge=0, le=1023)], Size] = Field(default_factory=dict)
     """Sizes of other tags by number, m"""
     rate: Annotated[float, Field(gt=0, le=30)] = 5.0
     """Pictures read a second, at most; of a robot that stands two at a place"""

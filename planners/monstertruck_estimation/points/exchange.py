@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any, Self
 
+from monstertruck_schemas.board import TagFamily
 from monstertruck_schemas.body import LensConfig
 
 Triple = tuple[float, float, float]
@@ -23,11 +24,14 @@ class ReadTask:
     angle: float = 1.0
     """rad."""
     margin: float = 0.15
+    family: TagFamily = "36h11"
 
     @classmethod
     def of(cls, jpeg: bytes, lens: LensConfig, config: Any) -> Self:
         """By a ``PointsConfig``."""
-        return cls(jpeg, lens, config.size, dict(config.sizes), config.reach, config.angle, config.margin)
+        return cls(
+            jpeg, lens, config.size, dict(config.sizes), config.reach, config.angle, config.margin, config.family
+        )
 
 
 @dataclass(frozen=True, slots=True)

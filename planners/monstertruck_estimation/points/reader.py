@@ -10,14 +10,16 @@ import numpy as np
 
 from monstertruck_estimation.points.exchange import ReadAnswer, ReadTask, TagReading, Triple
 from monstertruck_estimation.vision.lens import Lens
-from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader, drawn
+from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader, cells, drawn
 from monstertruck_kinematics.elementary import Array
+from monstertruck_schemas.board import TagFamily
 
 
 class ReadingStep:
-    """Reads pictures one by one; keeps nothing from one to the next."""
+    """Reads pictures one by one; keeps the reader of the last family."""
 
     def __init__(self) -> None:
+        self._family: TagFamily = "36h11"
         self._reader = TagReader(everywhere=1, corners="edges")
 
     def step(self, task: ReadTask) -> ReadAnswer:
@@ -27,10 +29,13 @@ class ReadingStep:
         if colour is None:
             return ReadAnswer(unreadable=True)
         grey: Picture = np.asarray(cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+        if task.family != self._family:
+            self._family = task.family
+            self._reader = TagReader(everywhere=1, corners="edges", family=task.family)
         found = []
         lens = Lens.of(task.lens, grey.shape[1], grey.shape[0])
         for sighting in self._reader.read(grey):
-            margin = decode_margin(grey, sighting)
+            margin = decode_margin(grey, sighting, task.family)
             reading = placed(sighting, task.sizes.get(sighting.tag, task.size), lens, margin)
             near = reading is not None and float(np.linalg.norm(reading.middle)) <= task.reach
             if reading is not None and near and margin >= task.margin and reading.angle <= task.angle:
@@ -38,17 +43,17 @@ class ReadingStep:
         return ReadAnswer(tuple(found))
 
 
-def decode_margin(grey: Picture, sighting: Sighting) -> float:
+def decode_margin(grey: Picture, sighting: Sighting, family: TagFamily = "36h11") -> float:
     """How clear the least clear cell is: 1 = black or white, 0 = grey, below 0 = the other one."""
-    cells = 8  # cells of a tag's black square, along a side
+    count = cells(family)
     samples = 6  # pixels of a cell that is looked at
-    side = cells * samples
+    side = count * samples
     square = np.array(((0, 0), (side, 0), (side, side), (0, side)), np.float32) - 0.5
     turned = cv2.getPerspectiveTransform(sighting.corners.astype(np.float32), square.astype(np.float32))
     flat = cv2.warpPerspective(grey, turned, (side, side), flags=cv2.INTER_LINEAR)
     core = slice(samples // 3, samples - samples // 3)
-    means = np.asarray(flat, dtype=np.float64).reshape(cells, samples, cells, samples)[:, core, :, core].mean((1, 3))
-    white = drawn(sighting.tag, cells) > 127
+    means = np.asarray(flat, dtype=np.float64).reshape(count, samples, count, samples)[:, core, :, core].mean((1, 3))
+    white = drawn(sighting.tag, count, family) > 127
     bright, dark = float(means[white].mean()), float(means[~white].mean())
     if bright - dark < 25.0:  # least difference of white and black, of 255
         return -1.0

@@ -1,4 +1,4 @@
-"""AprilTags in a picture: the one place where tags are read (family 36h11; Olson, "AprilTag", ICRA 2011).
+"""Tags in a picture: the one place where they are read (Olson, "AprilTag", ICRA 2011; ArUco by its dictionaries).
 
 OpenCV's ArUco module finds them; corners are crossings of lines along the edges, to a part of a pixel. A tag that stays
 in view is looked for around its last place and where it is expected, and everywhere once in a while, which lets one
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_schemas.board import TagFamily
 
 Picture = NDArray[np.uint8]
 """Grey, (height, width)."""
@@ -48,6 +49,7 @@ class TagReader:
         corners: how they are found: as crossings of lines along the edges, which bears tags of few pixels a cell and
             dirt, or to a tenth of a pixel as crossings of the edges of the picture itself, for tags that are measured.
         phase: which ones of the pictures are looked at as a whole: cameras that are read side by side take turns.
+        family: of the tags.
     """
 
     def __init__(
@@ -56,6 +58,7 @@ class TagReader:
         still: Collection[int] = (),
         corners: Literal["lines", "edges"] = "lines",
         phase: int = 0,
+        family: TagFamily = "36h11",
     ) -> None:
         cv2.setNumThreads(1)  # cameras are read side by side; OpenCV's own threads wait for each other
         self._still = frozenset(still)
@@ -70,7 +73,7 @@ class TagReader:
         parameters.adaptiveThreshWinSizeStep = 8
         self._exact = corners == "edges"
         self._parameters = parameters
-        self._detector = cv2.aruco.ArucoDetector(dictionary(), parameters)
+        self._detector = cv2.aruco.ArucoDetector(dictionary(family), parameters)
         self._everywhere = everywhere
         self._phase = phase
         self._count = 0
@@ -151,14 +154,23 @@ def along_edges(picture: Picture, corners: Array) -> Array:
     return np.array(found)
 
 
-def dictionary() -> "cv2.aruco.Dictionary":
-    """The family of tags."""
-    return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+def dictionary(family: TagFamily = "36h11") -> "cv2.aruco.Dictionary":
+    """Return the tags of a family."""
+    if family[0].isdigit():
+        name = f"DICT_APRILTAG_{family}"
+    else:
+        name = "DICT_" + family.upper() if family == "aruco_original" else family.upper().replace("ARUCO", "DICT")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def drawn(tag: int, pixels: int) -> Picture:
+def cells(family: TagFamily = "36h11") -> int:
+    """Return the cells of a tag's black square along a side."""
+    return int(dictionary(family).markerSize) + 2
+
+
+def drawn(tag: int, pixels: int, family: TagFamily = "36h11") -> Picture:
     """A tag to be printed, its white rim left aside; (pixels, pixels)."""
-    return np.asarray(cv2.aruco.generateImageMarker(dictionary(), tag, pixels), dtype=np.uint8)
+    return np.asarray(cv2.aruco.generateImageMarker(dictionary(family), tag, pixels), dtype=np.uint8)
 
 
 def _windows(places: Sequence[Array], width: int, height: int) -> list[tuple[int, int, int, int]]:

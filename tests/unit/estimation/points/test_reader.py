@@ -1,6 +1,7 @@
 """Tags in pictures: where they are before the camera, and what is refused."""
 
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ from monstertruck_drivers.webcam.emulator import jpeg
 from monstertruck_estimation.points.exchange import ReadTask
 from monstertruck_estimation.points.reader import ReadingStep
 from monstertruck_estimation.vision.lens import Lens
+from monstertruck_estimation.vision.tags import drawn
+from monstertruck_schemas.board import TagFamily
 from monstertruck_schemas.body import LensConfig
 from monstertruck_sim.world.camera import Painter, mounted, tag_panel
 from monstertruck_sim.world.config import CameraConfig, TagConfig
@@ -67,3 +70,14 @@ def test_a_tag_of_another_size_is_farther_away():
 def test_a_lens_is_scaled_to_the_pictures():
     matrix = Lens.of(LensConfig(), 320, 240).matrix
     assert matrix[0] == pytest.approx((261.1, 0.0, 159.5))
+
+
+@pytest.mark.parametrize("family", get_args(TagFamily))
+def test_each_family_is_read_by_its_name(family: TagFamily):
+    paper = np.full((480, 640), 255, np.uint8)
+    paper[160:320, 240:400] = drawn(3, 160, family)
+    answer = read(jpeg(paper, 1), family=family)
+    assert [reading.tag for reading in answer.readings] == [3]
+    assert answer.readings[0].margin > 0.5
+    other = "aruco_5x5_50" if family == "36h11" else "36h11"
+    assert not read(jpeg(paper, 1), family=other).readings

@@ -63,3 +63,19 @@ def test_a_mark_says_where_it_is(monkeypatch):
     monkeypatch.setattr(points, "with_robot", lambda *_, **__: {"x": 2.4, "y": 1.0, "yaw": -0.001})
     done = run("mark", "dock")
     assert done.stderr == "marked dock at x 2.40, y 1.00 m, yaw 0.00 rad\n"
+
+
+def test_a_cameras_lens_is_converted_to_and_from_the_forms_of_others(tmp_path):
+    robot, ros = "configs/points.yaml", tmp_path / "camera.yaml"
+    assert CliRunner().invoke(app, ["convert-lens", robot, str(ros), "-f", "ros"]).exit_code == 0
+    assert "distortion_model: plumb_bob" in ros.read_text()
+    again = CliRunner().invoke(app, ["convert-lens", str(ros)])
+    direct = CliRunner().invoke(app, ["convert-lens", robot])
+    assert direct.stdout == again.stdout
+    assert direct.stdout.startswith("lens:\n  width: 640\n")
+    refused = CliRunner().invoke(app, ["convert-lens", str(ros), "--size", "640"])
+    assert (refused.exit_code, refused.stderr) == (3, "--size 640: expected WIDTHxHEIGHT, e.g. 640x480\n")
+    bare = tmp_path / "bare.yaml"
+    bare.write_text("version: 5\nrobot: truck\ndevices: {}\n")
+    refused = CliRunner().invoke(app, ["convert-lens", str(bare)])
+    assert "has no camera whose lens it states" in refused.stderr
