@@ -126,6 +126,13 @@ class RangeSheet(NamedTuple):
     """Bound of the error of short ranges, m."""
     relative_error: float
     """Bound of the error of longer ranges, as a share of the range."""
+    dark: float | None = None
+    """Longest range to a surface that reflects 10 % of the light, m; None = the data sheet states white targets only."""
+
+    @property
+    def sure(self) -> float:
+        """Longest range at which the data sheet promises a return of any obstacle, m."""
+        return self.greatest if self.dark is None else self.dark
 
 
 class BeamSource(Protocol):

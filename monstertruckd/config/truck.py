@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from monstertruck_drivers.config import Devices, Monitors
+from monstertruck_drivers.scanning.config import sight
 from monstertruck_drivers.shafts import MotorLimits, SteeringOutputs, motor_limits
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_estimation.catalog import AnyOdometry
@@ -39,7 +40,7 @@ from monstertruck_schemas.topics import COMPASS
 from monstertruckd.bus.zenoh_config import PeerConfig, ZenohConfig
 from monstertruckd.config.device_safety import beyond_devices, packs, unattended_times, weakened_devices
 from monstertruckd.gate.catalog import AnyCheck
-from monstertruckd.gate.config import SIGHT, BodyLimits, GateConfig, impossible_settings, weakened, weaker
+from monstertruckd.gate.config import BodyLimits, GateConfig, impossible_settings, weakened, weaker
 from monstertruckd.gate.hand import HandConfig
 from monstertruckd.recorder.config import BlackBoxConfig, MapRender, RecorderConfig
 
@@ -229,7 +230,7 @@ class TruckConfig(Schema):
             mass=geometry.mass,
             pull=geometry.pull,
             motor_speed=min(speeds, default=None),
-            sight=None if lidar is None else SIGHT - geometry.length / 2 + lidar.mount.x,
+            sight=None if lidar is None else sight(lidar.driver) - geometry.length / 2 + lidar.mount.x,
         )
 
     def weakened(self) -> tuple[str, ...]:

@@ -286,9 +286,6 @@ class InForce:
         self.config = config
 
 
-SIGHT: Final = 4.0
-"""Distance at which the scanner is sure to see an obstacle, m (URG-04LX, data sheet)."""
-
 GRIP: Final = 0.6
 """Friction of rubber wheels on a smooth floor, at most."""
 SLIPPING: Final = math.atan(GRIP)

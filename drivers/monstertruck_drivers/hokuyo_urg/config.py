@@ -4,6 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from monstertruck_drivers.hokuyo_urg.models import LX, URG_04LX
 from monstertruck_drivers.scanning.config import ReturnsConfig
 from monstertruck_schemas.base import FrameId, Schema
 
@@ -45,6 +46,11 @@ class HokuyoConfig(ScipConfig):
 
     kind: Literal["hokuyo_urg"] = "hokuyo_urg"
 
+    @property
+    def sight(self) -> float:
+        """See ``scanning.config.sight``."""
+        return URG_04LX.ranges.sure
+
 
 class HokuyoLxConfig(ScipConfig, ReturnsConfig):
     """UST-10LX, UST-20LX or UTM-30LX."""
@@ -53,8 +59,13 @@ class HokuyoLxConfig(ScipConfig, ReturnsConfig):
 
     kind: Literal["hokuyo_lx"] = "hokuyo_lx"
     model: Literal["ust_10lx", "ust_20lx", "utm_30lx"] = "ust_10lx"
-    """Which one is emulated; the driver reads the geometry from the sensor"""
+    """Which one is emulated, and how far the gate relies on it; the driver reads the geometry from the sensor"""
     stale_periods: Annotated[float, Field(gt=1)] = 20.0
     """Scan intervals (25 ms) without a good scan before the session restarts."""
     first_scan_periods: Annotated[float, Field(gt=1)] = 60.0
     """Scan intervals allowed for the first scan after starting."""
+
+    @property
+    def sight(self) -> float:
+        """See ``scanning.config.sight``."""
+        return LX[self.model].ranges.sure

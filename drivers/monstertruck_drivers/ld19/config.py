@@ -2,6 +2,7 @@
 
 from typing import Literal
 
+from monstertruck_drivers.ld19.protocol import MODELS
 from monstertruck_drivers.scanning.config import TurningHeadConfig
 
 
@@ -11,3 +12,8 @@ class Ld19Config(TurningHeadConfig):
     kind: Literal["ld19"] = "ld19"
     model: Literal["ld06", "ld19", "stl19p"] = "ld19"
     """Which one it is: they send the same, but reach and measure differently"""
+
+    @property
+    def sight(self) -> float:
+        """See ``scanning.config.sight``."""
+        return MODELS[self.model].ranges.sure

@@ -30,3 +30,8 @@ class RplidarConfig(TurningHeadConfig):
     def own_baud(self) -> int:
         """Bits per second of the model's serial line."""
         return MODELS[self.model].baud
+
+    @property
+    def sight(self) -> float:
+        """See ``scanning.config.sight``."""
+        return MODELS[self.model].ranges.sure

@@ -120,20 +120,20 @@ MODELS: Final = {
         _modes(("Standard", 500, 12, _S), ("Express", 250, 12, _E), ("Boost", 125, 12, _U)), 2, 10.0, True,
     ),
     "a3": RplidarModel(
-        "RPLIDAR A3M1", 0x31, 256000, RangeSheet(0.2, 25.0, 0.0, 0.01),
+        "RPLIDAR A3M1", 0x31, 256000, RangeSheet(0.2, 25.0, 0.0, 0.01, 10.0),
         _modes(("Standard", 250, 25, _S), ("Express", 125, 25, _E), ("Boost", 62.5, 25, _U),
                ("Sensitivity", 62.5, 25, _U)), 3, 10.0, True,
     ),
     "c1": RplidarModel(
-        "RPLIDAR C1", 0x41, 460800, RangeSheet(0.05, 12.0, 0.03, 0.0),
+        "RPLIDAR C1", 0x41, 460800, RangeSheet(0.05, 12.0, 0.03, 0.0, 6.0),
         _modes(("Standard", 200, 12, _S), ("DenseBoost", 200, 12, _D)), 0, 10.0,
     ),
     "s1": RplidarModel(
-        "RPLIDAR S1", 0x61, 256000, RangeSheet(0.1, 40.0, 0.05, 0.0),
+        "RPLIDAR S1", 0x61, 256000, RangeSheet(0.1, 40.0, 0.05, 0.0, 10.0),
         _modes(("Standard", 217, 40, _S), ("DenseBoost", 108.5, 40, _D)), 1, 10.0,
     ),
     "s2": RplidarModel(
-        "RPLIDAR S2", 0x71, 1000000, RangeSheet(0.05, 30.0, 0.03, 0.0),
+        "RPLIDAR S2", 0x71, 1000000, RangeSheet(0.05, 30.0, 0.03, 0.0, 10.0),
         _modes(("Standard", 62.5, 30, _S), ("DenseBoost", 31.25, 30, _D)), 1, 10.0,
     ),
 }  # fmt: skip

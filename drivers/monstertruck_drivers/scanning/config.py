@@ -1,10 +1,20 @@
 """Settings that all scanners with a turning head share."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field
 
 from monstertruck_schemas.base import FrameId, Schema
+
+
+UNSTATED: Final = 4.0
+"""Sight of a scanner whose settings do not state one, m: that of a URG-04LX."""
+
+
+def sight(settings: Any) -> float:
+    """Return the distance at which a scanner is sure to see any obstacle, m, by the data sheet of its model."""
+    stated: float = getattr(settings, "sight", UNSTATED)
+    return stated
 
 
 class ReturnsConfig(Schema):

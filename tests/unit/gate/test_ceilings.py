@@ -232,6 +232,25 @@ def test_an_attitude_that_is_measured_keeps_its_limits():
         truck(attitude=None)
 
 
+@pytest.mark.parametrize(
+    ("driver", "seen"),
+    [
+        ({"kind": "hokuyo_urg"}, 4.0),
+        ({"kind": "hokuyo_lx"}, 4.0),
+        ({"kind": "hokuyo_lx", "model": "ust_20lx"}, 8.0),
+        ({"kind": "rplidar", "model": "c1"}, 6.0),
+        ({"kind": "rplidar", "model": "a1"}, 12.0),
+        ({"kind": "ld19"}, 12.0),
+    ],
+)
+def test_how_far_a_robot_sees_is_on_its_lidars_data_sheet(driver, seen):
+    config, _ = load_truck(CONFIGS / "truck.yaml")
+    lidar = config.devices.lidar.model_dump() | {"driver": driver}
+    devices = config.devices.model_dump() | {"lidar": lidar}
+    limits = TruckConfig.model_validate(config.model_dump() | {"devices": devices}, strict=False).body_limits
+    assert limits.sight == pytest.approx(seen - 0.235 + 0.14)
+
+
 def test_a_truck_knows_its_limits_and_what_weakens_it():
     config = truck()
     limits = config.body_limits
