@@ -127,7 +127,7 @@ class RangeSheet(NamedTuple):
     relative_error: float
     """Bound of the error of longer ranges, as a share of the range."""
     dark: float | None = None
-    """Longest range to a surface that reflects 10 % of the light, m; None = the data sheet states white targets only."""
+    """Longest range to a surface that reflects 10 % of the light, m; None = the data sheet states white ones only."""
 
     @property
     def sure(self) -> float:

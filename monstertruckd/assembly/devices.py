@@ -147,7 +147,11 @@ def build_drivers(
                 where = computer
         ends: dict[str, Any] = {name: bus.subscribe(topic, latest()) for name, topic in role.reads.items()}
         written = {**role.writes, **kind.also}
-        ends |= {name: _publisher(role, topic, roles, config, bus) for name, topic in written.items()}
+        unmeasured = without(settings[role.name])
+        ends |= {
+            name: None if topic in unmeasured else _publisher(role, topic, roles, config, bus)
+            for name, topic in written.items()
+        }
         driver = kind.implementation_class()
         drivers[role.name] = driver(settings[role.name], where, clock, **ends, events=bus.event_sink(), name=role.name)
     return drivers
@@ -163,11 +167,16 @@ def sensor_services(config: TruckConfig) -> dict[str, Reason]:
     }
 
 
+def without(settings: Schema) -> tuple[Topic[Any], ...]:
+    """Topics that a device does not write although others of its kind do, by its settings."""
+    return (topics.BATTERY,) if getattr(settings, "battery", settings) is None else ()
+
+
 def _written(role: str, device: Device[Any], config: TruckConfig) -> list[Topic[Any]]:
     """Topics that a device writes, its own first, without those that are another configured device's own."""
     others = {DEVICES.roles[other].topic.name for other in config.devices.present() if other != role}
-    topics = (*DEVICES.roles[role].writes.values(), *device.kind.also.values())
-    return [topic for topic in topics if topic.name not in others]
+    written = (*DEVICES.roles[role].writes.values(), *device.kind.also.values())
+    return [topic for topic in written if topic.name not in others and topic not in without(device.driver)]
 
 
 def measures_battery(config: TruckConfig) -> bool:

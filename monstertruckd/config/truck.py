@@ -39,6 +39,7 @@ from monstertruck_schemas.roles import SHAFTS, DeviceRole
 from monstertruck_schemas.topics import COMPASS
 from monstertruckd.bus.zenoh_config import PeerConfig, ZenohConfig
 from monstertruckd.config.device_safety import beyond_devices, packs, unattended_times, weakened_devices
+from monstertruckd.config.pace import too_slow
 from monstertruckd.gate.catalog import AnyCheck
 from monstertruckd.gate.config import BodyLimits, GateConfig, impossible_settings, weakened, weaker
 from monstertruckd.gate.hand import HandConfig
@@ -264,7 +265,8 @@ class TruckConfig(Schema):
         body = self.body_limits
         times = unattended_times(self.devices)
         devices = beyond_devices(self.devices, self.monitors, self.gate.standstill, body)
-        for excess in (*impossible_settings(self.gate, body, times), *devices):
+        pace = too_slow(self.gate.speed, self.odometry, self.tracker, self.planner, self.slam)
+        for excess in (*impossible_settings(self.gate, body, times), *devices, *pace):
             raise ValueError(excess)
         if self.gate.attitude is None and self.devices.measures(COMPASS):
             raise ValueError("gate.attitude null: a device measures the attitude; expected its limits, or no such line")

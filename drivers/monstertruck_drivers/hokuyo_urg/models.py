@@ -59,8 +59,12 @@ def _lx(
 
 
 LX: Final = {
-    "ust_10lx": _lx("UST-10LX", "UST-10LX", 20, 30000, (UNRETURNED, UNRETURNED), RangeSheet(0.06, 10.0, 0.04, 0.0, 4.0)),
-    "ust_20lx": _lx("UST-20LX", "UST-20LX", 20, 60000, (UNRETURNED, UNRETURNED), RangeSheet(0.06, 20.0, 0.04, 0.0, 8.0)),
+    "ust_10lx": _lx(
+        "UST-10LX", "UST-10LX", 20, 30000, (UNRETURNED, UNRETURNED), RangeSheet(0.06, 10.0, 0.04, 0.0, 4.0)
+    ),
+    "ust_20lx": _lx(
+        "UST-20LX", "UST-20LX", 20, 60000, (UNRETURNED, UNRETURNED), RangeSheet(0.06, 20.0, 0.04, 0.0, 8.0)
+    ),
     "utm_30lx": _lx(
         "SOKUIKI Sensor UTM-30LX-EW", "UTM-30LX-EW", 23, 60000, (1, 5), RangeSheet(0.1, 30.0, 0.03, 0.005 / 3)
     ),

@@ -6,7 +6,6 @@ from pydantic import Field
 
 from monstertruck_schemas.base import FrameId, Schema
 
-
 UNSTATED: Final = 4.0
 """Sight of a scanner whose settings do not state one, m: that of a URG-04LX."""
 

@@ -1,4 +1,4 @@
-"""A 6S LiPo pack: charge by coulomb counting, sag at once and slowly, read through a divider and an RC filter."""
+"""A LiPo pack: charge by coulomb counting, sag at once and slowly, read through a divider and an RC filter."""
 
 from math import exp
 
@@ -11,13 +11,13 @@ _CELL_VOLTS = (
 """At charges in steps of 5 %."""
 
 
-def rest_voltage(charge: float) -> float:
-    """Open-circuit volts of the pack at a charge of 0..1 (the table in common circulation, 5 % steps)."""
+def rest_voltage(charge: float, cells: int) -> float:
+    """Open-circuit volts of cells in series at a charge of 0..1 (the table in common circulation, 5 % steps)."""
     steps = len(_CELL_VOLTS) - 1
     place = min(max(charge, 0.0), 1.0) * steps
     below = min(int(place), steps - 1)
     low, high = _CELL_VOLTS[below], _CELL_VOLTS[below + 1]
-    return 6 * (low + (high - low) * (place - below))  # cells in series
+    return cells * (low + (high - low) * (place - below))
 
 
 class BatteryModel:
@@ -38,7 +38,7 @@ class BatteryModel:
     def set_charge(self, charge: float) -> None:
         """Exchange the pack for one of another charge, 0..1."""
         self.charge = charge
-        self._rest = rest_voltage(charge)
+        self._rest = rest_voltage(charge, self._config.cells)
         self.volts = self._loaded(self._config.electronics_w / self._rest)
 
     @property
@@ -51,7 +51,7 @@ class BatteryModel:
         config = self._config
         current = (config.electronics_w + motor_w) / max(self.volts, 1.0)
         self.charge = max(0.0, self.charge - current * dt / 3600 / config.capacity_ah)
-        self._rest = rest_voltage(self.charge)
+        self._rest = rest_voltage(self.charge, config.cells)
         self._slow_sag += (current * config.recovery_resistance - self._slow_sag) * _share(dt, config.recovery_time)
         self.volts = self._loaded(current)
         self._filtered += (self.volts - self._filtered) * _share(dt, config.filter_time)

@@ -1,6 +1,6 @@
-"""Worlds drawn by code: a loop with its lap, rooms, a maze of corridors, a ramp, a yard, a table, a hall, a workshop.
+"""Worlds drawn by code: two with laps (loop, circuit), rooms, a maze, a ramp, a yard, a table, a hall, a workshop.
 
-``python -m monstertruck_sim.world.built_in configs`` writes them as map_server files, and the lap of ``loop``.
+``python -m monstertruck_sim.world.built_in configs`` writes them as map_server files, and the laps.
 """
 
 import sys
@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import pi, radians, tan
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -21,8 +22,26 @@ DRAWN_RESOLUTION = 0.025
 """m per cell."""
 _WALL = 0.1
 
-LOOP_LENGTH, LOOP_WIDTH, LOOP_RADIUS = 4.6, 3.4, 1.0
-"""Rounded rectangle of the lap: 14.28 m, 71 s at 0.2 m/s."""
+
+class RoundedRectangle(NamedTuple):
+    """A lap around the origin, between the outer ends of its straights and arcs, m."""
+
+    length: float
+    width: float
+    radius: float
+
+    def distances(self, canvas: "_Canvas") -> Array:
+        """Distance of every cell from the lap's inner straight core, less the radius, m: 0 on the lap."""
+        dx = np.maximum(abs(canvas.xs) - (self.length / 2 - self.radius), 0)
+        dy = np.maximum(abs(canvas.ys) - (self.width / 2 - self.radius), 0)
+        away: Array = np.hypot(dx, dy) - self.radius
+        return away
+
+
+LOOP = RoundedRectangle(4.6, 3.4, 1.0)
+"""Lap of ``loop``: 14.28 m, 71 s at 0.2 m/s."""
+CIRCUIT = RoundedRectangle(9.0, 6.4, 2.5)
+"""Lap of ``circuit``: 26.5 m, 9 s at 3 m/s."""
 
 
 def _widened(cells: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
@@ -76,10 +95,8 @@ class _Canvas:
 def loop() -> BuiltIn:
     """A corridor 1.2 m wide round a block, with niches, posts and boxes for the scan to hold on to."""
     canvas = _Canvas((-3.4, 3.4), (-2.8, 2.8))
-    dx = np.maximum(abs(canvas.xs) - (LOOP_LENGTH / 2 - LOOP_RADIUS), 0)
-    dy = np.maximum(abs(canvas.ys) - (LOOP_WIDTH / 2 - LOOP_RADIUS), 0)
     # Inside the straight core the distance to the rounded rectangle does not matter: the block stands there.
-    canvas.free = abs(np.hypot(dx, dy) - LOOP_RADIUS) < 1.2 / 2  # width of the corridor, m
+    canvas.free = abs(LOOP.distances(canvas)) < 1.2 / 2  # width of the corridor, m
     for niche in ((1.6, 2.2, 2.9, 2.45), (-1.3, 2.2, -0.4, 2.5), (-0.2, -2.6, 0.5, -2.2), (2.8, -0.5, 3.2, 0.2)):
         canvas.free |= canvas.rectangle(*niche)
     for corner in ((2.2, -2.25, 2.85, -1.6), (-2.85, -2.3, -2.2, -1.6), (-2.8, 1.6, -2.2, 2.2)):
@@ -88,7 +105,22 @@ def loop() -> BuiltIn:
         canvas.free &= ~canvas.rectangle(*box)
     for post in ((-1.0, 1.1, 0.12), (1.75, 0.3, 0.08), (2.82, -1.1, 0.1)):
         canvas.free &= ~canvas.disc(*post)
-    return BuiltIn(canvas.map(), (0.0, -LOOP_WIDTH / 2, 0.0))
+    return BuiltIn(canvas.map(), (0.0, -LOOP.width / 2, 0.0))
+
+
+def circuit() -> BuiltIn:
+    """A track 2.2 m wide round a block, for fast robots, with niches, boxes and posts along its walls."""
+    canvas = _Canvas((-6.2, 6.2), (-4.9, 4.9))
+    canvas.free = abs(CIRCUIT.distances(canvas)) < 2.2 / 2  # width of the track, m
+    for niche in ((2.0, 4.2, 2.8, 4.6), (-1.8, 4.2, -0.8, 4.7), (-0.4, -4.6, 0.6, -4.2), (5.5, -0.6, 5.9, 0.5)):
+        canvas.free |= canvas.rectangle(*niche)
+    for corner in ((4.3, -4.2, 5.4, -3.3), (-5.3, -4.1, -4.4, -3.2), (-5.4, 3.1, -4.5, 4.0)):
+        canvas.free |= canvas.rectangle(*corner)
+    for box in ((-2.4, -4.4, -2.1, -4.0), (1.5, 4.0, 1.8, 4.4), (-5.7, 0.3, -5.3, 0.8), (1.6, -2.3, 2.1, -2.0)):
+        canvas.free &= ~canvas.rectangle(*box)
+    for post in ((-1.5, 2.3, 0.15), (3.5, 0.4, 0.12), (5.45, -1.6, 0.15), (3.2, -4.2, 0.12)):
+        canvas.free &= ~canvas.disc(*post)
+    return BuiltIn(canvas.map(), (0.0, -CIRCUIT.width / 2, 0.0))
 
 
 def rooms() -> BuiltIn:
@@ -188,19 +220,22 @@ BUILT_IN: dict[str, Callable[[], BuiltIn]] = {
     "table": table,
     "hall": hall,
     "workshop": workshop,
+    "circuit": circuit,
 }
 
 
-def lap(spacing: float = 0.05) -> Array:
-    """The drawn lap of ``loop``, counter-clockwise from its start pose and back to it.
+def lap(shape: RoundedRectangle = LOOP, spacing: float = 0.05) -> Array:
+    """The drawn lap of a world, counter-clockwise from its start pose and back to it.
 
     Args:
+        shape: of the lap.
         spacing: wanted distance of the points, m; the true one divides the lap evenly.
 
     Returns:
         (n, 3): x, y (m) and heading (rad, in (-pi, pi]) in the map frame; the last row repeats the first.
     """
-    half_x, half_y, radius = LOOP_LENGTH / 2 - LOOP_RADIUS, LOOP_WIDTH / 2 - LOOP_RADIUS, LOOP_RADIUS
+    radius = shape.radius
+    half_x, half_y = shape.length / 2 - radius, shape.width / 2 - radius
     arc = radius * pi / 2
     # (length, turn) of every piece, from the middle of the lower side.
     pieces = [(half_x, 0), (arc, 1), (2 * half_y, 0), (arc, 1), (2 * half_x, 0), (arc, 1), (2 * half_y, 0), (arc, 1)]
@@ -208,7 +243,7 @@ def lap(spacing: float = 0.05) -> Array:
     count = round(sum(length for length, _ in pieces) / spacing)
     stations = np.linspace(0.0, sum(length for length, _ in pieces), count + 1)
     points = np.empty((count + 1, 3))
-    begun, x, y, yaw = 0.0, 0.0, -LOOP_WIDTH / 2, 0.0
+    begun, x, y, yaw = 0.0, 0.0, -shape.width / 2, 0.0
     for length, turn in pieces:
         mine = (stations >= begun - 1e-9) & (stations <= begun + length + 1e-9)
         along = stations[mine] - begun
@@ -227,7 +262,7 @@ def _along(x: float, y: float, yaw: float, s: Array, curvature: float) -> tuple[
 
 
 def make_worlds(out: Path) -> list[Path]:
-    """Write ``out``/worlds/NAME.yaml, .png, .profile.yaml and ``out``/paths/loop.csv; returns what was written."""
+    """Write ``out``/worlds/NAME.yaml, .png, .profile.yaml and the laps in ``out``/paths; returns what was written."""
     worlds, paths = out / "worlds", out / "paths"
     worlds.mkdir(parents=True, exist_ok=True)
     paths.mkdir(parents=True, exist_ok=True)
@@ -239,9 +274,11 @@ def make_worlds(out: Path) -> list[Path]:
         if built.profile is not None:
             save_profile(built.profile, profile_path(path))
             written.append(profile_path(path))
-    rows = [f"{x:.4f},{y:.4f},{yaw:.5f},1" for x, y, yaw in lap()]
-    (paths / "loop.csv").write_text("\n".join(["x,y,yaw,direction", *rows, ""]), encoding="utf-8")
-    return [*written, paths / "loop.csv"]
+    for name, shape in (("loop", LOOP), ("circuit", CIRCUIT)):
+        rows = [f"{x:.4f},{y:.4f},{yaw:.5f},1" for x, y, yaw in lap(shape)]
+        written.append(paths / f"{name}.csv")
+        written[-1].write_text("\n".join(["x,y,yaw,direction", *rows, ""]), encoding="utf-8")
+    return written
 
 
 if __name__ == "__main__":

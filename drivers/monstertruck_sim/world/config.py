@@ -240,8 +240,10 @@ class MechanicsConfig(Schema):
 
 
 class BatteryModelConfig(Schema):
-    """6S LiPo pack and its measurement."""
+    """LiPo pack and its measurement."""
 
+    cells: Annotated[int, Field(ge=1, le=14)] = 6
+    """Cells in series."""
     capacity_ah: Positive = 5.0
     charge: Fraction = 0.95
     """Charge at the start, as a share of the capacity."""

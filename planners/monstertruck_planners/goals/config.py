@@ -36,9 +36,26 @@ class EscapeConfig(Schema):
     """Kept to obstacles on the way, m; those that are nearer already may not come nearer."""
 
 
+class WindowConfig(Schema):
+    """Obstacles around the robot by which routes are deformed."""
+
+    size: Annotated[float, Field(gt=0, le=20)] = 4.0
+    """Side, m; the robot is in the middle"""
+    resolution: Annotated[float, Field(ge=0.01, le=0.2)] = 0.04
+    """Edge of a cell, m"""
+    mark: Positive = 3.0
+    """Returns up to this distance mark obstacles, m"""
+    clear: Positive = 4.0
+    """Beams clear cells up to this distance, m"""
+    thickness: NotNegative = 0.12
+    """Depth of obstacles where the cells behind them have never been seen, m"""
+
+
 class LocalConfig(Schema):
     """When routes are deformed, and what is made of it."""
 
+    window: WindowConfig = WindowConfig()
+    """Where obstacles are kept"""
     clearance: NotNegative = 0.02
     """A route with an obstacle nearer than this is deformed, m; the gate's side clearance."""
     rejoin_clearance: NotNegative = 0.03

@@ -7,11 +7,9 @@ it until the truck is back on it.
 import logging
 import math
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.ndimage import binary_dilation
 
 from monstertruck_estimation.slam.grid import trace
@@ -19,6 +17,7 @@ from monstertruck_kinematics.beams import nearest_beams
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_relative, poses_relative
 from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, scan_points_at
+from monstertruck_planners.goals.config import WindowConfig
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Setup, explained_within
 from monstertruck_planners.goals.plan_step import answer_of
 from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, nearest_pose, pose_distance
@@ -29,26 +28,10 @@ from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import moved
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
-from monstertruck_schemas.base import Schema
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 
 log = logging.getLogger(__name__)
-
-
-class WindowConfig(Schema):
-    """The obstacle window."""
-
-    size: Annotated[float, Field(gt=0)] = 4.0
-    """Side, m."""
-    resolution: Annotated[float, Field(gt=0)] = 0.04
-    """Metres per cell."""
-    mark: Annotated[float, Field(gt=0)] = 3.0
-    """Returns up to this distance mark obstacles, m."""
-    clear: Annotated[float, Field(gt=0)] = 4.0
-    """Beams clear cells up to this distance, m."""
-    thickness: Annotated[float, Field(ge=0)] = 0.12
-    """Depth of obstacles where the cells behind them have never been seen, m."""
 
 
 class Window:
@@ -214,7 +197,7 @@ class DeformStep:
             config.steering, angle=config.angle, geometry=setup.geometry, footprint=setup.footprint
         )
         self._planner = make_local_planner(self._vehicle, config.local_planner)
-        self._window = Window()
+        self._window = Window(config.local.window)
         if config.map is not None:
             self._walls = _walls_of(config.map)
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.collision import DistanceField
-from monstertruck_planners.goals.deform_step import Window, WindowConfig
+from monstertruck_planners.goals.config import WindowConfig
+from monstertruck_planners.goals.deform_step import Window
 from monstertruck_runtime.errors import InputError
 
 SENSOR, BASE = (0.1, 0.02), (0.0, 0.0)

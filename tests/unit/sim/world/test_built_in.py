@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt, label
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import FREE, OCCUPIED, load_map
 from monstertruck_schemas.base import Pose2D
-from monstertruck_sim.world.built_in import BUILT_IN, lap, make_worlds
+from monstertruck_sim.world.built_in import BUILT_IN, CIRCUIT, lap, make_worlds
 from monstertruck_sim.world.config import LidarConfig, RoughPatch, ServoModelConfig, SimTruckConfig, WorldConfig
 from monstertruck_sim.world.obstacles import Box, Disc, penetration
 from monstertruck_sim.world.terrain import LEVEL, Profile, Terrain, load_profile
@@ -58,6 +58,19 @@ def test_lap_is_closed_even_and_clear_of_walls():
     clearance = distance_transform_edt(world.cells != OCCUPIED) * world.resolution
     columns, rows = ((points[:, :2] - world.origin) / world.resolution).astype(int).T
     assert clearance[rows, columns].min() > 0.45
+
+
+def test_the_circuit_is_wide_enough_for_a_fast_robot():
+    points = lap(CIRCUIT)
+    np.testing.assert_array_equal(points[0], BUILT_IN["circuit"]().start)
+    gaps = np.hypot(*np.diff(points[:, :2], axis=0).T)
+    assert gaps.sum() == pytest.approx(2 * (9.0 - 5.0) + 2 * (6.4 - 5.0) + 5 * pi, abs=0.01)
+    turns = (np.diff(points[:, 2]) + pi) % (2 * pi) - pi
+    assert np.abs(turns / gaps).max() <= 1 / 2.49
+    world = BUILT_IN["circuit"]().map
+    clearance = distance_transform_edt(world.cells != OCCUPIED) * world.resolution
+    columns, rows = ((points[:, :2] - world.origin) / world.resolution).astype(int).T
+    assert clearance[rows, columns].min() > 0.7
 
 
 def test_lap_file():

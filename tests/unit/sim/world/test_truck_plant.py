@@ -274,15 +274,15 @@ def test_climbing_costs_current(field):
 def test_battery_counts_coulombs_and_sags():
     config = BatteryModelConfig(charge=0.8, electronics_w=24.12)
     battery = BatteryModel(config)
-    assert rest_voltage(1.0) == pytest.approx(25.2)
-    assert rest_voltage(0.0) == pytest.approx(19.62)
+    assert rest_voltage(1.0, 6) == pytest.approx(25.2)
+    assert rest_voltage(0.0, 6) == pytest.approx(19.62)
     idle = battery.volts
     assert idle == pytest.approx(24.12 - 1.0 * 0.08)
     for _ in range(3600):
         battery.step(0.1, 100.0)
     assert battery.charge == pytest.approx(0.8 - 0.1 * 124.12 / 23.2 / 5.0, abs=0.003)
     loaded = battery.volts
-    assert loaded < rest_voltage(battery.charge) - 5 * 0.11
+    assert loaded < rest_voltage(battery.charge, 6) - 5 * 0.11
     assert battery.analog_volts == pytest.approx(loaded / 10, abs=0.01)
     battery.step(0.1, 0.0)
     at_once = battery.volts
@@ -293,7 +293,7 @@ def test_battery_counts_coulombs_and_sags():
 
 def test_battery_reaches_the_analog_input_and_can_be_exchanged(field):
     driver = field()
-    assert driver.world.servos.analog_volts(5, driver.now) == pytest.approx(rest_voltage(0.95) / 10, abs=0.02)
+    assert driver.world.servos.analog_volts(5, driver.now) == pytest.approx(rest_voltage(0.95, 6) / 10, abs=0.02)
     assert driver.world.servos.analog_volts(4, driver.now) == 0
     driver.world.set_charge(driver.now, 0.1)
     truth = driver.wait(1)
@@ -323,7 +323,8 @@ def test_an_obstacle_put_beside_the_truck_is_felt_at_once(field):
     ("charge", "cell"), [(-0.1, 3.27), (0.0, 3.27), (0.025, 3.44), (0.5, 3.84), (1.0, 4.2), (1.1, 4.2)]
 )
 def test_rest_voltage_is_straight_between_the_tables_points(charge, cell):
-    assert rest_voltage(charge) == pytest.approx(6 * cell)
+    assert rest_voltage(charge, 6) == pytest.approx(6 * cell)
+    assert rest_voltage(charge, 3) == pytest.approx(3 * cell)
 
 
 def test_a_carried_truck_stands_elsewhere_and_its_lidar_sees_no_way_between(field):

@@ -1,0 +1,58 @@
+"""Settings outside of the gate that keep up with its speed, or else are refused by name.
+
+A robot that is faster than these allow would not be wrong at once: its pose would stand still while it drives, or its
+route would end in what it should have seen. Speeds m/s, distances m.
+"""
+
+from collections.abc import Iterator
+from typing import Final
+
+from monstertruck_estimation.odometry import OdometrySettings
+from monstertruck_estimation.slam.config import SlamConfig
+from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.track.config import TrackerConfig
+
+SPARE: Final = 1.25
+"""Readings of a wheel may say so much more than the gate allows: their instants are uncertain by a part of the time
+between them."""
+
+
+def too_slow(
+    speed: float,
+    odometry: OdometrySettings,
+    tracker: TrackerConfig | None,
+    planner: PlannerConfig | None,
+    slam: SlamConfig | None,
+) -> Iterator[str]:
+    """Every setting that does not keep up with ``gate.speed``, with what it must be.
+
+    Args:
+        speed: ``gate.speed``, m/s.
+        odometry: the robot's own, as all others.
+        tracker: None = there is none.
+        planner: likewise.
+        slam: likewise.
+    """
+    believed = getattr(odometry, "max_speed", None)
+    if believed is not None and believed < SPARE * speed:
+        yield f"odometry.max_speed {believed:g} m/s: expected at least {SPARE * speed:g}, {SPARE} times gate.speed"
+    if slam is not None and slam.mapper.fastest[0] < SPARE * speed:
+        yield f"slam.mapper.fastest {slam.mapper.fastest[0]:g} m/s: expected at least {SPARE * speed:g}, likewise"
+    if planner is None or tracker is None:
+        return
+    needed = distance_to_stop(min(speed, tracker.speed), planner, tracker)
+    sees = [("planner.look_ahead", planner.look_ahead, 1)]
+    if planner.local_planner is not None:
+        sees.append(("planner.local.window.size", planner.local.window.size, 2))
+    for name, metres, share in sees:
+        if metres < share * needed:
+            yield (
+                f"{name} {metres:g} m: expected at least {share * needed:.2f}: the tracker stops within {needed:.2f} m "
+                f"once blocked_scans have shown that the route is blocked"
+            )
+
+
+def distance_to_stop(speed: float, planner: PlannerConfig, tracker: TrackerConfig) -> float:
+    """Distance from where the first scan shows the route blocked to where the tracker has stopped, m."""
+    noticed = planner.blocked_scans / planner.rate
+    return speed * noticed + speed**2 / (2 * tracker.deceleration)
