@@ -76,6 +76,6 @@ def test_a_cameras_lens_is_converted_to_and_from_the_forms_of_others(tmp_path):
     refused = CliRunner().invoke(app, ["convert-lens", str(ros), "--size", "640"])
     assert (refused.exit_code, refused.stderr) == (3, "--size 640: expected WIDTHxHEIGHT, e.g. 640x480\n")
     bare = tmp_path / "bare.yaml"
-    bare.write_text("version: 5\nrobot: truck\ndevices: {}\n")
+    bare.write_text("version: 2\nrobot: truck\ndevices: {}\n")
     refused = CliRunner().invoke(app, ["convert-lens", str(bare)])
     assert "has no camera whose lens it states" in refused.stderr
