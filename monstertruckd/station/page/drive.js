@@ -11,18 +11,22 @@ const LEASE = 0.25;
 const UNKNOWN = 1500; // ms that the way to the robot and back is taken to be until it is measured
 const MODES = ["front", "rear", "counter", "crab", "twist"];
 const KEYS = { w: [0, 1], s: [0, -1], a: [-1, 0], d: [1, 0] };
+const PAD_ESTOP = 1; // the right one of the four buttons
 const UNSEEN = "v"; // held: drives into ground that no sensor has seen
 const UNSEEN_WAIT = 10000; // ms for which the button waits for the hand
 const ARROWS = { ArrowUp: "w", ArrowDown: "s", ArrowLeft: "a", ArrowRight: "d" };
 
 export class Drive {
-  constructor(link) {
+  constructor(link, onEstop) {
     this.link = link;
+    this.onEstop = onEstop;
+    this.padStops = false;
     this.held = new Map(); // names of the keys that are down, by their places on the keyboard
     this.stick = null;
     this.rest = 0;
     this.last = "stick";
     this.grace = 0;
+    this.blocked = null; // mode of the gate that does not let the present hand drive
     this.unseen = 0; // until then, or while the hand then drives on, the button counts
     this.byId = (id) => document.getElementById(id);
     this.steering = this.byId("steering");
@@ -110,16 +114,19 @@ export class Drive {
 
   /** What the hand says now: [input, sideways, ahead], each -1..1; null = no hand. */
   input() {
+    // A gamepad is read by every page that is in view: it drives the robot of the one that has the focus.
+    const pads = document.hasFocus() ? navigator.getGamepads?.() ?? [] : [];
+    const pad = [...pads].find((each) => each?.connected && each.mapping === "standard");
+    this.pad = pad ?? null;
+    const stops = Boolean(pad?.buttons[PAD_ESTOP]?.pressed);
+    if (stops && !this.padStops) this.onEstop();
+    this.padStops = stops;
     if (this.stick) return ["stick", ...this.stick];
     const keys = [...new Set(this.held.values())].filter((name) => name in KEYS);
     if (keys.length) {
       const sum = keys.map((key) => KEYS[key]).reduce(([x, y], [kx, ky]) => [x + kx, y + ky], [0, 0]);
       return ["keys", ...sum];
     }
-    // A gamepad is read by every page that is in view: it drives the robot of the one that has the focus.
-    const pads = document.hasFocus() ? navigator.getGamepads?.() ?? [] : [];
-    const pad = [...pads].find((each) => each?.connected && each.mapping === "standard");
-    this.pad = pad ?? null;
     if (pad?.buttons[5]?.pressed || pad?.buttons[7]?.pressed) {
       const [x, y] = [pad.axes[0], -pad.axes[1]].map((v) => (Math.abs(v) < DEAD ? 0 : v));
       return ["gamepad", x, y];
@@ -180,7 +187,13 @@ export class Drive {
     if (this.unseen && this.unseen < performance.now()) this.unseen = 0;
     this.byId("unseen").setAttribute("aria-pressed", String(this.confirms()));
     const left = Math.ceil((this.grace - performance.now()) / 1000);
-    const text = hand ? words(`input.${hand[0]}`)
+    const blocked = hand && ["disarmed", "estopped"].includes(this.link.newest.gate?.mode) ? this.link.newest.gate.mode : null;
+    if (blocked !== this.blocked) {
+      setText(this.byId("hand-note"), blocked ? words(`input.blocked.${blocked}`) : "");
+      this.blocked = blocked;
+    }
+    const text = blocked ? words(`input.blocked.${blocked}`)
+      : hand ? words(`input.${hand[0]}`)
       : left > 0 ? words("input.grace", { seconds: left })
       : this.pad ? words("input.ready", { name: this.pad.id.slice(0, 24) })
       : words("input.none");

@@ -22,6 +22,7 @@ function estop() {
 byId("estop").addEventListener("pointerdown", estop);
 byId("estop").addEventListener("click", (event) => event.detail === 0 && estop()); // by Enter, or by assistive technology
 window.addEventListener("keydown", (event) => {
+  if (event.code === "Escape" && !event.repeat) order("stop");
   if (event.code !== "Space") return;
   event.preventDefault();
   event.stopPropagation();
@@ -54,7 +55,7 @@ async function letPlannersDrive() {
 }
 
 await loadWords();
-const drive = new Drive(link);
+const drive = new Drive(link, estop);
 const map = new MapView(byId("map"), link, aimed);
 const panels = new Panels(link);
 const fleet = new FleetView(link, map, chosen);
@@ -212,6 +213,12 @@ byId("tool-layers").onclick = () => {
   byId("tool-layers").setAttribute("aria-expanded", !byId("layers").hidden);
 };
 
+/** What the goal does now: nothing drives to it while the gate does not let the robot drive. */
+function goalPhase(phase) {
+  const mode = link.newest.gate?.mode;
+  return ["disarmed", "stopping", "estopped"].includes(mode) && phase !== "paused" ? words(`goal.held.${mode}`) : words(`phase.${phase}`);
+}
+
 function showGoal() {
   const state = link.newest.goal;
   const pending = map.pending ?? map.drawn;
@@ -228,7 +235,8 @@ function showGoal() {
   let text = "";
   if (map.drawn) text = words("path.drawn", { metres: number(lengthOf(map.drawn), 1) });
   else if (pending) text = words("goal.at", { x: number(pending[0]), y: number(pending[1]), yaw: degrees(pending[2]) });
-  else if (running) text = words("goal.state", { number: state.number, phase: words(`phase.${state.phase}`), remaining: number(state.remaining, 1) });
+  else if (running) text = words("goal.state", { number: state.number, phase: goalPhase(state.phase), remaining: number(state.remaining, 1) });
+  else if (state?.outcome === "estopped") text = words("goal.estopped", { number: state.number });
   else if (state) text = words("goal.ended", { number: state.number, text: state.text || reason(state.outcome) });
   if (byId("goal-text").textContent !== text) byId("goal-text").textContent = text;
 }

@@ -1,12 +1,13 @@
 // The panels beside the map: safety gate, truck, system, events, banners.
 import { wheelAngles } from "./geometry.js";
-import { degrees, modeText, number, reason, words } from "./words.js";
+import { degrees, modeText, moves, number, reason, words } from "./words.js";
 
 const byId = (id) => document.getElementById(id);
 const KEPT = 300;
 const SILENT = 1.0;
 const OLD = 3.0; // seconds after which a value that the robot no longer says has its age
 const HOT = 80; // degrees of the computer
+const POOR = 250; // ms there and back from which on the slower link is named
 const LATE = 0.02; // seconds: one control tick
 
 export function element(name, fields = {}, ...children) {
@@ -49,9 +50,13 @@ export class Panels {
   constructor(link) {
     this.link = link;
     this.seen = new Set();
+    this.early = []; // events that came before the robot's time was known
     link.on("robot", () => this.clear());
     link.on("stop", (stop) => this.showStop(stop));
-    link.on("event", (event) => this.addEvent(event));
+    link.on("event", (event) => {
+      this.early.push(event);
+      this.listEvents();
+    });
     link.on("health", (table) => this.showServices(table));
     link.on("late", ({ seconds }) => this.banner("late", words("banner.late", { seconds: number(seconds) }), "warn"));
     link.on("camera", (message) => this.showPicture(message));
@@ -59,15 +64,17 @@ export class Panels {
     this.buildTop();
     this.buildHorizon();
     this.tabs();
+    byId("events-least").onchange = ({ target }) => (byId("events").dataset.least = target.value);
     setInterval(() => this.refresh(), 100);
   }
 
   clear() {
     this.seen.clear();
+    this.early = [];
     byId("events").replaceChildren();
     byId("services").replaceChildren();
     byId("banners").replaceChildren();
-    byId("chain").hidden = true;
+    byId("chain").hidden = byId("stopped").hidden = true;
     byId("camera").hidden = true;
     setText("refusal", "");
   }
@@ -91,6 +98,7 @@ export class Panels {
   refresh() {
     const { newest } = this.link;
     const gate = this.alive ? newest.gate : null;
+    this.listEvents();
     this.showLink();
     this.showGate(gate);
     if (!byId("pane-truck").hidden) this.showTruck();
@@ -106,7 +114,9 @@ export class Panels {
     }
     this.warn();
     const silent = this.link.open && !this.alive && this.link.age("robot") > 2;
-    if (silent && newest.gate) this.banner("silent", words("banner.silent"), "bad");
+    const lost = !this.link.open && this.link.age("open") > 2;
+    if (lost) this.banner("silent", words("banner.station", { seconds: number(this.link.age("open"), 0) }), "bad");
+    else if (silent && newest.gate) this.banner("silent", words("banner.silent", { robot: this.link.robot, seconds: number(this.link.age("gate"), 0) }), "bad");
     else this.drop("silent");
     const facts = newest.facts;
     if (facts?.versions.monstertruckd && newest.hello && facts.versions.monstertruckd !== newest.hello.version) {
@@ -129,16 +139,18 @@ export class Panels {
 
   showLink() {
     const { link } = this;
-    if (!link.open) return setText("chip-link", words("link.lost"), "bad");
+    if (!link.open) return setText("chip-link", words("link.lost", { seconds: number(link.age("open"), 0) }), "bad");
     const delay = link.roundTrip();
     if (delay === null) return setText("chip-link", words("link.absent"), "bad");
     if (!this.alive && link.newest.gate) return setText("chip-link", words("link.silent", { seconds: number(link.age("gate"), 0) }), "bad");
-    setText("chip-link", words("link.value", { delay: number(delay, 0) }), delay > 250 ? "bad" : delay > 100 ? "warn" : "good");
+    const { browser, robot } = link.delays();
+    const slow = delay <= POOR ? "link.value" : browser > robot ? "link.slow.browser" : "link.slow.robot";
+    setText("chip-link", words(slow, { delay: number(delay <= POOR ? delay : Math.max(browser, robot), 0) }), delay > POOR ? "bad" : delay > 100 ? "warn" : "good");
   }
 
   showGate(gate) {
     const mode = gate?.mode ?? "unknown";
-    const named = modeText(gate?.mode, gate?.stopping);
+    const named = modeText(gate?.mode, gate?.stopping, gate);
     setText("mode-name", named);
     byId("authority").dataset.mode = mode;
     setText("chip-mode", named, gate?.stopping ? "bad" : LOOKS[mode] ?? "bad");
@@ -148,8 +160,10 @@ export class Panels {
       byId("reasons").dataset.shown = list.join();
       byId("reasons").replaceChildren(...list.map((textContent) => element("li", { textContent })));
     }
+    this.showCause(gate);
     const mine = gate?.holder && gate.holder === this.source;
-    setText("holder-name", gate?.holder ? words(mine ? "holder.you" : "holder", { name: gate.holder })
+    const hand = `holder${mine ? ".you" : ""}${moves(gate) ? "" : ".rests"}`;
+    setText("holder-name", gate?.holder ? words(hand, { name: gate.holder })
       : gate?.waiting.length ? words("holder.waiting", { names: gate.waiting.join(", ") }) : gate ? words("holder.none") : "");
     byId("lease").hidden = !gate?.holder;
     byId("lease").value = gate?.lease_left ?? 0;
@@ -161,6 +175,27 @@ export class Panels {
     byId("arm").hidden = mode === "estopped";
   }
 
+  /** Why the robot stands, since when, and what helps: as long as it has not been driven on. */
+  showCause(gate) {
+    const { stop } = this.link.newest;
+    const stands = gate && stop && !stop.ordered && !(gate.mode === "driving" && moves(gate));
+    byId("stopped").hidden = !stands;
+    if (!stands) return;
+    const cause = stop.causes[0];
+    const seconds = number(Math.max((gate.stamp - stop.stamp) / 1e9, 0), 0);
+    const remedy = words(`remedy.${stop.reason}`);
+    const text = words("stopped", { time: this.clockTime(stop.stamp), seconds, why: cause.text || reason(cause.reason), source: cause.source });
+    setText("stopped", remedy === `remedy.${stop.reason}` ? text : `${text} ${remedy}`);
+  }
+
+  /** Local time of a stamp of the robot's clock, by the newest state of the gate and when it came. */
+  clockTime(stamp) {
+    const { gate } = this.link.newest;
+    if (!gate) return "";
+    const ago = (gate.stamp - stamp) / 1e6 + 1000 * this.link.age("gate");
+    return new Date(Date.now() - ago).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit" });
+  }
+
   showStop(stop) {
     byId("chain").hidden = false;
     byId("causes").replaceChildren(...stop.causes.map((cause) => {
@@ -170,12 +205,25 @@ export class Panels {
     }));
   }
 
+  /** List the events that have come, once the robot's time is known. */
+  listEvents() {
+    if (this.link.newest.gate) for (const event of this.early.splice(0)) this.addEvent(event);
+  }
+
+  /** An event; one like the newest is counted there. */
   addEvent(event) {
     const list = byId("events");
+    const text = event.text || reason(event.reason);
+    const key = `${event.severity}|${event.source}|${event.reason}|${text.replace(/[0-9.]+/g, "#")}`;
+    const last = list.firstElementChild;
+    const again = last?.dataset.key === key;
+    const count = again ? Number(last.dataset.count) + 1 : 1;
+    const first = again ? last.dataset.first : this.clockTime(event.stamp);
     const item = element("li", { className: event.severity },
-      element("span", { textContent: event.text || reason(event.reason) }),
-      element("small", { textContent: `${event.source} · ${reason(event.reason)}` }));
-    list.prepend(item);
+      element("span", { textContent: text }), ...(count > 1 ? [element("b", { textContent: words("events.count", { count }) })] : []),
+      element("small", { textContent: `${count > 1 ? words("events.since", { first, last: this.clockTime(event.stamp) }) : first} · ${event.source} · ${reason(event.reason)}` }));
+    Object.assign(item.dataset, { key, count, first });
+    again ? last.replaceWith(item) : list.prepend(item);
     while (list.children.length > KEPT) list.lastChild.remove();
   }
 
@@ -311,7 +359,8 @@ export class Panels {
     const delay = this.link.roundTrip();
     const gigabytes = (bytes) => `${number(bytes / 1e9, 1)} GB`;
     rows("computer", [
-      ["computer.link", delay === null ? null : words("link.value", { delay: number(delay, 0) })],
+      ["computer.browser", delay === null ? null : words("link.value", { delay: number(this.link.delays().browser, 0) })],
+      ["computer.link", delay === null ? null : words("link.value", { delay: number(this.link.delays().robot, 0) })],
       [`network.${network?.medium ?? "none"}`, network ? words("network.value", { level: words(`level.${network.level}`), signal: network.signal === null ? "" : `${number(network.signal, 0)} dBm` }) : null],
       ["computer.cpu", host?.cpu != null ? `${number(host.cpu * 100, 0)} %` : null],
       ["computer.temperature", host?.temperature != null ? `${number(host.temperature, 0)} °C` : null],
@@ -334,6 +383,7 @@ export class Panels {
         const chosen = each === tab;
         each.setAttribute("aria-selected", chosen);
         each.tabIndex = chosen ? 0 : -1;
+        if (chosen) each.scrollIntoView({ block: "nearest", inline: "nearest" });
         byId(each.getAttribute("aria-controls")).hidden = !chosen;
       }
     };

@@ -54,7 +54,7 @@ export class Link {
     this.delay = this.asked = null;
     this.echoes = [];
     if (open) this.ping();
-    this.emit("open", open);
+    if (this.newest.open !== open) this.emit("open", open); // its age is that of the loss, not of the newest attempt
   }
 
   ping() {
@@ -132,11 +132,17 @@ export class Link {
     this.send({ do: "watch", robot });
   }
 
+  /** Milliseconds there and back from the browser to the station, and from there to the robot; only while both are known. */
+  delays() {
+    const waits = this.asked === null ? 0 : performance.now() - this.asked;
+    return { browser: Math.max(this.delay, waits), robot: 1000 * this.newest.link.round_trip };
+  }
+
   /** Milliseconds from a hand to the robot and back to the screen; null while unknown. */
   roundTrip() {
     const robot = this.newest.link?.round_trip;
     if (this.delay === null || robot == null) return null;
-    const waits = this.asked === null ? 0 : performance.now() - this.asked;
-    return Math.max(this.delay, waits) + 1000 * robot;
+    const { browser } = this.delays();
+    return browser + 1000 * robot;
   }
 }

@@ -1,5 +1,6 @@
 // Every text of the page comes from one table, by key; `{name}` in it is replaced.
 let table = {};
+const STILL = 0.005; // m/s and rad/s: less is standing
 
 export async function loadWords() {
   table = await (await fetch("/strings.json")).json();
@@ -15,9 +16,13 @@ export function words(key, values = {}) {
   return (table[key] ?? key).replace(/\{(\w+)\}/g, (whole, name) => values[name] ?? whole);
 }
 
-// The gate's mode, and that the robot has not come to rest yet.
-export function modeText(mode, stopping) {
-  const text = words(`mode.${mode ?? "unknown"}`);
+/** Whether the gate commands a motion. */
+export const moves = (gate) => Boolean(gate?.twist) && Math.hypot(gate.twist.vx, gate.twist.vy, gate.twist.wz) > STILL;
+
+// The gate's mode, and that the robot has not come to rest yet. A robot that is told to stand is armed, whoever holds the lease.
+export function modeText(mode, stopping, gate = null) {
+  const shown = mode === "driving" && gate && !moves(gate) ? "armed" : mode ?? "unknown";
+  const text = words(`mode.${shown}`);
   return stopping && mode !== "stopping" ? `${text}, ${words("mode.stopping").toLowerCase()}` : text;
 }
 

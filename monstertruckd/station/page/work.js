@@ -26,6 +26,8 @@ export class Work {
     });
     byId("tab-settings").addEventListener("click", () => this.loadSettings());
     byId("tab-recordings").addEventListener("click", () => this.loadRecordings());
+    byId("settings-find").oninput = byId("settings-changed").onchange = () => this.filterSettings();
+    byId("settings-find").placeholder = words("settings.find");
     byId("recordings-again").onclick = () => this.loadRecordings();
     byId("explore-start").onclick = () => this.begin("task.explore", { do: "explore", order: "start" });
     byId("explore-stop").onclick = () => this.ask("task.explore", { do: "explore", order: "stop" });
@@ -141,25 +143,43 @@ export class Work {
     const answer = await this.link.ask({ do: "settings" });
     if (!this.outcome("tab.settings", answer)) return;
     byId("settings").replaceChildren(...answer.value.settings.map((row) => this.setting(row)));
+    this.filterSettings();
     byId("settings-save-row").hidden = !this.engineer;
   }
 
+  /** Show the settings whose name, key or meaning has every word that is searched, and of those only changed ones if so wished. */
+  filterSettings() {
+    const wanted = byId("settings-find").value.toLowerCase().split(/\s+/);
+    for (const row of byId("settings").children) {
+      const found = wanted.every((word) => row.textContent.toLowerCase().includes(word));
+      row.hidden = !found || (byId("settings-changed").checked && !row.classList.contains("changed"));
+    }
+  }
+
+  /** One setting by its name, in degrees where the robot counts in radians. */
   setting({ key, value, began, meaning, above, at_least, below, at_most }) {
     const id = `setting-${key.replaceAll(".", "-")}`;
-    const input = element("input", { id, value: String(value), disabled: !this.engineer, inputMode: "decimal", autocomplete: "off" });
+    const unit = unitOf(meaning);
+    const shown = (number) => (typeof number === "number" ? String(Number((number * unit.factor).toPrecision(6))) : String(number));
+    const input = element("input", { id, value: shown(value), disabled: !this.engineer, inputMode: "decimal", autocomplete: "off" });
     input.setAttribute("aria-describedby", `${id}-note`);
-    const change = async () => {
-      if (input.value === String(value)) return;
-      const wanted = Number.isFinite(Number(input.value)) && input.value.trim() ? Number(input.value) : input.value;
+    const set = async (wanted) => {
       const answer = await this.link.ask({ do: "set", key, value: wanted, save: byId("settings-save").checked });
-      if (!this.outcome(key, answer)) input.value = String(value);
+      if (!this.outcome(key, answer)) input.value = shown(value);
     };
-    input.onchange = change;
+    input.onchange = () => {
+      if (input.value === shown(value)) return;
+      const typed = Number(input.value.replace(",", "."));
+      set(Number.isFinite(typed) && input.value.trim() ? typed / unit.factor : input.value);
+    };
     const bounds = [[">", above], ["≥", at_least], ["<", below], ["≤", at_most]]
-      .filter(([, bound]) => bound !== null).map(([sign, bound]) => `${sign} ${Number(bound.toPrecision(4))}`).join(", ");
-    const changed = value === began ? "" : words("settings.began", { value: began });
-    return element("div", { className: `setting${changed ? " changed" : ""}` }, element("label", { htmlFor: id }, ...breakable(key)), input,
-      element("p", { id: `${id}-note`, className: "note", textContent: [meaning, bounds, changed].filter(Boolean).join(" · ") }));
+      .filter(([, bound]) => bound !== null).map(([sign, bound]) => `${sign} ${Number((bound * unit.factor).toPrecision(4))}${unit.name && ` ${unit.name}`}`).join(", ");
+    const changed = value === began ? "" : words("settings.began", { value: `${shown(began)}${unit.name && ` ${unit.name}`}` });
+    const note = element("p", { id: `${id}-note`, className: "note", textContent: [meaning, bounds, changed].filter(Boolean).join(" · ") });
+    if (changed && this.engineer) note.append(" ", button(words("settings.reset"), () => set(began)));
+    const name = key.split(".").slice(-2).join(" ").replaceAll("_", " ");
+    return element("div", { className: `setting${changed ? " changed" : ""}` },
+      element("label", { htmlFor: id }, `${name[0].toUpperCase()}${name.slice(1)}${unit.name && `, ${unit.name}`}`, element("small", {}, ...breakable(key))), input, note);
   }
 
   // Recordings
@@ -204,6 +224,12 @@ export class Work {
     offer();
     return item;
   }
+}
+
+/** Unit that a setting's meaning names last, and by what its value is multiplied for people: degrees instead of radians. */
+export function unitOf(meaning) {
+  const [, unit = ""] = /(?:, |\()(rad(?:\/s(?:\^2)?)?|m(?:\/s(?:\^2)?)?|s|Hz|V|1\/m|%|N|kg)\)?\.?$/.exec(meaning.trim()) ?? [];
+  return unit.startsWith("rad") ? { name: unit.replace("rad", "°"), factor: 180 / Math.PI } : { name: unit, factor: 1 };
 }
 
 /** A configured name as people write it. */

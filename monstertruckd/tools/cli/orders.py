@@ -202,8 +202,8 @@ def drive(
 ) -> None:
     """Drive with the keyboard: the robot moves only while a key is held, in this terminal.
 
-    `Enter` arms, `W A S D` or the arrow keys drive, `space` stops, `e` is the emergency stop and
-    `r` resets it, `1` to `5` choose front, rear, counter, crab or hybrid steering, `z` and `c`
+    `Enter` arms, `W A S D` or the arrow keys drive, `space` is the emergency stop,
+    `r` resets it, `Esc` stops, `1` to `5` choose front, rear, counter, crab or hybrid steering, `z` and `c`
     the drift of the last, `x` straightens the wheels, `+` and `-` change the speed, `q` ends.
     `v`, held in place of `s`, drives in reverse into ground that no sensor has seen, at 0.05 m/s at most.
     `6` drives by twist: `A` and `D` turn, also on the spot, `z` and `c` move left and right.

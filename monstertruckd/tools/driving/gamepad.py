@@ -64,8 +64,8 @@ Button = Literal[
 Axis = Literal["left_x", "left_y", "left_trigger", "right_x", "right_y", "right_trigger", "hat_x", "hat_y"]
 KEYS: Final[dict[str, str]] = {
     "arm": "enter",
-    "stop": "space",
-    "estop": "e",
+    "stop": "escape",
+    "estop": "space",
     "reset": "r",
     "faster": "+",
     "slower": "-",

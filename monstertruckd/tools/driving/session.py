@@ -40,7 +40,7 @@ NEUTRAL_REQUESTS: Final = 6
 """Neutral requests after the gamepad was let go, so that the truck stops by its ramp."""
 QUIET: Final = frozenset({Reason.CLIPPED, Reason.SERVO_LIMIT})
 """Limits of the driver's own request: the hand knows."""
-HELP = "Enter arm  WASD drive  space stop  e E-STOP  r reset  x straight  q end"
+HELP = "Enter arm  WASD drive  space E-STOP  Esc stop  r reset  x straight  q end"
 ARROWS = {1: "▲ forward", -1: "▼ back", 0: "standing"}
 HINTS = {
     None: "no state of the gate yet",

@@ -43,7 +43,7 @@ DRIFTING: Final = {"z": 1, "c": -1}
 CENTRE: Final = "x"
 UNSEEN: Final = "v"
 """Drives on, by default in reverse, into ground that no sensor has seen."""
-ORDERS: Final = {"enter": Order.ARM, "space": Order.STOP, "escape": Order.STOP, "e": Order.ESTOP, "r": Order.RESET}
+ORDERS: Final = {"enter": Order.ARM, "space": Order.ESTOP, "escape": Order.STOP, "e": Order.ESTOP, "r": Order.RESET}
 ENDS: Final = frozenset({"q", "end"})
 
 Command = Order | Literal["end"]

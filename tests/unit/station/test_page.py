@@ -2,9 +2,11 @@
 
 import asyncio
 import json
+import re
 from pathlib import Path
 from typing import Any
 
+import pytest
 from playwright.async_api import Page
 
 from monstertruck_schemas.event import Cause, Stop
@@ -339,6 +341,185 @@ async def an_emulated_robot_fails_and_gets_obstacles_by_hand(page: Page) -> None
     await page.click("#tab-drive")
 
 
+async def a_goal_says_what_the_gate_lets_it_do(page: Page) -> None:
+    goal = {"number": 3, "phase": "driving", "remaining": 1.0, "goal": {"x": 1, "y": 0, "yaw": 0}, "text": ""}
+    await say(page, {"kind": "goal", "m": goal}, gate_says(GateMode.DRIVING))
+    assert await page.inner_text("#goal-text") == "Goal 3: driving, 1.0 m to go"
+    await say(page, gate_says(GateMode.DISARMED))
+    assert await page.inner_text("#goal-text") == "Goal 3: waits, the robot is disarmed, 1.0 m to go"
+    ended = goal | {"phase": "idle", "goal": None, "outcome": "estopped", "text": "emergency stop is latched"}
+    await say(page, {"kind": "goal", "m": ended})
+    assert await page.inner_text("#goal-text") == "Goal 3 was ended by an emergency stop"
+    await say(page, {"kind": "goal", "m": goal | {"number": 0, "phase": "idle", "goal": None}})
+
+
+async def armed_at_rest_is_called_armed(page: Page) -> None:
+    await say(page, {"kind": "pilot", "source": "me"})
+    twist = {"vx": 0.0, "vy": 0.0, "wz": 0.0}
+    fields = {"holder": "me", "lease_left": 0.2}
+    await say(page, gate_says(GateMode.DRIVING, twist=twist, **fields))
+    await page.wait_for_selector("#authority[data-mode=driving]")
+    assert (await page.inner_text("#mode-name"), await page.inner_text("#holder-name")) == ("Armed", "You have control")
+    await say(page, gate_says(GateMode.DRIVING, twist=twist | {"vx": 0.1}, **fields))
+    await asyncio.sleep(0.2)
+    assert (await page.inner_text("#mode-name"), await page.inner_text("#holder-name")) == ("Driving", "You drive")
+
+
+async def a_hand_on_a_disarmed_robot_hears_arm_first(page: Page) -> None:
+    await say(page, gate_says(GateMode.DISARMED))
+    await page.focus("#stick")
+    await page.keyboard.down("w")
+    await asyncio.sleep(0.15)
+    assert await page.inner_text("#hand-note") == "Arm first: the robot is disarmed"
+    await page.keyboard.up("w")
+    await asyncio.sleep(0.15)
+    assert await page.inner_text("#hand-note") == ""
+
+
+async def space_and_a_gamepads_face_button_are_the_emergency_stop_and_escape_stops(page: Page) -> None:
+    async def orders() -> list[str]:
+        await asyncio.sleep(0.15)
+        given = await page.evaluate("window.sent.filter((each) => each.do === 'order').map((each) => each.order)")
+        await page.evaluate("void (window.sent = [])")
+        return list(given)
+
+    await orders()
+    await page.keyboard.press("Space")
+    assert await orders() == ["estop"]
+    await page.keyboard.press("Escape")
+    assert await orders() == ["stop"]
+    pad = """(pressed) => {
+        const buttons = Array.from({ length: 17 }, (_, i) => ({ pressed: pressed && i === 1 }));
+        const pad = { connected: true, mapping: "standard", id: "synthetic", axes: [0, 0, 0, 0], buttons };
+        navigator.getGamepads = () => [pad];
+    }"""
+    await page.evaluate("document.hasFocus = () => true")
+    await page.evaluate(pad, True)
+    assert await orders() == ["estop"], "once, however long it is held"
+    await page.evaluate(pad, False)
+    await page.evaluate("navigator.getGamepads = () => []")
+
+
+async def the_link_that_failed_is_named_with_its_age(page: Page) -> None:
+    await say(page, gate_says(GateMode.DISARMED), {"kind": "link", "alive": True, "round_trip": 8.9, "text": ""})
+    await page.wait_for_function(
+        "() => document.querySelector('#chip-link').textContent === 'Station to robot: 8900 ms'"
+    )
+    await say(page, {"kind": "link", "alive": True, "round_trip": 0.02, "text": ""})
+    await page.wait_for_function(
+        "() => /^Station to robot: silent for/.test(document.querySelector('#chip-link').textContent)"
+    )
+    text = "The station has heard nothing from truck for"
+    await page.wait_for_function(f"() => document.querySelector('#banners').textContent.startsWith('{text}')")
+    gone = "class { static OPEN = 1; constructor() { setTimeout(() => this.onclose(), 0); } send() {} }"
+    await page.evaluate(f"void (window.WebSocket = {gone})")
+    await page.evaluate("window.socket.onclose()")
+    await page.wait_for_function(
+        "() => document.querySelector('#chip-link').textContent === 'Browser to station: lost for 3 s'"
+    )
+    text = "This browser has had no connection to the station for"
+    assert text in await page.inner_text("#banners")
+
+
+async def why_the_robot_stands_is_in_the_panel_with_time_and_remedy(page: Page) -> None:
+    cause = Cause(reason=Reason.SCAN_STALE, source="lidar", since=9 * 10**8, text="no fresh lidar scan")
+    header = {"stamp": 0, "text": "", "received": 10**9, "seq": 1, "number": 4}
+    stop = Stop(**header, reason=cause.reason, mode=GateMode.DISARMED, causes=(cause,))
+    await say(page, gate_says(GateMode.DISARMED), {"kind": "stop", "m": json.loads(stop.model_dump_json())})
+    await page.wait_for_selector("#stopped:not([hidden])")
+    shown = await page.inner_text("#stopped")
+    assert "1 s ago: no fresh lidar scan (lidar). Check the lidar's cable and supply" in shown
+    await say(page, gate_says(GateMode.DRIVING, twist={"vx": 0.1, "vy": 0.0, "wz": 0.0}))
+    await page.wait_for_selector("#stopped", state="hidden")
+
+
+async def events_have_times_are_counted_and_filtered(page: Page) -> None:
+    event = {"severity": "warning", "source": "lidar", "reason": "scan_stale", "stamp": 10**9}
+    await say(page, {"kind": "robot", "name": "truck"}, FACTS)
+    await say(page, {"kind": "event", "m": event | {"text": "late by 3 ms"}})
+    await say(page, gate_says(GateMode.DISARMED))
+    for text in ("late by 4 ms", "late by 50 ms"):
+        await say(page, {"kind": "event", "m": event | {"text": text}})
+    await say(page, {"kind": "event", "m": event | {"text": "armed", "severity": "info"}})
+    await page.click("#tab-events")
+    await page.wait_for_function("() => document.querySelectorAll('#events li').length === 2")
+    newest, before = await page.locator("#events li").all_inner_texts()
+    assert "late by 50 ms" in before
+    assert "3 times" in before
+    assert re.search(r"\d\d:\d\d:\d\d", newest)
+    assert re.search(r"\d\d:\d\d:\d\d.* to \d\d:\d\d:\d\d", before)
+    await page.select_option("#events-least", "error")
+    assert await page.locator("#events li:visible").count() == 0
+    await page.select_option("#events-least", "warning")
+    assert await page.locator("#events li:visible").count() == 1
+    await page.click("#tab-drive")
+
+
+async def settings_have_names_units_degrees_search_and_a_way_back(page: Page) -> None:
+    angle = {
+        "key": "gate.tilt.stop",
+        "value": 0.35,
+        "began": 0.35,
+        "meaning": "Tilt that stops the robot, rad.",
+        "above": 0.0,
+        "at_least": None,
+        "below": None,
+        "at_most": 0.7,
+    }
+    speed = angle | {
+        "key": "gate.speed",
+        "value": 0.1,
+        "began": 0.2,
+        "meaning": "Of the fastest wheel, m/s.",
+        "at_most": 1.0,
+    }
+    await page.evaluate("void (window.sent = [])")
+    await page.click("#tab-settings")
+    await page.wait_for_function("() => window.sent.some((each) => each.do === 'settings')")
+    (asked,) = await page.evaluate("window.sent.filter((each) => each.do === 'settings')")
+    await say(page, {"kind": "answer", "id": asked["id"], "ok": True, "value": {"settings": [angle, speed]}})
+    row = page.locator(".setting").first
+    text = await row.inner_text()
+    assert "Tilt stop, °" in text
+    assert "> 0 °, ≤ 40.11 °" in text
+    assert await row.locator("input").input_value() == "20.0535"
+    await page.evaluate("void (window.sent = [])")
+    await row.locator("input").fill("30")
+    await row.locator("input").press("Enter")
+    (asked,) = await page.evaluate("window.sent.filter((each) => each.do === 'set')")
+    assert asked["value"] == pytest.approx(0.5235988)
+    await page.fill("#settings-find", "fastest wheel")
+    assert await page.locator(".setting:visible").count() == 1
+    await page.fill("#settings-find", "")
+    await page.check("#settings-changed")
+    assert "changed, 0.2 m/s at the start" in await page.locator(".setting:visible").inner_text()
+    await page.evaluate("void (window.sent = [])")
+    await page.locator(".setting:visible button").click()
+    (asked,) = await page.evaluate("window.sent.filter((each) => each.do === 'set')")
+    assert (asked["key"], asked["value"]) == ("gate.speed", 0.2)
+    await page.uncheck("#settings-changed")
+    await page.click("#tab-drive")
+
+
+async def stick_and_map_are_in_view_together_on_a_phone_and_tabs_stay_in_one_line(page: Page) -> None:
+    for width, height in ((390, 844), (844, 390)):
+        await page.set_viewport_size({"width": width, "height": height})
+        await page.click("#tab-drive")
+        await page.evaluate("window.scrollTo(0, 0)")
+        stop = await page.locator("#estop").bounding_box()
+        assert stop is not None
+        lowest = stop["y"] if stop["y"] > height / 2 else height  # on a phone held upright it is at the bottom
+        for part in ("#map", "#stick"):
+            box = await page.locator(part).bounding_box()
+            assert box is not None
+            assert box["height"] > 120, (part, width)
+            assert box["y"] + box["height"] <= lowest + 1, (part, width)
+        tabs = [await tab.bounding_box() for tab in await page.locator("[role=tab]:visible").all()]
+        assert len({round(tab["y"]) for tab in tabs if tab}) == 1, "one line"
+        assert await page.evaluate("document.documentElement.scrollWidth") <= width
+    await page.set_viewport_size({"width": 1280, "height": 720})
+
+
 async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path: Path):
     """All in one browser, for it takes seconds to start."""
     async with serving() as (station, _), chromium(tmp_path) as browser:
@@ -364,4 +545,13 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page)
         await the_configured_path_is_started_by_its_name(page)
         await an_emulated_robot_fails_and_gets_obstacles_by_hand(page)
+        await a_goal_says_what_the_gate_lets_it_do(page)
+        await armed_at_rest_is_called_armed(page)
+        await a_hand_on_a_disarmed_robot_hears_arm_first(page)
+        await space_and_a_gamepads_face_button_are_the_emergency_stop_and_escape_stops(page)
+        await why_the_robot_stands_is_in_the_panel_with_time_and_remedy(page)
+        await events_have_times_are_counted_and_filtered(page)
+        await settings_have_names_units_degrees_search_and_a_way_back(page)
+        await stick_and_map_are_in_view_together_on_a_phone_and_tabs_stay_in_one_line(page)
+        await the_link_that_failed_is_named_with_its_age(page)
         assert errors == []

@@ -122,7 +122,7 @@ def test_buttons_and_the_cross_give_each_order_once():
         "faster",
     ]
     assert hand.feed(key("mode")) == []
-    assert (key_for("estop", SteeringMode.FRONT), key_for("arm", SteeringMode.FRONT)) == ("e", "enter")
+    assert (key_for("estop", SteeringMode.FRONT), key_for("arm", SteeringMode.FRONT)) == ("space", "enter")
     assert (key_for("next_mode", SteeringMode.TWIST), key_for("previous_mode", SteeringMode.FRONT)) == ("1", "6")
 
 

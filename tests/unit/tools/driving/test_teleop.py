@@ -170,7 +170,7 @@ def test_keys_choose_mode_and_speed():
 
 @pytest.mark.parametrize(
     ("key", "command"),
-    [("space", Order.STOP), ("escape", Order.STOP), ("e", Order.ESTOP), ("r", Order.RESET), ("q", "end")],
+    [("space", Order.ESTOP), ("escape", Order.STOP), ("e", Order.ESTOP), ("r", Order.RESET), ("q", "end")],
 )
 def test_orders_and_the_end_silence_the_keys(key: str, command: object):
     teleop = Teleop()
