@@ -1,6 +1,7 @@
 """The demo, and the emulated robot it drives."""
 
 import itertools
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -62,6 +63,8 @@ def demo(
     folder = fresh(output)
     remark(f"starting the emulated robot and its daemon; log, map and outputs go to {folder}")
     screen = on_terminal(sys.stdout) and not json_output
+    if not fast and (waiting := busy()):
+        remark(f"{waiting}: late control ticks may stop the robot; `monstertruckd demo --fast` waits for none")
     try:
         if fast:
             summary = run_fast_demo(config, folder, seed, film)
@@ -75,7 +78,7 @@ def demo(
     else:
         _print(summary.rows(), summary.messages)
     if summary.lap.outcome is not Reason.GOAL_REACHED:
-        finish(summary.lap.outcome)
+        finish(summary.lap.outcome, summary.lap.text)
         finish(Reason.INTERNAL)
 
 
@@ -83,6 +86,12 @@ def fresh(folder: Path) -> Path:
     """``folder``, or the first of ``folder-2``, ``folder-3`` ... that is not there yet: no run overwrites another."""
     names = itertools.chain([folder], (folder.with_name(f"{folder.name}-{n}") for n in itertools.count(2)))
     return next(name for name in names if not name.exists())
+
+
+def busy() -> str:
+    """How many programs want a processor for each one that there is, if that is more than one; empty otherwise."""
+    load, processors = os.getloadavg()[0], os.cpu_count() or 1
+    return f"this computer is busy, {load:.1f} programs for {processors} processors" if load > processors else ""
 
 
 def _print(rows: list[tuple[str, str]], messages: dict[str, int]) -> None:

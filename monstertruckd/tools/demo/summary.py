@@ -11,6 +11,8 @@ from monstertruck_runtime.clock import SECOND
 from monstertruckd.tools.logs.summary import info
 from monstertruckd.tools.simulation.operator import Lap
 
+LATE = 0.02
+"""Lateness from which on the computer counts as busy, s: one control tick."""
 GOAL_CLOSING = 0.3
 """Greatest true closing error of the lap, m."""
 
@@ -73,6 +75,7 @@ class Summary:
             ("outcome", self.lap.outcome.text + (", COLLIDED" if self.collided else "")),
             ("lap time", f"{self.lap.seconds:.1f} s"),
             *self._stops_row(),
+            *self._busy_row(),
             ("distance, true", f"{self.distance:.2f} m"),
             ("cross-track RMS", f"{self.lap.cross_track_rms * 100:.2f} cm"),
             *self._closing_row(),
@@ -93,6 +96,14 @@ class Summary:
         again = f"; armed again {self.lap.armed_again} x" if self.lap.armed_again else ""
         return [("stopped on the way", text + again)] if text else []
 
+    def _busy_row(self) -> list[tuple[str, str]]:
+        """What a lap with stops on a busy computer needs; nothing for others."""
+        if not (self.lap.stops and self.lateness_p99 > LATE):
+            return []
+        return [
+            ("busy computer", f"ticks came {self.lateness_p99 * 1e3:.0f} ms late: end other programs, or use --fast")
+        ]
+
     def _closing_row(self) -> list[tuple[str, str]]:
         if not self.closed:
             return []
@@ -102,6 +113,7 @@ class Summary:
         """Everything as plain data."""
         return {
             "outcome": self.lap.outcome.value,
+            "text": self.lap.text,
             "collided": self.collided,
             "lap_s": self.lap.seconds,
             "distance_m": self.distance,

@@ -1,8 +1,9 @@
 """An operator that arms the truck and watches a lap, over Zenoh or inside the daemon's process."""
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from monstertruck_runtime.mailbox import Delivery, Mailbox, fifo, latest
 from monstertruck_runtime.requests import Operator
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Message
+from monstertruck_schemas.event import Event
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import UNCONDITIONAL, ControlRequest, DriveRequest, Order, Role
 from monstertruck_schemas.state import GateState
@@ -21,6 +23,10 @@ from monstertruck_schemas.topics import Topic
 from monstertruckd.daemon import Daemon
 
 M = TypeVar("M", bound=Message)
+
+
+GIVEN_UP: Final = frozenset({Reason.PATH_LOST, Reason.BAD_INPUT, Reason.NOT_FINITE, Reason.STUCK})
+"""Outcomes that arming again does not change, also before the path has begun."""
 
 
 class LocalOperator(Operator):
@@ -88,6 +94,8 @@ class Lap:
     """Why the gate stopped the truck on the way, in order."""
     armed_again: int = 0
     """How many of them left it disarmed."""
+    text: str = ""
+    """Why the path was given up, in the tracker's words; empty if it was driven."""
 
     @property
     def seconds(self) -> float:
@@ -116,6 +124,7 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
         operator.subscribe(topics.GATE, latest()) as gate,
         operator.subscribe(topics.STOP, fifo(256)) as stop,
         operator.subscribe(topics.TRACKER, fifo(256)) as tracker,
+        operator.subscribe(topics.EVENT, fifo(256)) as events,
     ):
         await _arm(operator, clock, timeout)
         start, driven = clock.now(), False
@@ -133,9 +142,11 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
                         continue  # of the path's end before
                     cross_track.append(report.cross_track)
                     stops |= {one.number: one.reason for one in stop.drain() if one.stamp >= start}
-                    if report.outcome is not Reason.DRIVING and report.along > 0:
+                    if report.outcome is not Reason.DRIVING and (report.along > 0 or report.outcome in GIVEN_UP):
                         reasons = tuple(stops.values())
-                        return Lap(report.outcome, start, report.stamp, np.array(cross_track), reasons, armed_again)
+                        text = await _text_of(report.outcome, events, clock)
+                        across = np.array(cross_track)
+                        return Lap(report.outcome, start, report.stamp, across, reasons, armed_again, text)
                     state = gate.latest
                     # 20: times in a lap that the truck is armed again after a stop; more are a fault, not a busy
                     # computer
@@ -147,6 +158,19 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
             raise NoAnswerError(f"path not finished within {limit:g} s ({why})") from None
         finally:
             await operator.disarm()
+
+
+async def _text_of(outcome: Reason, events: Mailbox[Event], clock: Clock) -> str:
+    """Text of the tracker's event on the end of a path, which may come a moment after its state."""
+    if outcome is Reason.GOAL_REACHED:
+        return ""
+    with suppress(TimeoutError):
+        async with clock.deadline(1.0):
+            while True:
+                event = await events.next()
+                if event.reason is outcome and event.text:
+                    return event.text
+    return ""
 
 
 async def _arm(operator: Operator, clock: Clock, timeout: float) -> None:

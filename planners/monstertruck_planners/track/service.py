@@ -222,6 +222,8 @@ class TrackingStep:
                 if reached
                 else f"path {path.name!r} leads back onto ground that no sensor has seen, from {at[0]:.2f}, {at[1]:.2f}"
             )
+        if command.outcome is Reason.PATH_LOST:
+            text = self._lost(path, command.progress, at)
         if active := gate.mode.active:
             self._progress = command.progress
         self._outcome = command.outcome
@@ -233,6 +235,15 @@ class TrackingStep:
         # 0.01: speed of a truck at rest, m/s
         drive = active and (command.outcome is Reason.DRIVING or abs(pose.twist.vx) > 0.01)
         return TrackOutput(command, drive, path.frame, path.name, along, path.length, axles, self._drain())
+
+    def _lost(self, path: SegmentedPath, progress: PathProgress, at: tuple[float, float, float]) -> str:
+        """Where the robot and the nearest part of its path are."""
+        x, y = path.segments[progress.segment].at(progress.s).point
+        return (
+            f"path {path.name!r} is {math.dist((x, y), at[:2]):.2f} m from the robot, which is at {at[0]:.2f}, "
+            f"{at[1]:.2f} m in {path.frame}; the nearest point of the path is {x:.2f}, {y:.2f} m, and the tracker "
+            f"follows within {self._config.lost_distance:g} m"
+        )
 
     def _before_unseen(self, now: int, gate: GateState, *, driving: bool) -> bool:
         """Whether the gate has stopped the truck before unseen ground for some time; from then on until armed again."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.async_api import Page
+from playwright.async_api import Page, expect
 
 from monstertruck_schemas.event import Cause, Stop
 from monstertruck_schemas.reasons import Reason
@@ -359,21 +359,20 @@ async def armed_at_rest_is_called_armed(page: Page) -> None:
     fields = {"holder": "me", "lease_left": 0.2}
     await say(page, gate_says(GateMode.DRIVING, twist=twist, **fields))
     await page.wait_for_selector("#authority[data-mode=driving]")
-    assert (await page.inner_text("#mode-name"), await page.inner_text("#holder-name")) == ("Armed", "You have control")
+    await expect(page.locator("#mode-name")).to_have_text("Armed")
+    assert await page.inner_text("#holder-name") == "You have control"
     await say(page, gate_says(GateMode.DRIVING, twist=twist | {"vx": 0.1}, **fields))
-    await asyncio.sleep(0.2)
-    assert (await page.inner_text("#mode-name"), await page.inner_text("#holder-name")) == ("Driving", "You drive")
+    await expect(page.locator("#mode-name")).to_have_text("Driving")
+    assert await page.inner_text("#holder-name") == "You drive"
 
 
 async def a_hand_on_a_disarmed_robot_hears_arm_first(page: Page) -> None:
     await say(page, gate_says(GateMode.DISARMED))
     await page.focus("#stick")
     await page.keyboard.down("w")
-    await asyncio.sleep(0.15)
-    assert await page.inner_text("#hand-note") == "Arm first: the robot is disarmed"
+    await expect(page.locator("#hand-note")).to_have_text("Arm first: the robot is disarmed")
     await page.keyboard.up("w")
-    await asyncio.sleep(0.15)
-    assert await page.inner_text("#hand-note") == ""
+    await expect(page.locator("#hand-note")).to_have_text("")
 
 
 async def space_and_a_gamepads_face_button_are_the_emergency_stop_and_escape_stops(page: Page) -> None:
@@ -426,9 +425,8 @@ async def why_the_robot_stands_is_in_the_panel_with_time_and_remedy(page: Page) 
     header = {"stamp": 0, "text": "", "received": 10**9, "seq": 1, "number": 4}
     stop = Stop(**header, reason=cause.reason, mode=GateMode.DISARMED, causes=(cause,))
     await say(page, gate_says(GateMode.DISARMED), {"kind": "stop", "m": json.loads(stop.model_dump_json())})
-    await page.wait_for_selector("#stopped:not([hidden])")
-    shown = await page.inner_text("#stopped")
-    assert "1 s ago: no fresh lidar scan (lidar). Check the lidar's cable and supply" in shown
+    expected = "1 s ago: no fresh lidar scan (lidar). Check the lidar's cable and supply"
+    await expect(page.locator("#stopped")).to_contain_text(expected)
     await say(page, gate_says(GateMode.DRIVING, twist={"vx": 0.1, "vy": 0.0, "wz": 0.0}))
     await page.wait_for_selector("#stopped", state="hidden")
 

@@ -314,7 +314,10 @@ def test_a_lost_path_is_reported_and_the_truck_left_standing():
         assert bench.reported[-1].stamp - bench.asked[-1].stamp > SECOND // 2
 
     bench = on_bench(scenario, path(straight(4.0)))
-    assert [reason for reason, _ in bench.events] == [Reason.PATH_LOST]
+    ((reason, text),) = bench.events
+    assert reason is Reason.PATH_LOST
+    assert "m from the robot, which is at" in text
+    assert "2.00 m in odom; the nearest point of the path is" in text
 
 
 def test_a_new_path_replaces_the_old_one():
