@@ -76,7 +76,8 @@ def decode(name: str, data: bytes) -> RosMessage:
 
 
 def _pad(body: bytearray, size: int) -> None:
-    body += bytes(-len(body) % size)
+    if extra := -len(body) % size:
+        body += bytes(extra)
 
 
 def _aligned(at: int, size: int) -> int:
@@ -87,12 +88,33 @@ def _aligned(at: int, size: int) -> int:
 def _struct_writer(name: str) -> Write:
     fields = [(field.name, _field_writer(field), _default(field)) for field in interfaces()[name]]
     names = frozenset(field for field, _, _ in fields)
+    packed = _packed_writer(interfaces()[name])
 
     def write(body: bytearray, message: Mapping[str, Any]) -> None:
-        if unknown := message.keys() - names:
-            raise ValueError(f"{name} has no field {', '.join(sorted(unknown))}")
+        if not message.keys() <= names:
+            unknown = ", ".join(sorted(message.keys() - names))
+            raise ValueError(f"{name} has no field {unknown}")
+        if packed is not None:
+            packed(body, message)
+            return
         for field, writer, default in fields:
             writer(body, message.get(field, default))
+
+    return write
+
+
+def _packed_writer(fields: tuple[RosField, ...]) -> Write | None:
+    """Writer of an interface that is a row of numbers of one size, such as a point; None for any other."""
+    kinds = {field.kind for field in fields}
+    sizes = {struct.calcsize(_CODES.get(kind, "0s")) for kind in kinds}
+    if len(sizes) > 1 or not kinds <= _CODES.keys() or "float32" in kinds or any(field.many for field in fields):
+        return None
+    row = struct.Struct("<" + "".join(_CODES[field.kind] for field in fields))
+    names, (size,) = [field.name for field in fields], sizes
+
+    def write(body: bytearray, message: Mapping[str, Any]) -> None:
+        _pad(body, size)
+        body += row.pack(*[message.get(name, 0) for name in names])
 
     return write
 
@@ -127,10 +149,16 @@ def _field_writer(field: RosField) -> Write:
                 one(body, value)
         elif len(values):
             _pad(body, size)
-            with np.errstate(over="ignore"):
-                body += values if isinstance(values, bytes) else np.asarray(values).astype(dtype, copy=False).tobytes()
+            body += values if isinstance(values, bytes) else _as_bytes(np.asarray(values), dtype)
 
     return write
+
+
+def _as_bytes(values: np.ndarray[Any, Any], dtype: np.dtype[Any]) -> bytes:
+    if values.dtype == dtype:
+        return values.tobytes()
+    with np.errstate(over="ignore"):
+        return values.astype(dtype).tobytes()
 
 
 def _writer(field: RosField) -> Write:

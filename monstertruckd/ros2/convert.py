@@ -86,12 +86,15 @@ def pose_of(pose: Pose2D, z: float = 0.0) -> RosValues:
     return {"position": vector(pose.x, pose.y, z), "orientation": rotation(quaternion_from_yaw(pose.yaw))}
 
 
+_PLANE: Final = np.array([6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)])
+"""Places of (x, y, yaw) in ROS's covariances over (x, y, z, roll, pitch, yaw)."""
+
+
 def full_covariance(planar: Array) -> Array:
     """Shape (36,) from the (9,) of x, y, yaw; what the plane does not know is 0."""
-    full = np.zeros((6, 6))
-    plane = (0, 1, 5)  # rows of (x, y, yaw) in ROS's covariances over (x, y, z, roll, pitch, yaw)
-    full[np.ix_(plane, plane)] = planar.reshape(3, 3)
-    return full.ravel()
+    full = np.zeros(36)
+    full[_PLANE] = planar
+    return full
 
 
 def scan(message: LaserScan, names: RosNames) -> RosValues:
