@@ -27,7 +27,7 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
 
 import numpy as np
@@ -68,11 +68,11 @@ TWIST = "geometry_msgs/msg/Twist"
 
 
 @asynccontextmanager
-async def process(*words: str, **environment: str) -> AsyncIterator[asyncio.subprocess.Process]:
+async def process(*words: str, folder: Path = ROOT, **environment: str) -> AsyncIterator[asyncio.subprocess.Process]:
     """A process that is ended at the end."""
     pipe = asyncio.subprocess.PIPE
     running = await asyncio.create_subprocess_exec(
-        *words, stdin=pipe, stdout=pipe, stderr=asyncio.subprocess.DEVNULL, cwd=ROOT, env=os.environ | environment
+        *words, stdin=pipe, stdout=pipe, stderr=asyncio.subprocess.DEVNULL, cwd=folder, env=os.environ | environment
     )
     try:
         yield running
@@ -268,7 +268,10 @@ def late_joiner(ros: str) -> float:
 @asynccontextmanager
 async def pyzeros(port: int, count: int) -> AsyncIterator[asyncio.subprocess.Process]:
     """A driver that has compiled what it needs, and begins when it is sent a line."""
-    async with process(sys.executable, str(PARTS / "pyzeros_driver.py"), str(port), str(count)) as driver:
+    compiled = Path(gettempdir()) / "pyzeros"  # which it compiles in the folder that it runs in
+    compiled.mkdir(exist_ok=True)
+    words = (sys.executable, str(PARTS / "pyzeros_driver.py"), str(port), str(count))
+    async with process(*words, folder=compiled, PYTHONPATH=str(ROOT)) as driver:
         assert driver.stdout is not None
         assert (await driver.stdout.readline()).strip() == b"ready"
         yield driver

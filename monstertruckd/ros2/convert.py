@@ -17,7 +17,7 @@ from monstertruck_schemas.base import Message, Pose2D
 from monstertruck_schemas.body import LensConfig
 from monstertruck_schemas.event import Event, LogLevel, LogRecord, Severity
 from monstertruck_schemas.health import HealthTable, ServiceState
-from monstertruck_schemas.plan import Path
+from monstertruck_schemas.plan import ExplorationState, GoalState, Path
 from monstertruck_schemas.points import PointsOfInterest
 from monstertruck_schemas.sensor import (
     NO_ECHO,
@@ -30,7 +30,7 @@ from monstertruck_schemas.sensor import (
     SonarEcho,
     SonarRanges,
 )
-from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry, Transform
+from monstertruck_schemas.state import TILT_STEP, GateMode, GateState, Grid, Ground, Odometry, Peers, Transform
 
 RosValues = dict[str, Any]
 
@@ -180,6 +180,20 @@ def grid(message: Grid, names: RosNames) -> RosValues:
         "origin": pose_of(message.origin),
     }
     return {"header": names.header(message), "info": info, "data": message.cells}
+
+
+def ground(message: Ground, names: RosNames) -> RosValues:
+    """``nav_msgs/msg/OccupancyGrid`` of the ground's tilt in degrees, at most 100; -1 where it is not known."""
+    degrees = np.minimum(np.rint(np.degrees(message.tilt * TILT_STEP)), 100)
+    cells = np.where(message.tilt == 255, -1, degrees).astype(np.int8)  # 255: not known
+    info = {
+        "map_load_time": names.time(message.stamp),
+        "resolution": message.resolution,
+        "width": message.width,
+        "height": message.height,
+        "origin": pose_of(message.origin),
+    }
+    return {"header": names.header(message), "info": info, "data": cells}
 
 
 def grid_update(tile: Grid, whole: Grid, names: RosNames) -> RosValues | None:
@@ -385,6 +399,31 @@ def point_markers(message: PointsOfInterest, names: RosNames) -> RosValues:
         # 0.1, 0.15: m, size of the post and of the letters; 0.2: m from the point up to its name
         markers.append(post | {"pose": pose_of(place, point.z), "scale": vector(0.1, 0.1, 0.1)})
         markers.append(text | {"pose": pose_of(place, point.z + 0.2), "scale": vector(z=0.15), "text": point.name})
+    return {"markers": markers}
+
+
+def task_markers(
+    goal: GoalState | None, exploration: ExplorationState | None, peers: Peers | None, names: RosNames
+) -> RosValues:
+    """``visualization_msgs/msg/MarkerArray`` of the goal, the frontier that is explored next, and other robots."""
+    rows: list[tuple[str, str, Message, Pose2D, tuple[float, ...]]] = []
+    if goal is not None and goal.running and goal.goal is not None:
+        rows.append(("goal", "", goal, goal.goal, (0.2, 0.4, 0.9, 0.9)))
+    if exploration is not None and exploration.running and exploration.target is not None:
+        text = f"{exploration.frontiers} frontiers"
+        rows.append(("frontier", text, exploration, exploration.target, (0.7, 0.2, 0.8, 0.9)))
+    if peers is not None:
+        recent = (peer for peer in peers.peers if peers.stamp - peer.heard < 2 * SECOND)  # 2 s: it may have left
+        rows += [("peers", peer.robot, peers, peer.pose, (0.1, 0.7, 0.7, 0.9)) for peer in recent]
+    markers: list[RosValues] = [{"header": names.header_of(0, "map"), "action": 3}]  # delete all
+    for number, (namespace, text, message, place, colour) in enumerate(rows):
+        header = names.header_of(message.stamp, message.frame or "map")
+        arrow = _marker(header, namespace, 2 * number, _ARROW, colour)
+        # 0.3, 0.06: m, length and width of the arrow
+        markers.append(arrow | {"pose": pose_of(place), "scale": vector(0.3, 0.06, 0.06)})
+        if text:
+            words = _marker(header, namespace, 2 * number + 1, _TEXT, (1.0, 1.0, 1.0, 1.0))
+            markers.append(words | {"pose": pose_of(place, 0.3), "scale": vector(z=0.15), "text": text})
     return {"markers": markers}
 
 

@@ -28,7 +28,7 @@ from monstertruck_schemas.sensor import (
     StabiliserFeedback,
     SteeringFeedback,
 )
-from monstertruck_schemas.state import ClockOffset, Grid, Odometry, Transforms
+from monstertruck_schemas.state import ClockOffset, Grid, Ground, Odometry, Transforms
 from monstertruck_schemas.topics import Topic
 from monstertruckd.ros2 import convert
 from monstertruckd.ros2.cdr import RosMessage
@@ -161,6 +161,8 @@ class RosFace:
             (t.POSE, self._pose),
             (t.MAP, self._whole_map),
             (t.MAP_TILES, self._tile),
+            (t.GROUND, self._ground),
+            (t.SEEN, self._seen),
             (t.PATH, self._path),
             (t.BATTERY, self._battery),
             (t.IMU, self._imu),
@@ -237,6 +239,12 @@ class RosFace:
             if values is not None:
                 self._publish("map_updates", "map_msgs/msg/OccupancyGridUpdate", values)
 
+    def _ground(self, message: Ground) -> None:
+        self._publish("ground_tilt", "nav_msgs/msg/OccupancyGrid", convert.ground(message, self._names), LATCHED)
+
+    def _seen(self, message: Grid) -> None:
+        self._publish("seen_ground", "nav_msgs/msg/OccupancyGrid", convert.grid(message, self._names), LATCHED)
+
     def _path(self, message: Path) -> None:
         self._publish("plan", "nav_msgs/msg/Path", convert.path(message, self._names), LATCHED)
 
@@ -290,7 +298,9 @@ class RosFace:
 
     async def _diagnose(self) -> None:
         """Once a second: the state of services, gate and this face, and the footprint."""
-        gate, health = self._client.watch(t.GATE), self._client.watch(t.HEALTH)
+        watch = self._client.watch
+        gate, health = watch(t.GATE), watch(t.HEALTH)
+        goal, exploration, peers = watch(t.GOAL), watch(t.EXPLORE), watch(t.PEERS)
         size = self._facts.length, self._facts.width
         while True:
             await self._clock.sleep(1.0)
@@ -302,6 +312,8 @@ class RosFace:
                 rows.append(convert.gate_status(gate.latest, robot))
                 markers = convert.gate_markers(gate.latest, *size, self._names)
                 self._publish("gate", "visualization_msgs/msg/MarkerArray", markers)
+            tasks = convert.task_markers(goal.latest, exploration.latest, peers.latest, self._names)
+            self._publish("tasks", "visualization_msgs/msg/MarkerArray", tasks)
             header = {"stamp": self._names.time(self._clock.now() + self._clock.real_offset() - self._names.offset)}
             self._publish("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", {"header": header, "status": rows})
             placed = header | {"frame_id": self._names.frame("base")}

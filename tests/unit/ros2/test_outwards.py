@@ -7,16 +7,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from monstertruck_runtime.clock import WallClock
+from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.yaml_files import read_yaml
 from monstertruck_schemas import topics as t
-from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.body import LensConfig
+from monstertruck_schemas.plan import ExplorationPhase, ExplorationState, GoalPhase, GoalState
 from monstertruck_schemas.sensor import DriveFeedback, DriveMode, SteeringFeedback
-from monstertruck_schemas.state import Grid
+from monstertruck_schemas.state import Grid, Ground, Peer, Peers
 from monstertruckd.config.load import load_truck
 from monstertruckd.ros2 import convert
 from monstertruckd.ros2.cdr import decode, encode
+from monstertruckd.ros2.convert import RosNames
 from monstertruckd.ros2.face import FaceOptions, RosFace
 from monstertruckd.ros2.facts import RobotFacts, WheelJoints, renamed_links
 from monstertruckd.ros2.serve import RVIZ
@@ -155,3 +157,32 @@ def test_links_of_the_description_have_the_frames_of_ros():
     assert '<link name="t1/laser" />' in text
     assert '<joint name="lidar"><parent link="t1/base_link" />' in text
     assert t.SCAN in ROWS
+
+
+def known_ground(tilt):
+    fields = {"resolution": 0.1, "width": len(tilt), "height": 1, "origin": Pose2D(x=0.0, y=0.0, yaw=0.0)}
+    cells = np.array(tilt, np.uint8)
+    return Ground(stamp=1, received=1, seq=1, frame="map", **fields, tilt=cells, roughness=cells)
+
+
+def test_the_tilt_of_the_ground_is_in_degrees_and_unknown_ground_stays_unknown():
+    cells = convert.ground(known_ground([0, 35, 254, 255]), RosNames())["data"]
+    assert cells.tolist() == [0, 10, 73, -1]  # 35 * 0.005 rad are 10 degrees
+
+
+def test_the_goal_the_next_frontier_and_robots_heard_lately_are_marked():
+    header = {"stamp": 10 * SECOND, "received": 0, "seq": 0, "frame": "map"}
+    there = Pose2D(x=1.0, y=2.0, yaw=0.0)
+    goal = GoalState(**header, goal=there, phase=GoalPhase.DRIVING)
+    exploration = ExplorationState(**header, target=there, phase=ExplorationPhase.DRIVING, frontiers=3)
+    still = {"pose": there, "twist": Twist2D(vx=0.0, vy=0.0, wz=0.0)}
+    peers = [Peer(robot=name, heard=heard * SECOND, **still) for name, heard in (("ann", 9), ("bob", 5))]
+    values = convert.task_markers(goal, exploration, Peers(**header, peers=tuple(peers)), RosNames())
+    encode("visualization_msgs/msg/MarkerArray", values)
+    first, *markers = values["markers"]
+    assert first["action"] == 3
+    assert [row["ns"] for row in markers] == ["goal", "frontier", "frontier", "peers", "peers"]
+    assert [row["text"] for row in markers if "text" in row] == ["3 frontiers", "ann"]
+    assert markers[0]["pose"]["position"] == {"x": 1.0, "y": 2.0, "z": 0.0}
+    ended = goal.model_copy(update={"phase": GoalPhase.IDLE})
+    assert len(convert.task_markers(ended, None, None, RosNames())["markers"]) == 1
