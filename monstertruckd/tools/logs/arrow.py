@@ -5,7 +5,7 @@ is a map, any other mapping is JSON text. Absent values are null.
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from enum import Enum
 from functools import cache
@@ -18,11 +18,18 @@ import pyarrow as pa
 import pyarrow.parquet
 from pydantic import BaseModel
 
+from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import BY_NAME
-from monstertruckd.recorder.reader import LogReader, open_log
+from monstertruckd.recorder.reader import LogMessage, LogReader, open_log
 from monstertruckd.tools.logs.export import LOG_TIME, REAL_TIME, flat, made_folder, record_type, whole_tables
 from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_offset
+
+BATCH_BYTES: Final = 4_000_000
+"""Encoded messages of a batch (bytes): a few hundred scans, whose rows take a few ten MB."""
+BATCH_ROWS: Final = 16_384
+"""Rows of a batch at most: small messages take a hundred times their encoded size as rows."""
 
 
 @cache
@@ -91,10 +98,7 @@ class _Batch:
         for field in self.schema:
             self._columns[field.name].append(_value(row[field.name], field.type))
         self._bytes, self._rows = self._bytes + size, self._rows + 1
-        # Encoded messages of a batch (bytes): a few hundred scans, whose rows take a few ten MB.
-        batch_bytes = 4_000_000
-        batch_rows = 16_384  # rows of a batch at most: small messages take a hundred times their encoded size as rows
-        return self._bytes >= batch_bytes or self._rows >= batch_rows
+        return self._bytes >= BATCH_BYTES or self._rows >= BATCH_ROWS
 
     def take(self) -> pa.RecordBatch:
         """The rows so far, which are then forgotten.
@@ -135,12 +139,55 @@ def batches(
     for entry, message in selection.of(reader, progress):
         if entry.topic not in waiting:
             waiting[entry.topic] = _Batch(entry.topic, columns)
-        times = {LOG_TIME: entry.log_time, REAL_TIME: entry.log_time + offset}
-        if waiting[entry.topic].add({**times, **flat(message, type(message), "")}, len(entry.payload)):
+        if waiting[entry.topic].add(_row(entry, message, offset), len(entry.payload)):
             yield entry.topic, waiting[entry.topic].take()
     for topic, batch in waiting.items():
         if last := batch.take():
             yield topic, last
+
+
+def windows(
+    path: str | Path | LogReader, selection: Selection, columns: Mapping[str, Sequence[str]], seconds: float
+) -> Iterator[dict[str, pa.Table]]:
+    """Yield the rows of each topic, window by window of a log; windows without a row are left out.
+
+    Args:
+        path: the log.
+        selection: which messages; names the topics.
+        columns: names of the wanted ones by topic; empty = all.
+        seconds: length of a window, by log time; infinite = one window.
+
+    Raises:
+        NotFoundError: no such log, or a topic lacks a column.
+        InputError: not a log, or a message in it is invalid.
+    """
+    reader = open_log(path)
+    offset = real_offset(reader)
+    waiting = {topic: _Batch(topic, columns[topic]) for topic in selection.topics}
+    full: dict[str, list[pa.RecordBatch]] = {topic: [] for topic in selection.topics}
+
+    def rows() -> dict[str, pa.Table]:
+        found = {
+            topic: pa.Table.from_batches([*full[topic], batch.take()], batch.schema) for topic, batch in waiting.items()
+        }
+        full.update({topic: [] for topic in full})
+        return found
+
+    begin: int | None = None
+    for entry, message in selection.of(reader):
+        begin = entry.log_time if begin is None else begin
+        if entry.log_time - begin >= seconds * SECOND:
+            yield rows()
+            begin = entry.log_time
+        if waiting[entry.topic].add(_row(entry, message, offset), len(entry.payload)):
+            full[entry.topic].append(waiting[entry.topic].take())
+    yield rows()
+
+
+def _row(entry: LogMessage, message: Message, offset: int) -> dict[str, Any]:
+    """The columns of a message; ``offset`` is real minus daemon time, ns."""
+    times = {LOG_TIME: entry.log_time, REAL_TIME: entry.log_time + offset}
+    return {**times, **flat(message, type(message), "")}
 
 
 def export_parquet(

@@ -1,16 +1,17 @@
 """A log for a notebook: topics as NumPy arrays, pandas or polars tables, pictures, maps and events.
 
 Every read passes the file once, in bounded memory: what remains is what was asked for, so choose columns of long logs,
-or go through ``batches``.
+or go through ``batches`` or ``frames``.
 """
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from monstertruck_runtime.clock import SECOND
@@ -131,6 +132,38 @@ class OpenedLog:
             InputError: no topic, or ``at`` is not among them.
             NotFoundError: no such topic, or none of the topics has a column.
         """
+        parts = self._aligned(topics, at, within, columns, Selection((), start, end), np.inf)
+        return _as_frame(pa.concat_tables(parts), library)
+
+    def frames(
+        self,
+        *topics: str,
+        at: str | None = None,
+        within: float = np.inf,
+        columns: Sequence[str] = (),
+        start: float = 0.0,
+        end: float = np.inf,
+        library: Library = "pandas",
+        seconds: float = 60.0,
+    ) -> Iterator[Any]:
+        """The table of ``frame`` in parts of about ``seconds`` of the log: any length passes through bounded memory.
+
+        A row waits for a later message of each topic, for ``seconds`` at most.
+        """
+        for table in self._aligned(topics, at, within, columns, Selection((), start, end), seconds):
+            if len(table):
+                yield _as_frame(table, library)
+
+    def _aligned(
+        self,
+        topics: Sequence[str],
+        at: str | None,
+        within: float,
+        columns: Sequence[str],
+        times: Selection,
+        seconds: float,
+    ) -> Iterator[pa.Table]:
+        """Tables as ``frame`` describes them, one for each window of ``seconds``."""
         at = topics[0] if at is None and topics else at
         if at is None or at not in topics:
             raise InputError(f"at {at!r}: expected one of the topics of the table ({', '.join(topics) or 'none'})")
@@ -138,17 +171,30 @@ class OpenedLog:
         for column in columns:
             if not any(column in names for names in known.values()):
                 raise NotFoundError(f"no column {column} in {', '.join(topics)}")
-        tables = {
-            topic: self._table(named(topic), _wanted(names, columns), start, end) for topic, names in known.items()
-        }
-        stamps = tables[at][STAMP].to_numpy()
-        parts = {TIME: tables[at][TIME]}
-        for topic, table in tables.items():
-            rows = table if topic == at else table.take(_nearest(table[STAMP].to_numpy(), stamps, within))
-            for name in rows.column_names:
-                if name != TIME and (not columns or name in columns):
-                    parts[f"{topic}.{name}"] = rows[name]
-        return _as_frame(pa.table(parts), library)
+        wanted = {named(topic): _wanted(names, columns) for topic, names in known.items()}
+        selection, first = Selection(tuple(wanted), times.start, times.end), self._first()
+
+        def beside(rows: pa.Table, tables: Mapping[str, pa.Table]) -> pa.Table:
+            """The other topics' rows beside those of ``at``."""
+            stamps = rows[STAMP].to_numpy()
+            parts = {TIME: pa.array((rows[LOG_TIME].to_numpy() - first) / SECOND)}
+            for topic, table in tables.items():
+                near = rows if topic == at else table.take(_nearest(table[STAMP].to_numpy(), stamps, within))
+                named_so = (name for name in near.column_names if not columns or name in columns)
+                parts |= {f"{topic}.{name}": near[name] for name in named_so}
+            return pa.table(parts)
+
+        kept: dict[str, pa.Table] = {}
+        for rows in arrow.windows(self._reader, selection, wanted, seconds):
+            tables = {
+                topic: pa.concat_tables([kept[topic], rows[named(topic)]]) if kept else rows[named(topic)]
+                for topic in topics
+            }
+            ready = _ready(tables, at, seconds)
+            yield beside(tables[at].filter(ready), tables)
+            kept = _rest(tables, at, ready, seconds)
+        yield beside(kept[at], kept)
+        self._warn()
 
     def images(
         self, topic: str = t.CAMERA.name, start: float = 0.0, end: float = np.inf
@@ -213,7 +259,35 @@ def named(topic: str) -> str:
 
 def _wanted(names: Sequence[str], columns: Sequence[str]) -> list[str]:
     """Those columns of a topic that a table needs; empty = all."""
-    return [STAMP, *(name for name in names if name in columns and name != STAMP)] if columns else []
+    times = (LOG_TIME, STAMP)
+    return [*times, *(name for name in names if name in columns and name not in times)] if columns else []
+
+
+def _ready(tables: Mapping[str, pa.Table], at: str, seconds: float) -> pa.Array:
+    """Which rows of ``at`` have a later one of every other topic, or have waited for ``seconds`` of the log."""
+    rows = tables[at]
+    newest = min((_greatest(table[STAMP]) for topic, table in tables.items() if topic != at), default=np.inf)
+    waited = max(_greatest(table[LOG_TIME]) for table in tables.values()) - seconds * SECOND
+    return pa.array((rows[STAMP].to_numpy() <= newest) | (rows[LOG_TIME].to_numpy() < waited))
+
+
+def _rest(tables: Mapping[str, pa.Table], at: str, ready: pa.Array, seconds: float) -> dict[str, pa.Table]:
+    """The rows of ``at`` that wait, and those of other topics that may be nearest to them or to later ones."""
+    waiting = tables[at].filter(pc.invert(ready))
+    since = max(_greatest(table[STAMP]) for table in tables.values()) - seconds * SECOND
+    if len(waiting):
+        since = min(since, pc.min(waiting[STAMP]).as_py())
+
+    def near(table: pa.Table) -> pa.Table:
+        stamps = table[STAMP].to_numpy()
+        return table.filter(pa.array(stamps >= _greatest(stamps[stamps <= since])))
+
+    return {topic: waiting if topic == at else near(table) for topic, table in tables.items()}
+
+
+def _greatest(values: Any) -> float:
+    """The greatest of whole numbers, or minus infinity of none."""
+    return np.asarray(values).max() if len(values) else -np.inf
 
 
 def _nearest(stamps: NDArray[np.int64], at: NDArray[np.int64], within: float) -> pa.Array:

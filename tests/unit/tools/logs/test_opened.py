@@ -128,6 +128,34 @@ def test_a_frame_pairs_messages_by_their_stamps(log):
         log.frame("scan", columns=["speed"])
 
 
+@pytest.mark.parametrize("at", ["scan", "odometry", "imu"])
+@pytest.mark.parametrize("seconds", [0.15, 0.4, 60.0])
+def test_a_frame_in_parts_is_the_whole_one(log, at, seconds):
+    topics, columns = ("scan", "odometry", "imu"), ["seq", "pose.x"]
+    whole = log.frame(*topics, at=at, columns=columns, library="polars")
+    parts = list(log.frames(*topics, at=at, columns=columns, library="polars", seconds=seconds))
+    assert (pl.concat(parts) if parts else whole).equals(whole)
+    pairs = ("scan", "odometry")
+    whole = log.frame(*pairs, within=0.02, library="polars")
+    assert pl.concat(log.frames(*pairs, within=0.02, library="polars", seconds=seconds)).equals(whole)
+
+
+def test_parts_of_a_frame_hold_little_of_the_log(tmp_path):
+    file = tmp_path / "run-000001-000.mcap"
+    writer = Writer(file)
+    for seq in range(600):
+        now = SECOND + seq * SECOND // 10
+        writer.put(t.SCAN, scan(now, seq))
+        writer.put(t.ODOMETRY, odometry(now + 30_000_000, seq))
+    writer.log.finish()
+    log = monstertruckd.open_log(file)
+    rows, most = 0, 0
+    for part in log.frames("scan", "odometry", library="polars", seconds=3.0):
+        rows, most = rows + len(part), max(most, len(part))
+    assert rows == len(log.frame("scan", "odometry", library="polars")) == 600
+    assert most <= 35
+
+
 def test_pictures_maps_and_events(log):
     times, pictures = zip(*log.images(), strict=True)
     assert times[1] == pytest.approx(0.1)
