@@ -16,6 +16,7 @@ from monstertruck_planners.explore.service import TILES, ExplorerInputs, Explore
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.deformation import RouteDeformation
 from monstertruck_planners.goals.exchange import Setup
+from monstertruck_planners.goals.known_map import KnownMapService
 from monstertruck_planners.goals.path_publisher import GoalInputs, GoalOutputs
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.missions.service import MissionInputs, MissionParts, MissionService
@@ -92,6 +93,15 @@ def build_planners(
                 config, config.planner, bus, clock, body.chassis, body.footprint, paths, requests, actors
             )
             yield goals
+            if config.planner.map is not None and (config.slam is None or config.slam.mode == "ros2"):
+                yield KnownMapService(
+                    config.planner.map,
+                    frame,
+                    clock,
+                    bus.publisher(topics.MAP, Writer.ESTIMATION),
+                    bus.event_sink(),
+                    inline if isinstance(clock, VirtualClock) else in_thread,
+                )
             if config.explorer is not None:
                 explorer = _build_explorer(config, config.explorer, bus, clock, body, goals, actors, save_map)
                 yield explorer

@@ -111,7 +111,7 @@ def facts(config: dict[str, Any], versions: dict[str, str]) -> str:
         gate={name: config["gate"][name] for name in ("speed", "reverse_speed", "angle", "tilt", "leases")},
         devices=sorted(devices),
         goals=config.get("planner") is not None,
-        mapping=config.get("slam") is not None,
+        mapping=bool(config.get("slam") or (config.get("planner") or {}).get("map")),
         explores=config.get("explorer") is not None,
         tracks=config.get("tracker") is not None,
         path=PurePath(drawn["file"]).stem if (drawn := config.get("path")) else None,

@@ -49,6 +49,7 @@ class ServiceName(StrEnum):
     GROUND = "ground"
     HAND_DRIVE = "hand_drive"
     HEALTH = "health"
+    KNOWN_MAP = "known_map"
     LEVELLING = "levelling"
     LIDAR_SONARS = "lidar_sonars"
     MAP = "map"

@@ -1,0 +1,69 @@
+"""Publishes the map over which a robot without mapping plans, so that operators see it."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Final
+
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.map_files import WorldMap, load_map
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_schemas.base import Pose2D
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
+from monstertruck_schemas.state import Grid
+
+Offload = Callable[[Callable[[], WorldMap]], Awaitable[WorldMap]]
+"""Runs a function that takes a file system's time."""
+
+NAME: Final = ServiceName.KNOWN_MAP.value
+
+
+class KnownMapService:
+    """Reads the planner's map once and publishes it; the topic retains it.
+
+    Args:
+        place: map_server YAML, or the folder of a saved map.
+        frame: frame of the map.
+        clock: time.
+        out: ``state/map``.
+        events: where events go.
+        offload: reads the file beside the event loop.
+    """
+
+    name = NAME
+
+    def __init__(
+        self, place: Path, frame: str, clock: Clock, out: Publisher[Grid], events: EventSink, offload: Offload
+    ) -> None:
+        self._place, self._frame, self._clock = place, frame, clock
+        self._out, self._events, self._offload = out, events, offload
+
+    async def run(self, ready: Ready) -> None:
+        """Publish, then wait until cancelled."""
+        try:
+            self._publish(await self._offload(lambda: load_map(self._place)))
+        except InputError as error:  # the planner refuses it by itself
+            self._events(Reason.FILE_DAMAGED, Severity.WARNING, NAME, f"{error}; operators see no map")
+        ready()
+        await asyncio.Event().wait()
+
+    def _publish(self, known: WorldMap) -> None:
+        height, width = known.cells.shape
+        x, y = known.origin
+        now = self._clock.now()
+        self._out.put(
+            Grid(
+                stamp=now,
+                received=now,
+                seq=self._out.next_seq(),
+                frame=self._frame,
+                resolution=known.resolution,
+                width=width,
+                height=height,
+                origin=Pose2D(x=x, y=y, yaw=0.0),
+                cells=known.cells.ravel(),
+            )
+        )
