@@ -1,5 +1,6 @@
 """What a browser may ask of the station: one JSON object a message."""
 
+import math
 from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -15,6 +16,8 @@ LONGEST_MESSAGE: Final = 262_144
 DeviceFault = Literal["none", "unplugged", "deaf", "noise"]
 """Of an emulated device: works; its cable is unplugged; it hears nothing; one bit in 50 bytes is wrong."""
 Number = Annotated[float, Field(allow_inf_nan=False)]
+Heading = Annotated[float, Field(ge=-math.tau, le=math.tau)]
+"""rad; at most one turn."""
 Place = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
 """x, y (m) and optionally yaw (rad)."""
 Id = Annotated[int, Field(ge=0, lt=2**53)]
@@ -86,7 +89,7 @@ class SetGoal(Asked):
     """Drive to a pose in the frame of the map, by way of others."""
 
     do: Literal["goal"]
-    goal: tuple[Number, Number, Number]
+    goal: tuple[Number, Number, Heading]
     via: Annotated[
         tuple[Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)], ...], Field(max_length=32)
     ] = ()

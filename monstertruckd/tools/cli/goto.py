@@ -8,7 +8,15 @@ import typer
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.path_forms import PathForm
 from monstertruckd.tools.cli.connection import require_section, with_robot
-from monstertruckd.tools.cli.options import EndpointOption, RobotOption, ViaOption, parse_pose, require_finite
+from monstertruckd.tools.cli.options import (
+    HEADING,
+    EndpointOption,
+    RobotOption,
+    ViaOption,
+    parse_heading,
+    parse_pose,
+    require_finite,
+)
 from monstertruckd.tools.cli.output import JsonOption, print_end, print_json
 
 if TYPE_CHECKING:
@@ -35,7 +43,7 @@ ColumnsOption = Annotated[
 def goto(
     x: Annotated[float, typer.Argument(help="Metres.", show_default=False)],
     y: Annotated[float, typer.Argument(help="Metres.", show_default=False)],
-    yaw: Annotated[float, typer.Argument(help="Radians.", show_default=False)],
+    yaw: Annotated[float, typer.Argument(parser=parse_heading, help=HEADING, show_default=False)],
     via: ViaOption = None,
     arm: ArmOption = False,
     robot: RobotOption = "truck",

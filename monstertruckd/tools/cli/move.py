@@ -8,7 +8,7 @@ import typer
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.connection import with_robot
-from monstertruckd.tools.cli.options import EndpointOption, RobotOption
+from monstertruckd.tools.cli.options import EndpointOption, RobotOption, parse_angle
 from monstertruckd.tools.cli.output import JsonOption, print_end
 
 if TYPE_CHECKING:
@@ -31,9 +31,15 @@ def move(
         typer.Option(help="Radius of the arc, m; centre on the left positive, 0 = on the spot, left out = straight."),
     ] = None,
     length: Annotated[float | None, typer.Option(help="Distance, m; backwards negative.")] = None,
-    angle: Annotated[float | None, typer.Option(help="Turn, rad; counter-clockwise positive.")] = None,
+    angle: Annotated[
+        float | None,
+        typer.Option(parser=parse_angle, metavar="DEGREES", help="Turn, counter-clockwise positive; or 1.57rad."),
+    ] = None,
     bearing: Annotated[
-        float | None, typer.Option(help="Direction of travel, rad; 0 = ahead, 1.5708 = sideways to the left.")
+        float | None,
+        typer.Option(
+            parser=parse_angle, metavar="DEGREES", help="Direction of travel; 0 = ahead, 90 = sideways to the left."
+        ),
     ] = None,
     profile: Annotated[
         MoveProfile | None, typer.Option(help="Default: that of the configuration's behaviour `move`.")
@@ -52,7 +58,7 @@ def move(
     from monstertruckd.tools.cli.runs import run_behaviour
 
     if length is None and angle is None:
-        raise InputError("expected --length 0.5, or --radius 0 --angle 1.57, for example")
+        raise InputError("expected --length 0.5, or --radius 0 --angle 90, for example")
     spot = radius == 0.0
     given = {
         "radius": radius,

@@ -3,6 +3,7 @@
 import inspect
 import math
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -131,19 +132,53 @@ TopicArgument = Annotated[
 ]
 
 
-def parse_pose(text: str, *, yaw_needed: bool = True) -> tuple[float, ...]:
-    """Numbers of a pose; nan and inf are let through for the planner to refuse by name.
+UNITS: Final = {"deg": math.pi / 180, "°": math.pi / 180, "rad": 1.0}
+"""Units of an angle as people write them, in rad."""
+
+
+def parse_angle(text: str) -> float:
+    """An angle in rad, from degrees (``90``, ``90deg``, ``90°``) or ``1.57rad``; nan and inf are let through.
 
     Raises:
-        InputError: something else than numbers, or not enough of them.
+        BadParameter: something else than a number with one of these units, or none.
+    """
+    unit = next((unit for unit in UNITS if text.endswith(unit)), "")
+    try:
+        return float(text.removesuffix(unit)) * UNITS[unit or "deg"]
+    except ValueError:
+        raise typer.BadParameter("expected a number of degrees, or 1.57rad") from None
+
+
+def parse_heading(text: str) -> float:
+    """A heading in rad, written as an angle.
+
+    Raises:
+        BadParameter: no angle.
+        InputError: more than one turn, as of radians that were multiplied twice, or of metres.
+    """
+    heading = parse_angle(text)
+    if math.tau < abs(heading) < math.inf:
+        raise InputError(f"heading {text}: expected at most one turn, 360 degrees or 6.283rad")
+    return heading
+
+
+HEADING: Final = "Heading in the map, degrees, counter-clockwise from x; or 1.57rad."
+
+
+def parse_pose(text: str, *, yaw_needed: bool = True) -> tuple[float, ...]:
+    """Numbers of a pose, m and rad; nan and inf are let through for the planner to refuse by name.
+
+    Raises:
+        InputError: something else than numbers with a heading, not enough of them, or more than one turn.
     """
     expected = "x,y,yaw" if yaw_needed else "x,y or x,y,yaw"
-    try:
-        values = tuple(map(float, text.split(",")))
-    except ValueError:
-        values = ()
-    if len(values) != 3 and (yaw_needed or len(values) != 2):
-        raise InputError(f"pose {text!r}: expected {expected}, m and rad")
+    words = text.split(",")
+    values: tuple[float, ...] = ()
+    if len(words) == 3 or (len(words) == 2 and not yaw_needed):
+        with suppress(ValueError, typer.BadParameter):
+            values = (*map(float, words[:2]), *map(parse_heading, words[2:]))
+    if not values:
+        raise InputError(f"pose {text!r}: expected {expected}, m and degrees")
     return values
 
 
@@ -155,11 +190,13 @@ def require_finite(*poses: tuple[float, ...]) -> None:
     """
     for pose in poses:
         if not all(map(math.isfinite, pose)):
-            raise InputError(f"pose {','.join(f'{value:g}' for value in pose)}: expected finite numbers, m and rad")
+            shown = ",".join(f"{value:g}" for value in (*pose[:2], *map(math.degrees, pose[2:])))
+            raise InputError(f"pose {shown}: expected finite numbers, m and degrees")
 
 
 ViaOption = Annotated[
-    list[str] | None, typer.Option(metavar="X,Y[,YAW]", help="Place to pass on the way; may be repeated.")
+    list[str] | None,
+    typer.Option(metavar="X,Y[,YAW]", help="Place to pass on the way, m and degrees; may be repeated."),
 ]
 
 

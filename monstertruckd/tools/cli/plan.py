@@ -33,7 +33,7 @@ class UnknownChoice(StrEnum):
 
 
 PoseArgument = Annotated[
-    str, typer.Argument(metavar="X,Y,YAW", show_default=False, help="Pose of the base, m, m, rad.")
+    str, typer.Argument(metavar="X,Y,YAW", show_default=False, help="Pose of the base, m, m, degrees (or 1.57rad).")
 ]
 
 

@@ -14,7 +14,7 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NoAnswerError, NotFoundError
 from monstertruckd.tools.cli.connection import not_ready, require_section, with_robot
 from monstertruckd.tools.cli.goto import ROUTE_TIMEOUT, ArmOption
-from monstertruckd.tools.cli.options import EndpointOption, RobotOption, require_finite
+from monstertruckd.tools.cli.options import HEADING, EndpointOption, RobotOption, parse_heading, require_finite
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_end, print_json, print_table, remark
 
 if TYPE_CHECKING:
@@ -100,7 +100,10 @@ def mark_command(
     name: NameArgument,
     x: Annotated[float | None, typer.Argument(help="Metres; without, where the robot is.", show_default=False)] = None,
     y: Annotated[float | None, typer.Argument(help="Metres.", show_default=False)] = None,
-    yaw: Annotated[float | None, typer.Argument(help="Radians; else the robot's.", show_default=False)] = None,
+    yaw: Annotated[
+        float | None,
+        typer.Argument(parser=parse_heading, help=f"{HEADING} Else the robot's.", show_default=False),
+    ] = None,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:
@@ -112,7 +115,8 @@ def mark_command(
     require_finite(tuple(value for value in (x, y, yaw) if value is not None))
     place = None if x is None or y is None else (x, y)
     marked = _order(PointOrder.MARK, robot, endpoint, name, place, yaw)
-    remark(f"marked {name} at x {marked['x']:.2f}, y {marked['y']:.2f} m, yaw {marked['yaw']:z.2f} rad")
+    heading = math.degrees(marked["yaw"])
+    remark(f"marked {name} at x {marked['x']:.2f}, y {marked['y']:.2f} m, heading {heading:z.1f} degrees")
 
 
 @app.command("remove")

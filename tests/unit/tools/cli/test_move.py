@@ -1,5 +1,7 @@
 """``move``: what is no move is refused before any robot is asked; what is one reaches the robot as settings."""
 
+import math
+
 import pytest
 from typer.testing import CliRunner
 
@@ -13,14 +15,14 @@ from monstertruckd.tools.cli.runs import RunEnd
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ([], "expected --length 0.5, or --radius 0 --angle 1.57"),
+        ([], "expected --length 0.5, or --radius 0 --angle 90"),
         (["--length", "1", "--angle", "1"], "expected either a length or an angle"),
         (["--angle", "1"], "an angle needs a radius: 0 turns on the spot"),
         (["--radius", "0", "--length", "1"], "radius is 0"),
         (["--length", "0"], "the length or angle is 0: nothing would move"),
         (["--radius", "0", "--angle", "0"], "the length or angle is 0: nothing would move"),
         (["--length", "1", "--speed", "-0.1"], "--speed: expected greater than 0"),
-        (["--length", "1", "--bearing", "7"], "--bearing"),
+        (["--length", "1", "--bearing", "400"], "--bearing"),
     ],
 )
 def test_what_is_no_move_is_refused_at_once(options, said):
@@ -33,8 +35,9 @@ def test_what_is_no_move_is_refused_at_once(options, said):
     ("options", "settings"),
     [
         (["--length", "-0.5"], {"length": -0.5}),
+        (["--length", "1", "--bearing", "90"], {"length": 1.0, "bearing": pytest.approx(math.pi / 2)}),
         (
-            ["--radius", "0", "--angle", "-1.5", "--speed", "0.3", "--profile", "ramp"],
+            ["--radius", "0", "--angle", "-1.5rad", "--speed", "0.3", "--profile", "ramp"],
             {"radius": 0.0, "angle": -1.5, "turn_rate": 0.3, "profile": "ramp"},
         ),
         (

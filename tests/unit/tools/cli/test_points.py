@@ -60,9 +60,9 @@ def test_a_robot_stands_before_a_tag_and_on_a_mark():
 
 
 def test_a_mark_says_where_it_is(monkeypatch):
-    monkeypatch.setattr(points, "with_robot", lambda *_, **__: {"x": 2.4, "y": 1.0, "yaw": -0.001})
+    monkeypatch.setattr(points, "with_robot", lambda *_, **__: {"x": 2.4, "y": 1.0, "yaw": -0.0001})
     done = run("mark", "dock")
-    assert done.stderr == "marked dock at x 2.40, y 1.00 m, yaw 0.00 rad\n"
+    assert done.stderr == "marked dock at x 2.40, y 1.00 m, heading 0.0 degrees\n"
 
 
 def test_a_cameras_lens_is_converted_to_and_from_the_forms_of_others(tmp_path):
