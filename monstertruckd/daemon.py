@@ -52,6 +52,7 @@ from monstertruckd.config.calibration import CalibrationStore
 from monstertruckd.config.expiry import CalibrationWatch, DistanceCounter
 from monstertruckd.config.live import LiveConfig
 from monstertruckd.config.load import Tree, resolved
+from monstertruckd.config.proposal import SteeringProposal
 from monstertruckd.config.start import LeftOut, set_aside
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.gate.core import Gate
@@ -335,7 +336,7 @@ class Daemon:
             self._events,
             self._offload,
             lambda: self.gate.mode,
-            self._calibration.stamped,
+            self._calibration,
         )
         return rpc
 
@@ -400,8 +401,10 @@ class Daemon:
         loaded = self._tree.calibration if self._tree is not None else None
         results = {} if loaded is None else CalibrationStore(loaded.parent, self.config.robot).load(loaded).results
         file = self.config.state_directory / "odometer.json" if self._seed is None else None
+        kept = None if file is None else self.config.state_directory / "proposed_calibration.json"
+        proposal = SteeringProposal(self.config, "" if loaded is None else str(loaded), kept)
         return CalibrationWatch(
-            self.config, results, self.bus, self.clock, self._events, self._offload, DistanceCounter(file)
+            self.config, results, self.bus, self.clock, self._events, self._offload, DistanceCounter(file), proposal
         )
 
     def _build_latch(self, environment: Mapping[str, str]) -> Latch:

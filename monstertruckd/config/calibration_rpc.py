@@ -18,6 +18,8 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.config.calibration import CalibrationStore, Result, unused, with_values
+from monstertruckd.config.expiry import CalibrationWatch
+from monstertruckd.config.proposal import WIZARD as STEERING_WIZARD
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.config.wizards import WIZARDS
 
@@ -34,7 +36,7 @@ def register(
     events: EventSink,
     offload: Offload,
     mode: Callable[[], GateMode],
-    stamped: Callable[[Result], Result],
+    watch: CalibrationWatch,
 ) -> None:
     """Serve ``calibration``, ``calibration_save`` and ``calibration_undo``.
 
@@ -46,7 +48,7 @@ def register(
         events: gets an event for every new file.
         offload: where files are read and written.
         mode: the gate's present one; nothing is written while the truck may move.
-        stamped: gives a result its grades, and says until when it counts.
+        watch: gives a result its grades, says until when it counts, and knows what is proposed.
     """
     store = CalibrationStore(config.calibration_folder, config.robot)
 
@@ -73,15 +75,19 @@ def register(
                 "newest": None if newest is None else str(newest),
                 "content": None if file is None else file.model_dump(mode="json"),
                 "unused": [] if file is None else unused(config, file.results.values()),
+                "proposed": None if proposed is None else proposed.model_dump(mode="json"),
             }
 
+        proposed = None if watch.proposal is None else watch.proposal.result
         return await offload(read)
 
     async def save(payload: dict[str, Any]) -> dict[str, Any]:
         at_rest()
         result = _result(payload.get("result"))
         await offload(lambda: with_values(config, [result], "result"))
-        path = await offload(lambda: store.save(stamped(result), real_time()))
+        path = await offload(lambda: store.save(watch.stamped(result), real_time()))
+        if result.wizard == STEERING_WIZARD:
+            await watch.close_proposal()
         saved = (await offload(lambda: store.load(path))).results[result.wizard]
         answer = announced(path, f"{result.wizard} calibrated", payload.get("source"))
         return answer | {"result": saved.model_dump(mode="json")}
@@ -92,6 +98,8 @@ def register(
             raise InputError(f"wizard: expected one of {', '.join(WIZARDS)}, got {wizard!r}")
         at_rest()
         path = await offload(lambda: store.undo(wizard, real_time()))
+        if wizard == STEERING_WIZARD:
+            await watch.close_proposal()
         return announced(path, f"calibration of {wizard} undone", payload.get("source"))
 
     rpc.register(SHOW, show, AccessRole.OBSERVER, recorded=False)

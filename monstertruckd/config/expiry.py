@@ -24,17 +24,20 @@ from monstertruck_runtime.small_files import make_folder, put_aside, replace_fil
 from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import CalibrationHealth, CalibrationState
+from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import (
     CALIBRATION,
     DRIVE,
+    TRACKER,
     USB,
     Writer,
 )
 from monstertruck_schemas.usb import UsbTree
 from monstertruckd.bus.local import Bus
 from monstertruckd.config.calibration import Estimate, Grade, Result, ValidUntil, WizardName, utc
+from monstertruckd.config.proposal import SteeringProposal
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.config.wizards import WIZARDS
 
@@ -181,6 +184,7 @@ class CalibrationWatch:
         events: gets an event when one ends.
         offload: where files are written.
         odometer: total distance driven.
+        proposal: what trackers propose; None: nothing is.
     """
 
     name = ServiceName.CALIBRATION.value
@@ -194,6 +198,7 @@ class CalibrationWatch:
         events: EventSink,
         offload: Offload,
         odometer: DistanceCounter,
+        proposal: SteeringProposal | None = None,
     ) -> None:
         self._config = config
         self._results = dict(results)
@@ -202,6 +207,7 @@ class CalibrationWatch:
         self._events = events
         self._offload = offload
         self.odometer = odometer
+        self.proposal = proposal
         self._train = DriveTrain(config.geometry.drive_ratio, config.geometry.wheel_radius)
         self._out = bus.publisher(CALIBRATION, Writer.DAEMON)
         self._expired: frozenset[str] = frozenset()
@@ -214,6 +220,36 @@ class CalibrationWatch:
             where = await self._offload(lambda: put_aside(file))
             text = f"{wrong}: the distance driven restarts at 0, which delays the end of calibrations; {where}"
             self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, text)
+        proposal = self.proposal
+        if proposal is not None and (wrong := await self._offload(proposal.load)):
+            where = await self._offload(proposal.put_aside)
+            text = f"{wrong}: a proposed calibration is lost and has to be learnt again; {where}"
+            self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, text)
+
+    async def consider(self, state: TrackerState) -> None:
+        """Propose what a tracker has learnt about the steering, if that is new."""
+        proposal = self.proposal
+        if proposal is None or not proposal.consider(state, utc(self._real())):
+            return
+        self._look()
+        if proposal.result is not None:
+            text = f"{proposal.result.measured}; `calibrate accept` keeps it"
+            self._events(Reason.OK, Severity.INFO, self.name, text)
+        await self._keep_proposal(proposal)
+
+    async def close_proposal(self) -> None:
+        """Drop the proposal: the steering was calibrated, or its calibration undone."""
+        if self.proposal is not None:
+            self.proposal.close()
+            self._look()
+            await self._keep_proposal(self.proposal)
+
+    async def _keep_proposal(self, proposal: SteeringProposal) -> None:
+        try:
+            await self._offload(proposal.save)
+        except OSError as error:
+            text = f"{proposal.file}: the proposed calibration is not saved: {error.strerror}"
+            self._events(disk_reason(error), Severity.WARNING, self.name, text)
 
     def stamped(self, result: Result) -> Result:
         """As it is saved now."""
@@ -231,7 +267,11 @@ class CalibrationWatch:
         self._look()
         ready()
         publish = 60  # periods between two messages, and between two writings of the odometer
-        with self._bus.subscribe(DRIVE, latest()) as drive, self._bus.subscribe(USB, latest()) as usb:
+        with (
+            self._bus.subscribe(DRIVE, latest()) as drive,
+            self._bus.subscribe(USB, latest()) as usb,
+            self._bus.subscribe(TRACKER, latest()) as tracker,
+        ):
             before: float | None = None
             try:
                 # Seconds between two checks of the drive's position: half of it at most is missing of every reversal.
@@ -243,6 +283,8 @@ class CalibrationWatch:
                         if before is not None:
                             self.odometer.metres += abs(float(self._train.distance(here - before)))
                         before = here
+                    if tracker.latest is not None:
+                        await self.consider(tracker.latest)
                     serials = self._serials if usb.latest is None else self._serials | serials_of(usb.latest)
                     replaced, self._serials = serials != self._serials, serials
                     if replaced or count % publish == 0:
@@ -278,6 +320,7 @@ class CalibrationWatch:
                 seq=self._out.next_seq(),
                 wizards=tuple(states),
                 odometer=round(self.odometer.metres, 1),
+                proposed="" if self.proposal is None or self.proposal.result is None else self.proposal.result.measured,
             )
         )
 

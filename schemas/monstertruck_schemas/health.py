@@ -59,6 +59,8 @@ class CalibrationHealth(Message):
     wizards: tuple[CalibrationState, ...] = ()
     odometer: float = 0.0
     """Total distance driven, m."""
+    proposed: str = ""
+    """Calibration that a tracker proposes and nobody has accepted, in a sentence; empty if there is none."""
 
 
 class LoopHealth(Message):

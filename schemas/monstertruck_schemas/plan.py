@@ -59,6 +59,28 @@ class AxleResponse(Schema):
     """Measured turns that the estimate rests on."""
 
 
+class AxleDeviation(Schema):
+    """How one axle steers against its calibration, as a tracker has learnt it."""
+
+    axle: Literal["front", "rear"]
+    gain: float
+    """Angle for each requested angle."""
+    gain_deviation: Annotated[float, Field(ge=0)]
+    """Standard deviation of that."""
+    trim: float
+    """Angle when straight ahead is requested, rad, left positive."""
+    trim_deviation: Annotated[float, Field(ge=0)]
+    """Standard deviation of that, rad."""
+    slip: float
+    """Angle lost for each m/s^2 of lateral acceleration, rad s^2/m."""
+    slip_deviation: Annotated[float, Field(ge=0)]
+    """Standard deviation of that, rad s^2/m."""
+    samples: Annotated[int, Field(ge=0)]
+    """Compared pieces of motion that this rests on."""
+    servo_differs: bool
+    """Whether gain or trim certainly differs from the calibration."""
+
+
 class TrackerState(Message):
     """How well the tracker follows its path."""
 
@@ -74,6 +96,10 @@ class TrackerState(Message):
     outcome: Reason
     """DRIVING, GOAL_REACHED, PATH_LOST ..."""
     axles: AxleResponse | None = None
+    steering: tuple[AxleDeviation, ...] = ()
+    """Front and rear axle; empty where nothing is steered."""
+    steering_differs: str = ""
+    """What differs from the calibration, in a sentence; empty if nothing is known to."""
 
 
 class TaskState(Protocol):

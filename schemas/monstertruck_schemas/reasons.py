@@ -121,6 +121,8 @@ class Reason(StrEnum):
     CLOCK_DRIFT = "clock_drift", 87, "a sensor's clock and the computer's run apart"
     CALIBRATION_EXPIRED = "calibration_expired", 88, "a calibration no longer counts: measure it again"
     RESPONSE_AGREES = "response_agrees", 0, "the axles answer as configured again"
+    STEERING_DIFFERS = "steering_differs", 0, "an axle steers more, less or further to a side than calibrated, or slips"
+    STEERING_AGREES = "steering_agrees", 0, "the axles steer as calibrated again"
 
     # Localisation and mapping
     POSE_LOST = "pose_lost", 90, "the scans do not fit the map: the pose is odometry alone"

@@ -146,3 +146,26 @@ async def test_scripted_shown_undone_and_applied_by_the_next_start(tmp_path: Pat
         again = await command(truck, "battery", "--undo", "--config", str(truck.config))
         assert again.returncode == 0, "without the daemon too"
         assert len(files(tmp_path)) == 3
+
+
+async def test_what_the_tracker_proposed_before_a_restart_is_shown_and_accepted(tmp_path: Path):
+    centre = Estimate(
+        name="front_centre", value=1480.0, low=1470.0, high=1490.0, unit="us", samples=9, meaning="test",
+        key="devices.steering.driver.front.centre_us",
+    )  # fmt: skip
+    proposed = Result(wizard="steering", measured="front steers to the left", estimates=(centre,), partial=True)
+    async with robot(tmp_path, LONG_WAITS, YARD) as truck:
+        file = tmp_path / "state" / "proposed_calibration.json"
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(json.dumps({"base": "", "result": proposed.model_dump(mode="json")}))
+        await truck.start_simulator()
+        await truck.start_daemon()
+        shown, accepted, again = [await command(truck, word) for word in ("show", "accept", "accept")]
+    assert "proposed, not used: front steers to the left" in shown.stderr
+    assert accepted.returncode == 0, accepted.stderr
+    assert not file.exists()
+    saved = CalibrationStore(tmp_path / "state" / "calibration", "truck").current()
+    assert saved is not None
+    assert [estimate.value for estimate in saved.results["steering"].estimates] == [1480.0]
+    assert again.returncode == Reason.NOT_FOUND.exit_code
+    assert "no calibration is proposed" in again.stderr

@@ -317,6 +317,7 @@ export class Panels {
       ["figure.charge", battery?.charge != null ? `${number(battery.charge * 100, 0)} %` : null],
       ["figure.stopping", gate ? `${number(gate.stopping_distance)} m` : null],
       ["figure.error", tracker && tracker.outcome === "driving" ? `${number(tracker.cross_track * 100, 1)} cm` : null],
+      ["figure.steering", tracker?.steering_differs || null],
       ["figure.lidar", scan?.tilt != null ? this.aged("scan", `${degrees(scan.tilt, 1)}°`) : null],
       ["figure.map", slam ? `${number(slam.overlap * 100, 0)} %` : null],
     ]);
@@ -340,8 +341,8 @@ export class Panels {
   }
 
   showCalibration() {
-    const wizards = this.link.newest.calibration?.wizards ?? [];
-    const key = JSON.stringify(wizards);
+    const { wizards = [], proposed = "" } = this.link.newest.calibration ?? {};
+    const key = JSON.stringify([wizards, proposed]);
     if (byId("calibration").dataset.shown === key) return;
     byId("calibration").dataset.shown = key;
     byId("calibration").replaceChildren(...(wizards.length ? wizards : [null]).map((row) => row === null
@@ -350,6 +351,7 @@ export class Panels {
         element("td", { textContent: row.wizard }, element("small", { textContent: words("calibration.age", { days: Math.max(Math.floor((Date.now() - Date.parse(row.date)) / 864e5), 0) }) })),
         element("td", { textContent: row.grade, className: { A: "good", B: "", C: "warn" }[row.grade] }),
         element("td", { textContent: row.expired ? words("calibration.expired", { why: row.expired }) : row.until.slice(0, 10), className: row.expired ? "bad" : "" }))));
+    if (proposed) byId("calibration").append(element("tr", {}, element("td", { colSpan: 3, className: "warn", textContent: words("calibration.proposed", { what: proposed }) })));
   }
 
   showSystem() {

@@ -217,6 +217,9 @@ def show(
     if json_output:
         print_json(state)
         return
+    if (proposed := _proposed(state)) is not None:
+        _print(proposed)
+        remark(f"proposed, not used: {proposed.measured}; `monstertruckd calibrate accept` saves it")
     if file is None:
         remark(f"nothing calibrated yet: no file in {state['folder']}")
         return
@@ -227,6 +230,32 @@ def show(
         remark(f"not used, as the configuration has no such part: {', '.join(keys)}")
     if "loaded" in state and state["loaded"] != state["newest"]:
         remark(f"the daemon still runs on {state['loaded'] or 'no calibration'}: restart it")
+
+
+@app.command()
+def accept(
+    robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT, json_output: JsonOption = False
+) -> None:
+    """Save what the tracker has learnt about the steering as its calibration; `show` prints it before.
+
+    The robot must be disarmed. `calibrate steering --undo` takes it back.
+    """
+    from monstertruck_runtime.errors import NotFoundError
+    from monstertruckd.config.calibration_rpc import SAVE, SHOW
+
+    async def save(client: "TruckClient", _: "Clock") -> "tuple[Result, str]":
+        proposed = _proposed(await client.call(SHOW))
+        if proposed is None:
+            raise NotFoundError("no calibration is proposed: the tracker has found nothing that differs for certain")
+        payload = {"result": proposed.model_dump(mode="json"), "source": client.source}
+        return proposed, (await client.call(SAVE, payload))["file"]
+
+    result, file = with_robot(save, robot, endpoint, ANSWER_TIMEOUT)
+    if json_output:
+        print_json({"result": result, "file": file})
+    else:
+        _print(result)
+    remark(f"saved in {file}; it counts from the next start of the daemon")
 
 
 def _run(wizard: "Wizard", call: _Call, panel: "Panel") -> None:
@@ -297,6 +326,16 @@ def _file(state: dict[str, Any]) -> "CalibrationFile | None":
 
     content = state["content"]
     return None if content is None else CalibrationFile.model_validate_json(json.dumps(content))
+
+
+def _proposed(state: dict[str, Any]) -> "Result | None":
+    """The calibration that a robot's tracker proposes; older robots and files alone have none."""
+    import json
+
+    from monstertruckd.config.calibration import Result
+
+    content = state.get("proposed")
+    return None if content is None else Result.model_validate_json(json.dumps(content))
 
 
 def _print(result: "Result") -> None:

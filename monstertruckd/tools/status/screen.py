@@ -266,20 +266,13 @@ def _truck(state: ScreenState) -> Panel:
     if state.battery is not None:
         volts = "-" if state.battery.voltage is None else f"{state.battery.voltage:.1f} V"
         _row(table, "battery", f"{volts} {state.battery.level.value}", state.old("battery"))
-    if state.calibration is not None and state.calibration.wizards:
-        _row(table, "calibrated", calibration_badge(state.calibration))
+    if state.calibration is not None:
+        _calibration(table, state.calibration)
     if odometry is not None:
         pose = f"{odometry.pose.x:+.2f} {odometry.pose.y:+.2f} m {math.degrees(odometry.pose.yaw):+.0f}°"
         _row(table, "pose", pose, state.old("odometry"))
     _tilt(table, state)
-    if state.tracker is not None:
-        done = _done(state.tracker)
-        bar = "█" * round(done * 16)
-        _row(table, "path", f"{bar:░<16} {done:4.0%}")
-        waits = state.tracker.outcome is Reason.DRIVING and gate is not None and not gate.mode.active
-        doing = "waits" if waits else state.tracker.outcome.value
-        old = state.old("tracker") if state.tracker.outcome is Reason.DRIVING else ""  # at its end it falls silent
-        _row(table, "off path", f"{state.tracker.cross_track * 100:+.1f} cm {doing}", old)
+    _path(table, state)
     if state.loop is not None and state.loop.busy:
         _row(table, "busy", Text(state.loop.busy, style="bold yellow"))
     elif state.loop is not None:
@@ -288,6 +281,29 @@ def _truck(state: ScreenState) -> Panel:
         _row(table, "weakened", Text("\n".join(gate.weakened), style="bold yellow"))
     old = f", {state.silence:.0f} s ago" if state.gone else ""
     return Panel(table, title=f"mt/{state.robot}{old}", border_style="dim")
+
+
+def _calibration(table: Table, health: CalibrationHealth) -> None:
+    if health.wizards:
+        _row(table, "calibrated", calibration_badge(health))
+    if health.proposed:
+        _row(table, "proposed", Text(f"{health.proposed} (`calibrate accept`)", style="yellow"))
+
+
+def _path(table: Table, state: ScreenState) -> None:
+    """Progress on the path, and what the tracker has learnt about the steering."""
+    gate, tracker = state.gate, state.tracker
+    if tracker is None:
+        return
+    done = _done(tracker)
+    bar = "█" * round(done * 16)
+    _row(table, "path", f"{bar:░<16} {done:4.0%}")
+    waits = tracker.outcome is Reason.DRIVING and gate is not None and not gate.mode.active
+    doing = "waits" if waits else tracker.outcome.value
+    old = state.old("tracker") if tracker.outcome is Reason.DRIVING else ""  # at its end it falls silent
+    _row(table, "off path", f"{tracker.cross_track * 100:+.1f} cm {doing}", old)
+    if tracker.steering_differs:
+        _row(table, "steering", Text(tracker.steering_differs, style="yellow"))
 
 
 def _tilt(table: Table, state: ScreenState) -> None:

@@ -115,6 +115,17 @@ def _echo(echo: SonarEcho) -> str:
     return f"{echo.name} {distance if echo.answered else 'silent'}"
 
 
+def _steering(state: ScreenState) -> list[str]:
+    """What was calibrated, and what the tracker has learnt."""
+    health, tracker = state.calibration, state.tracker
+    rows = [
+        ("calibrated", "" if health is None else calibration_badge(health)),
+        ("proposed ", "" if health is None else health.proposed),
+        ("steering ", "" if tracker is None else tracker.steering_differs),
+    ]
+    return [f"{name} {text}" for name, text in rows if text]
+
+
 def plain(state: ScreenState) -> list[str]:
     """The state in words, for pipes."""
     lines = []
@@ -132,8 +143,7 @@ def plain(state: ScreenState) -> list[str]:
         lines.append(f"battery   {volts} V, {state.battery.level.value}")
     if state.sonar is not None:
         lines.append(f"sonars    {', '.join(map(_echo, state.sonar.sonars))}")
-    if state.calibration is not None and state.calibration.wizards:
-        lines.append(f"calibrated {calibration_badge(state.calibration)}")
+    lines += _steering(state)
     if state.loop is not None:
         late = state.loop
         lines.append(f"tick      late p99 {late.lateness_p99 * 1e3:.2f} ms, max {late.lateness_max * 1e3:.2f} ms")

@@ -156,6 +156,8 @@ class AxleErrorEstimator:
         self.errors = AxleErrors()
         self.metres = 0.0
         """Distance over which motion was compared."""
+        self.samples = 0
+        """Compared intervals."""
         self._squares, self._counts = [0.0, 0.0], [0.0, 0.0]
         self.restart()
 
@@ -266,6 +268,7 @@ class AxleErrorEstimator:
         keep = math.exp(-way / FORGET)
         self.covariance = keep * self.covariance + (1.0 - keep) * self._prior
         self.metres += way
+        self.samples += 1
 
     def _update(self, kind: int, row: Array, measured: float, known: float) -> None:
         """One measurement: turn (0) or sideways motion (1); ``known`` is the variance of what has a name."""

@@ -14,6 +14,8 @@ from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.se2 import Pose2, poses_relative
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint, ScanPoints, clearance_to_points, points_near
+from monstertruck_planners.track.axle_report import SteeringReport
+from monstertruck_planners.track.axle_report import report as steering_report
 from monstertruck_planners.track.catalog import AnyTracker, build_tracker
 from monstertruck_planners.track.path_tracker import Command, TruckState
 from monstertruck_planners.track.segments import PathProgress, SegmentedPath
@@ -94,6 +96,7 @@ class TrackOutput:
     length: float = 0.0
     """Of the whole path, m."""
     axles: AxleResponse | None = None
+    steering: SteeringReport | None = None
     events: tuple[StepEvent, ...] = ()
 
 
@@ -165,6 +168,11 @@ class TrackingStep:
         self._active = False
         self._contradicted = False
         """The response differed from the configured one at the last step."""
+        self._steering_report = SteeringReport("", agrees=True, axles=())
+        self._compared = 0.0
+        """Metres that the report rests on."""
+        self._differs: Severity | None = None
+        """With which the steering was reported to differ; None: it was not."""
         self._events: list[StepEvent] = []
 
     def step(self, now: int, newest: Newest) -> TrackOutput:
@@ -231,10 +239,10 @@ class TrackingStep:
             self._reported = command.outcome
             severity = Severity.INFO if command.outcome in (Reason.DRIVING, Reason.GOAL_REACHED) else Severity.WARNING
             self._report(command.outcome, severity, text, path=path.name, cross_track=command.cross_track)
-        axles = self._axles()
+        axles, steering = self._axles(), self._steering()
         # 0.01: speed of a truck at rest, m/s
         drive = active and (command.outcome is Reason.DRIVING or abs(pose.twist.vx) > 0.01)
-        return TrackOutput(command, drive, path.frame, path.name, along, path.length, axles, self._drain())
+        return TrackOutput(command, drive, path.frame, path.name, along, path.length, axles, steering, self._drain())
 
     def _lost(self, path: SegmentedPath, progress: PathProgress, at: tuple[float, float, float]) -> str:
         """Where the robot and the nearest part of its path are."""
@@ -275,6 +283,23 @@ class TrackingStep:
             text = f"dead time and lag are {axles.delay:.3f} s together, configured are {configured.total:.3f} s"
             self._report(reason, severity, text, configured=configured.total, **values)
         return axles
+
+    def _steering(self) -> SteeringReport:
+        """The steering against its calibration; reports when it begins and ceases to differ, and which part does."""
+        estimator = self._path_tracker.axle_errors
+        if estimator.metres == self._compared:
+            return self._steering_report
+        self._compared = estimator.metres
+        found = self._steering_report = steering_report(estimator, self._path_tracker.geometry.wheelbase)
+        values = {f"{row.axle}_{name}": getattr(row, name) for row in found.axles for name in ("gain", "trim", "slip")}
+        servo = any(row.servo_differs for row in found.axles)
+        if found.text and (self._differs is None or (servo and self._differs is Severity.INFO)):
+            self._differs = Severity.WARNING if servo else Severity.INFO
+            self._report(Reason.STEERING_DIFFERS, self._differs, found.text, **values)
+        elif found.agrees and self._differs is not None:
+            self._differs = None
+            self._report(Reason.STEERING_AGREES, Severity.INFO, "", **values)
+        return found
 
     def _choose_path(self, path: Path, pose: Odometry, *, armed: bool) -> bool:
         """Join a new path, or the present one again; returns whether it did. Until armed the truck may be moved."""
@@ -489,5 +514,7 @@ class TrackerService:
                     length=output.length,
                     outcome=command.outcome,
                     axles=output.axles,
+                    steering=() if output.steering is None else output.steering.axles,
+                    steering_differs="" if output.steering is None else output.steering.text,
                 )
             )

@@ -136,6 +136,9 @@ INSTEAD = {
     "monstertruckd calibrate battery": Instead(
         "monstertruckd calibrate battery --yes --answer meter=24.2 --answer another=no", "asks somebody"
     ),
+    "monstertruckd calibrate accept": Instead(
+        None, "needs a proposal; tests/daemon/test_calibration_wall.py accepts one"
+    ),
     "monstertruckd calibrate drive": Instead(None, MOVES),
     "monstertruckd calibrate drive --sign-only": Instead(None, MOVES),
     "monstertruckd calibrate steering": Instead(None, MOVES),

@@ -24,6 +24,7 @@ def driven(
     compass=False,
     seed=1,
     freedom="both",
+    each=lambda _: None,
 ):
     """Random requests to axles that obey at once, at each of some speeds in turn."""
     estimator, rng = AxleErrorEstimator(STEERING, freedom), np.random.default_rng(seed)
@@ -38,6 +39,7 @@ def driven(
         yaw = pose[2] + noise * float(rng.standard_normal())
         heading = (t, yaw + 1.0) if compass else None
         estimator.observe(AxleMotion(t, swept, asked, (*pose[:2], yaw), twist[0], heading, located), 0.0)
+        each(estimator)
         pose = STEERING.integrate(pose, *twist, STEP)
         swept = swept[0] + STEP * asked[0], swept[1] + STEP * asked[1]
     return estimator

@@ -10,7 +10,14 @@ from rich.console import Console
 from monstertruck_estimation.transforms import mount
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.event import Cause, Event, Severity, Stop
-from monstertruck_schemas.health import HealthTable, LoopHealth, RecorderHealth, ServiceHealth, ServiceState
+from monstertruck_schemas.health import (
+    CalibrationHealth,
+    HealthTable,
+    LoopHealth,
+    RecorderHealth,
+    ServiceHealth,
+    ServiceState,
+)
 from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
@@ -124,6 +131,17 @@ def test_a_path_driven_to_its_end_is_whole_though_the_next_lap_begins_at_nought(
     console = Console(width=140, height=40, record=True)
     console.print(draw(state, 140), height=40)
     assert "100%" in console.export_text()
+
+
+def test_what_the_tracker_learnt_about_the_steering_is_shown():
+    state, text = full(), "front steers 9 % less than calibrated"
+    assert state.tracker is not None
+    state.take(state.tracker.model_copy(update={"steering_differs": text}))
+    state.take(CalibrationHealth(**HEADER, proposed="learnt while driving"))
+    drawn = shown(state, 140, 60).export_text()
+    assert re.search(r"steering +front steers", drawn)
+    assert re.search(r"proposed +learnt while", drawn)
+    assert f"steering  {text}" in plain(state)
 
 
 def test_plain_words_for_pipes():

@@ -1,0 +1,172 @@
+"""Calibration that the trackers propose: learnt while driving, kept over restarts, used once an operator accepts it.
+
+A tracker learns gain and trim of an axle with their covariance. Where they certainly differ from the calibration, the
+pulse map is proposed at which the axle would steer as requested. Until it is accepted (``calibrate accept``) nothing
+runs on it; a proposal that was learnt on another calibration than the daemon runs on is void.
+"""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from pydantic import ValidationError
+
+from monstertruck_kinematics.chassis import Chassis
+from monstertruck_runtime.outside import cause_of
+from monstertruck_runtime.small_files import make_folder, put_aside, replace_file, require_file
+from monstertruck_schemas.base import Schema
+from monstertruck_schemas.plan import AxleDeviation, TrackerState
+from monstertruckd.config.calibration import Estimate, Result, value_at
+from monstertruckd.config.truck import TruckConfig
+from monstertruckd.config.wizards import STEERING, WIZARDS
+
+WIZARD: Final = "steering"
+"""Wizard whose values are proposed."""
+SPAN: Final = 0.2
+"""Axle angles to both sides over which the proposed pulse map fits best, rad; servos reach them on every truck."""
+HALF: Final = 1.96
+"""Half an interval of 95 % in standard deviations."""
+
+
+class _File(Schema):
+    """What is kept."""
+
+    base: str
+    """Calibration file that the daemon ran on; empty: none."""
+    result: Result
+
+
+@dataclass
+class SteeringProposal:
+    """The newest proposal.
+
+    Args:
+        config: the running one, calibration included.
+        base: calibration file that it includes; empty: none.
+        file: where the proposal is kept; None: nowhere.
+    """
+
+    config: TruckConfig
+    base: str
+    file: Path | None
+    result: Result | None = None
+    _chassis: Chassis = field(init=False)
+    _closed: bool = False
+    """The steering was calibrated in this run: what trackers find until the next start is known."""
+
+    def __post_init__(self) -> None:
+        self._chassis = self.config.chassis()
+
+    def load(self) -> str:
+        """Read it; may block.
+
+        Returns:
+            What is wrong with the file; empty for a sound or a missing one.
+        """
+        if self.file is None:
+            return ""
+        try:
+            require_file(self.file, 100_000)  # size of a proposal at most, bytes
+            found = _File.model_validate_json(self.file.read_bytes())
+        except FileNotFoundError:
+            return ""
+        except (OSError, ValidationError, ValueError, RecursionError) as error:
+            return f"{self.file}: {error.strerror if isinstance(error, OSError) else cause_of(error)}"
+        if found.base == self.base:
+            self.result = found.result
+        return ""
+
+    def put_aside(self) -> str:
+        """Keep a damaged file under another name; may block. Returns a sentence about it."""
+        return "" if self.file is None else put_aside(self.file)
+
+    def save(self) -> None:
+        """Write it, or remove its file if there is none; may block.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        if self.file is None:
+            return
+        if self.result is None:
+            self.file.unlink(missing_ok=True)
+            return
+        make_folder(self.file.parent)
+        replace_file(self.file, _File(base=self.base, result=self.result).model_dump_json(indent=1) + "\n")
+
+    def consider(self, state: TrackerState, date: str) -> bool:
+        """Propose what a tracker has learnt, if it differs from the present proposal; whether it does.
+
+        Args:
+            state: the tracker's newest.
+            date: now, UTC.
+        """
+        if self._closed or not WIZARDS[WIZARD].fits(self.config):
+            return False
+        rows = [row for row in state.steering if row.servo_differs]
+        estimates = [estimate for row in rows for estimate in self._estimates(row, date)]
+        if not estimates or not self._news(estimates):
+            return False
+        self.result = Result(
+            wizard=WIZARD,
+            date=date,
+            measured=f"learnt while driving: {state.steering_differs}",
+            estimates=tuple(estimates),
+            unobserved=("travel of the wheels", "direction of the servos"),
+            partial=True,
+        )
+        return True
+
+    def close(self) -> None:
+        """Drop the proposal: the steering was calibrated, or its calibration undone."""
+        self.result, self._closed = None, True
+
+    def _news(self, estimates: list[Estimate]) -> bool:
+        """Whether any value is another one, or is proposed for the first time."""
+        for new in estimates:
+            old = None if self.result is None else self.result.estimate(new.name)
+            if old is None or old.low is None or old.high is None or not old.low <= new.value <= old.high:
+                return True
+        return False
+
+    def _estimates(self, row: AxleDeviation, date: str) -> tuple[Estimate, ...]:
+        """Centre and scale of an axle's pulse map at which it steers as requested."""
+        data, servo = self.config.model_dump(), f"{STEERING}.{row.axle}"
+        centre, scale, direction = (
+            value_at(data, f"{servo}.{key}") for key in ("centre_us", "scale_us_per_deg", "direction")
+        )
+        if centre is None or scale is None or direction is None:
+            return ()
+        wanted = np.linspace(-SPAN, SPAN, 21)
+        # An axle that is to stand at `wanted` has to be asked for this.
+        asked = (wanted - row.trim) / row.gain
+        right, sent = (np.degrees([self._servo(row.axle, angle) for angle in angles]) for angles in (wanted, asked))
+        slope, begin = np.polyfit(right, sent, 1).tolist()
+        by_angle = (right[-1] - right[0]) / (2 * SPAN)  # degrees of the servo for each rad of the axle
+        centre_half = HALF * scale * slope * by_angle * row.trim_deviation
+        scale_half = HALF * scale * slope * row.gain_deviation / abs(row.gain)
+        values = (
+            ("centre", "centre_us", "us", centre + direction * scale * begin, centre_half, "pulse straight ahead"),
+            ("scale", "scale_us_per_deg", "us/deg", scale * slope, scale_half, "pulse per degree of the servo"),
+        )
+        return tuple(
+            Estimate(
+                name=f"{row.axle}_{name}",
+                value=round(value, 3),
+                unit=unit,
+                low=round(value - abs(half), 3),
+                high=round(value + abs(half), 3),
+                samples=max(row.samples, 1),
+                meaning=f"{meaning}, learnt by the tracker",
+                key=f"{servo}.{key}",
+                date=date,
+            )
+            for name, key, unit, value, half, meaning in values
+        )
+
+    def _servo(self, axle: str, angle: float) -> float:
+        """Servo angle for an axle's angle, the other one straight, rad."""
+        front, rear = self._chassis.servos(*((angle, 0.0) if axle == "front" else (0.0, angle)))
+        return math.remainder(front if axle == "front" else rear, math.tau)

@@ -1,0 +1,152 @@
+"""What the learnt errors of the axles mean for an operator: which axle steers otherwise than calibrated, and why.
+
+A servo's gain and slip act alike at one speed: what they do together is known best at the speed at which the covariance
+says so. A difference is named once it exceeds its own standard deviation and that of a calibration by so many times
+that the number in the sentence is right.
+"""
+
+import math
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.track.axle_errors import AxleErrorEstimator
+from monstertruck_schemas.plan import AxleDeviation
+
+SURE: Final = 4.0
+"""Standard deviations by which an axle must differ: its difference is known to a quarter then."""
+CALIBRATED: Final = (0.025 / 1.96, math.radians(0.5) * 0.64 / 1.96)
+"""Standard deviations of gain and trim (rad) of a calibrated axle: `calibrate steering` aims at intervals (95 %) of
+2.5 % for the scale and half a degree of the servo for the centre; the axle turns 0.64 times as far."""
+NAMES: Final[tuple[Literal["front", "rear"], ...]] = ("front", "rear")
+
+TURN: Final = np.array(((0.5, 0, 0, 0.5, 0, 0), (0, 1.0, 0, 0, -1.0, 0), (0, 0, 0.5, 0, 0, 0.5)))
+"""Weights of the estimator's numbers where only the turn is known, not the axle that makes it: mean gain, difference of
+the trims, mean slip."""
+
+Name = Literal["front", "rear", "both axles"]
+
+
+class _Estimate(NamedTuple):
+    """A number and its standard deviation, with what a calibrated truck may have."""
+
+    value: float
+    deviation: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether it cannot be 0."""
+        return abs(self.value) > SURE * self.deviation
+
+    @property
+    def gone(self) -> bool:
+        """Whether it may be 0."""
+        return abs(self.value) <= self.deviation
+
+
+class _Finding(NamedTuple):
+    """One axle, or both where their errors are known together only."""
+
+    name: Name
+    share: _Estimate
+    """By which it turns more, at ``speed``; of servo and slip together."""
+    servo: _Estimate
+    """By which the servo turns it more."""
+    slip: _Estimate
+    """Rad s^2/m."""
+    trim: _Estimate
+    """Rad, left positive."""
+    speed: float
+    """Speed at which ``share`` is known best, m/s."""
+
+    def sentence(self) -> str:
+        """What differs; empty if nothing does."""
+        parts = []
+        if self.servo.sure:
+            parts.append(f"{_percent(self.servo.value)} than calibrated")
+        elif self.slip.sure:
+            parts.append(f"{math.degrees(abs(self.slip.value)):.1f} degrees less for each m/s^2 sideways, by slip")
+        elif self.share.sure:
+            parts.append(
+                f"{_percent(self.share.value)} than calibrated at {self.speed:.1f} m/s, by its servo or by slip "
+                "(drive at another speed to learn which)"
+            )
+        if self.trim.sure:
+            side = "left" if self.trim.value > 0.0 else "right"
+            parts.append(f"{math.degrees(abs(self.trim.value)):.1f} degrees to the {side}")
+        verb = "steer" if self.name == "both axles" else "steers"
+        return f"{self.name} {verb} {', '.join(parts)}" if parts else ""
+
+    @property
+    def servo_differs(self) -> bool:
+        """Whether a calibration helps."""
+        return self.servo.sure or self.trim.sure
+
+    @property
+    def gone(self) -> bool:
+        """Whether nothing differs any longer."""
+        return self.share.gone and self.trim.gone
+
+
+class SteeringReport(NamedTuple):
+    """The steering against its calibration."""
+
+    text: str
+    """Empty if nothing is known to differ."""
+    agrees: bool
+    """Every estimate is within one standard deviation of the calibration."""
+    axles: tuple[AxleDeviation, ...]
+
+
+def report(estimator: AxleErrorEstimator, wheelbase: float) -> SteeringReport:
+    """Compare the estimate with the calibration.
+
+    Args:
+        estimator: of the axles' errors.
+        wheelbase: m.
+    """
+    state, covariance = estimator.state, estimator.covariance
+    alone = [_finding(name, np.eye(6)[3 * k : 3 * k + 3], state, covariance, wheelbase) for k, name in enumerate(NAMES)]
+    together = _finding("both axles", TURN, state, covariance, wheelbase)
+    found = [one for one in alone if one.sentence()] or ([together] if together.sentence() else [])
+    text = "; ".join(one.sentence() for one in found)
+    if any(one.servo_differs for one in found):
+        text += ": `calibrate steering`"
+    rows = tuple(
+        AxleDeviation(
+            axle=name,
+            gain=1.0 + one.servo.value,
+            gain_deviation=math.sqrt(covariance[3 * k, 3 * k]),
+            trim=one.trim.value,
+            trim_deviation=math.sqrt(covariance[3 * k + 1, 3 * k + 1]),
+            slip=one.slip.value,
+            slip_deviation=one.slip.deviation,
+            samples=estimator.samples,
+            servo_differs=(together if together in found else one).servo_differs,
+        )
+        for k, (name, one) in enumerate(zip(NAMES, alone, strict=True))
+    )
+    return SteeringReport(text, together.gone and all(one.gone for one in alone), rows)
+
+
+def _finding(name: Name, rows: Array, state: Array, covariance: Array, wheelbase: float) -> _Finding:
+    """Of gain, trim and slip, each a row of weights of the estimator's six numbers; (3, 6)."""
+    mean, spread = rows @ state, rows @ covariance @ rows.T
+    # The lateral acceleration for each rad at which gain and slip together have the least variance.
+    grip = max(float(spread[0, 2] / spread[2, 2]), 0.0) if spread[2, 2] > 0.0 else 0.0
+    both = float(spread[0, 0] - 2.0 * grip * spread[0, 2] + grip**2 * spread[2, 2])
+    gain, trim = CALIBRATED
+    known = float(np.abs(rows[1]).sum())
+    return _Finding(
+        name,
+        share=_Estimate(float(mean[0] - grip * mean[2]), math.sqrt(max(both, 0.0) + gain**2)),
+        servo=_Estimate(float(mean[0]), math.sqrt(spread[0, 0] + gain**2)),
+        slip=_Estimate(float(mean[2]), math.sqrt(spread[2, 2])),
+        trim=_Estimate(float(mean[1]), math.sqrt(spread[1, 1] + known * trim**2)),
+        speed=math.sqrt(grip * wheelbase),
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{abs(share) * 100:.0f} % {'more' if share > 0.0 else 'less'}"
