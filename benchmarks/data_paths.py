@@ -284,7 +284,7 @@ def scan_through_slam() -> list[str]:
 
 def goal_to_tracker() -> list[str]:
     """A goal becomes a route, the route a path round what stands there, which the tracker takes in."""
-    starts = ("GoalRequest", "PlanTask", "PlanAnswer", "DeformTask", "DeformAnswer", "Path")
+    starts = ("GoalRequest", "PlanTask", "RouteAnswer", "DeformTask", "DeformAnswer", "Path")
     config = robot("goals", placement={"planner": "loop", "local_planner": "loop"})
     trace = Trace(("/goals", "*"), starts)
     return traced(config, trace, 1.0, goal=(3.0, 2.0, 0.0))

@@ -178,8 +178,8 @@ class Rover:
             grid = self.map if self.map is not self.sent[k] else None
             self.fresh[k], self.sent[k] = False, self.map
             answer = self.planning[k].step(PlanTask("route", self.pose, goal, self.hits, setup, grid, clear=clear))
-            if answer.poses is not None:
-                return answer.poses
+            if answer.path is not None:
+                return answer.path.poses
         self.why = f"{answer.reason}: {answer.text}"
         return None
 

@@ -9,7 +9,7 @@ import numpy as np
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import DistanceField, Footprint, clearance_to_points
 from monstertruck_planners.goals.deform_step import Window
-from monstertruck_planners.local.api import PosePath
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
@@ -60,7 +60,7 @@ class Scenario:
             planner = HybridPlanner(vehicle, HybridConfig(margin=0.05, effort=20_000))
             path = planner.plan(route_map, vehicle.reference_pose(start), vehicle.reference_pose(goal)).path
             assert path is not None
-            return PosePath.from_motion(path)
+            return path.along()
         x = np.arange(start[0], goal[0] + 0.04, 0.08)
         x[-1] = goal[0]
         poses = np.column_stack((x, np.full(len(x), start[1]), np.zeros(len(x))))

@@ -19,7 +19,7 @@ from monstertruck_kinematics.se2 import Pose2
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import OCCUPIED, DistanceField, Footprint
 from monstertruck_planners.goals.config import PlannerConfig
-from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Setup
+from monstertruck_planners.goals.exchange import PlanTask, RouteAnswer, Setup
 from monstertruck_planners.goals.goal_run import apart
 from monstertruck_planners.goals.plan_step import PlanningStep
 from monstertruck_planners.route.config import HybridConfig
@@ -86,13 +86,13 @@ def random_pose(where: Place, rng: np.random.Generator) -> Pose2:
             return float(pose[0, 0]), float(pose[0, 1]), float(pose[0, 2])
 
 
-def drive(where: Place, answer: PlanAnswer, pose: Pose2) -> tuple[Pose2, bool, float]:
+def drive(where: Place, answer: RouteAnswer, pose: Pose2) -> tuple[Pose2, bool, float]:
     """Follow a route; returns the last pose, whether it collided, and the seconds it took."""
-    assert answer.poses is not None
-    assert answer.directions is not None
+    planned = answer.path
+    assert planned is not None
     path = DrivePath(
-        stamp=0, received=0, seq=0, frame="map", poses=answer.poses.ravel(), directions=answer.directions,
-        steering=answer.steering, clearance=np.zeros(0) if answer.clearance is None else answer.clearance,
+        stamp=0, received=0, seq=0, frame="map", poses=planned.poses.ravel(), directions=planned.directions,
+        steering=planned.steering, clearance=np.zeros(0) if planned.clearance is None else planned.clearance,
     )  # fmt: skip
     try:
         line = SegmentedPath(path, pose, CONFIG.beyond)
@@ -129,7 +129,7 @@ def trip(where: Place, rng: np.random.Generator) -> dict[str, Any]:
         if answer.reason is Reason.ROUTE_TIMEOUT:
             answer = where.steps[1].step(task)
         row["reason"] = answer.reason
-        if answer.poses is None:
+        if answer.path is None:
             break
         row["length"] = row.get("length", answer.length)
         pose, collided, seconds = drive(where, answer, pose)

@@ -3,7 +3,7 @@
 from typing import Final
 
 from monstertruck_planners.explore.exchange import ExploreAnswer, ExploreTask
-from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, PlanAnswer, PlanTask
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, PlanTask, RouteAnswer
 from monstertruck_planners.track.service import TrackInput, TrackOutput
 from monstertruck_runtime.actors.remote import StepCodec
 from monstertruck_schemas.plan import Path
@@ -27,7 +27,7 @@ PLANNING_BY_KIND: Final = {"hybrid": "monstertruck_planners.goals.plan_step:hybr
 """Planning steps that compile only the code of one kind of route planner, by kind."""
 
 CODEC: Final = StepCodec(
-    *(PlanTask, PlanAnswer, DeformTask, DeformAnswer, TrackInput, TrackOutput, ExploreTask, ExploreAnswer),
+    *(PlanTask, RouteAnswer, DeformTask, DeformAnswer, TrackInput, TrackOutput, ExploreTask, ExploreAnswer),
     # What ``TrackInput.news`` holds.
     *(Odometry, Path, GateState, LaserScan, Attitude),
 )

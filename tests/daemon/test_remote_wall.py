@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from monstertruck_planners.goals.exchange import DeformAnswer, PlanAnswer
+from monstertruck_planners.goals.exchange import DeformAnswer, RouteAnswer
 from monstertruck_planners.steps import CODEC, DEFORMING, EXPLORING, PLANNING, STEPS, TRACKING
 from monstertruck_runtime.actors.actor import ActorFactory, Placement
 from monstertruck_runtime.actors.remote import RPC, RemoteWorkQueue
@@ -54,9 +54,9 @@ def test_all_steps_give_the_same_in_the_loop_in_a_worker_and_in_a_plan_server():
             assert len(a) == len(b) > 3, name
             assert np.abs(np.subtract(a, b)).max() < 1e-9, name
     plan, last = found["planning"][0][0], found["deforming"][0][0]
-    assert isinstance(plan, PlanAnswer)
+    assert isinstance(plan, RouteAnswer)
     assert isinstance(last, DeformAnswer)
-    assert plan.poses is not None
+    assert plan.path is not None
     assert last.finding == "new"
     driven = found["tracking"][0][-1]
     assert driven.drive

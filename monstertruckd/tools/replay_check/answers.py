@@ -6,12 +6,13 @@ was computed is kept, to be compared with it.
 
 import asyncio
 from dataclasses import replace
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, PlanAnswer, PlanTask
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, PlanTask, RouteAnswer
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.steps import CODEC
 from monstertruck_runtime.actors.actor import Actor, ActorFactory, LoopActor, Placement
 from monstertruck_runtime.actors.remote import RemoteWorkQueue
@@ -21,38 +22,28 @@ from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.replay_check.goals import DEFORMED, PLANNED, TOGETHER, GoalRecord
 from monstertruckd.tools.replay_check.pace import PacedClock
 
-NOTHING: Final = PlanAnswer(Reason.OK, "", np.empty((0, 3)), np.empty(0))
-
 
 class ComputedPaths:
     """What was computed where another path was driven."""
 
     def __init__(self) -> None:
-        self._computed: dict[str, PlanAnswer] = {}
+        self._computed: dict[str, PosePath | None] = {}
 
-    def settle(self, computed: PlanAnswer, driven: Path | None) -> PlanAnswer:
-        """The answer for the goal service: the path that was driven, where there was one."""
-        if driven is None or _same(computed, driven):
+    def settle(self, computed: PosePath | None, driven: Path) -> PosePath:
+        """The path for the goal service: the one that was driven."""
+        if computed is not None and _same(computed, driven):
             return computed
-        self._computed[driven.name] = computed if computed.poses is not None else NOTHING
-        poses = np.array(driven.poses).reshape(-1, 3)
-        length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
-        return replace(
-            computed,
-            reason=Reason.OK,
-            poses=poses,
-            directions=np.array(driven.directions),
-            steering=driven.steering or _steering(computed, poses),
-            length=length,
-        )
+        self._computed[driven.name] = computed
+        path = PosePath.of(driven)
+        return replace(path, steering=path.steering or _steering(computed, path.poses))
 
     def as_computed(self, path: Path) -> Path:
         """``path`` as it would be if no other one had been driven."""
-        computed = self._computed.get(path.name)
-        if computed is None:
+        if path.name not in self._computed:
             return path
-        assert computed.poses is not None
-        assert computed.directions is not None
+        computed = self._computed[path.name]
+        if computed is None:
+            return path.model_copy(update={"poses": np.empty(0), "directions": np.empty(0), "steering": ()})
         update = {"poses": computed.poses.ravel(), "directions": computed.directions, "steering": computed.steering}
         return path.model_copy(update=update)
 
@@ -79,15 +70,19 @@ class _Replayed:
 class ReplayedPlanner(_Replayed):
     """Routes and ways out."""
 
-    async def step(self, task: PlanTask) -> PlanAnswer:
+    async def step(self, task: PlanTask) -> RouteAnswer:
         """Answer just before the tick that shows the recorded answer; never, if the log ends before."""
         end = self._record.decided(self._clock.now())
-        answer: PlanAnswer = await self._inner.step(task)
+        answer: RouteAnswer = await self._inner.step(task)
         if end is None:
             await asyncio.Event().wait()
         assert end is not None
         await self._clock.reach(end - (SECOND // 1000))  # a route is there this long before the tick that takes it, ns
-        return self._book.settle(answer, self._record.path_between(end - TOGETHER, end, PLANNED))
+        shown = self._record.path_between(end - TOGETHER, end, PLANNED)
+        if shown is None:
+            return answer
+        path = self._book.settle(answer.path, shown)
+        return answer if path is answer.path else replace(answer, reason=Reason.OK, path=path, length=path.length)
 
 
 class ReplayedDeformer(_Replayed):
@@ -101,8 +96,7 @@ class ReplayedDeformer(_Replayed):
         await self._clock.reach(begin + self._latency + 1 if shown is None else shown.stamp)
         if shown is None or "-held-up" in shown.name:
             return answer
-        path = self._book.settle(answer.path or replace(NOTHING, reason=Reason.PATH_BLOCKED), shown)
-        return replace(answer, finding="new", path=path)
+        return replace(answer, finding="new", path=self._book.settle(answer.path, shown))
 
 
 class ReplayedActors(ActorFactory):
@@ -124,17 +118,15 @@ class ReplayedActors(ActorFactory):
                 return super().actor(placement, name, target, latency=latency, **limits)
 
 
-def _steering(computed: PlanAnswer, poses: Array) -> tuple[Steering, ...]:
+def _steering(computed: PosePath | None, poses: Array) -> tuple[Steering, ...]:
     """Ways of steering, which paths in logs do not name: those where the computed path comes nearest."""
-    if computed.poses is None or not computed.steering:
+    if computed is None or not computed.steering:
         return ()
     apart = poses[:, None, :2] - computed.poses[None, :, :2]
     return tuple(computed.steering[index] for index in np.hypot(apart[..., 0], apart[..., 1]).argmin(axis=1))
 
 
-def _same(computed: PlanAnswer, driven: Path) -> bool:
-    if computed.poses is None or computed.directions is None:
-        return False
+def _same(computed: PosePath, driven: Path) -> bool:
     return np.array_equal(computed.poses.ravel(), driven.poses) and np.array_equal(
         computed.directions, driven.directions
     )

@@ -18,11 +18,11 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_relative, poses_relative
 from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, scan_points_at
 from monstertruck_planners.goals.config import WindowConfig
-from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Setup, explained_within
-from monstertruck_planners.goals.plan_step import answer_of
-from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, nearest_pose, pose_distance
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Setup, explained_within
+from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, nearest_pose, pose_distance
 from monstertruck_planners.local.catalog import make_local_planner
 from monstertruck_planners.local.config import RsbandConfig, TebConfig
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.api import Vehicle, make_planner, warm_up
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import moved
@@ -155,7 +155,8 @@ class DeformStep:
     def __init__(self) -> None:
         self._setup: Setup | None = None
         self._walls: DistanceField | None = None
-        self._route: LocalRoute | None = None
+        self._number = 0
+        """Of the route; 0 = there is none yet."""
         self._rest: PosePath | None = None
         """The route from where its deformation began; None while it is free."""
 
@@ -174,14 +175,14 @@ class DeformStep:
             self._walls = DistanceField.from_grid(task.grid, unknown_blocks=False)
         points, mapped = self._observe(setup, task)
         if task.route is not None:
-            self._begin(task.route)
-        if self._route is None:
+            self._begin(task.route, task.number, drivable=task.drivable)
+        if not self._number:
             return DeformAnswer(0, "idle")
         here = self._vehicle.reference_pose(task.pose)
         self._advance(here)
-        if self._route.drivable and self._free(setup, here, task.pose, points, mapped):
+        if self._drivable and self._free(setup, here, task.pose, points, mapped):
             self._rest, self._state = None, LocalPlannerState()
-            return DeformAnswer(self._route.number, "free", place=self._place, complete=True)
+            return DeformAnswer(self._number, "free", place=self._place, complete=True)
         if self._rest is None:
             self._rest = self._guide.part(self._place, len(self._guide.poses))
         result = self._planner.plan(self._rest, self._window.field(self._walls), here, self._state)
@@ -192,7 +193,7 @@ class DeformStep:
         config = setup.config
         if config.local_planner is None:
             raise InputError("deforming: expected planner.local_planner")
-        self._setup, self._route = setup, None
+        self._setup, self._number = setup, 0
         self._vehicle = Vehicle.truck(
             config.steering, angle=config.angle, geometry=setup.geometry, footprint=setup.footprint
         )
@@ -201,8 +202,8 @@ class DeformStep:
         if config.map is not None:
             self._walls = _walls_of(config.map)
 
-    def _begin(self, route: LocalRoute) -> None:
-        self._route, self._place = route, 0
+    def _begin(self, route: PosePath, number: int, *, drivable: bool) -> None:
+        self._number, self._drivable, self._place = number, drivable, 0
         self._guide = PosePath(moved(route.poses, self._vehicle.reference), route.directions)
         self._travelled = self._guide.travelled
         self._rest, self._state = None, LocalPlannerState()
@@ -258,8 +259,7 @@ class DeformStep:
         )
 
     def _answer(self, result: LocalPlan) -> DeformAnswer:
-        assert self._route is not None
-        number, path = self._route.number, result.path
+        number, path = self._number, result.path
         shortest = 0.02  # a deformed path shorter than this is none, m
         if path is not None and path.length < shortest and self._place == len(self._guide.poses) - 1:
             return DeformAnswer(number, "kept", result.reason, place=self._place, complete=True)
@@ -268,8 +268,8 @@ class DeformStep:
             return DeformAnswer(number, "blocked", why, result.text, self._place)
         if result.statistics.get("kept"):
             return DeformAnswer(number, "kept", result.reason, result.text, self._place, result.complete)
-        answer = answer_of(path, cost=path.length)
-        return DeformAnswer(number, "new", result.reason, result.text, self._place, result.complete, answer)
+        new = path.base_path()
+        return DeformAnswer(number, "new", result.reason, result.text, self._place, result.complete, new)
 
 
 def _walls_of(place: Path) -> DistanceField | None:

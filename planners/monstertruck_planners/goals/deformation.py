@@ -3,20 +3,17 @@
 from collections.abc import Callable
 from typing import Final
 
-import numpy as np
-
-from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.goals.exchange import (
     DeformAnswer,
     DeformTask,
     Finding,
-    LocalRoute,
-    PlanAnswer,
+    RouteAnswer,
     Setup,
     level,
     pose_of,
     twist_of,
 )
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import WorkerError
@@ -64,8 +61,7 @@ class RouteDeformation:
         self._fresh = True
         self._sent_grid: Grid | None = None
         self._number = 0
-        self._route: PlanAnswer | None = None
-        self._travelled: Array = np.zeros(1)
+        self._route: RouteAnswer | None = None
         self._sent_route = 0
         self._answer: DeformAnswer | None = None
         self._since = 0
@@ -109,13 +105,10 @@ class RouteDeformation:
             else:
                 return
 
-    def begin(self, route: PlanAnswer) -> None:
+    def begin(self, route: RouteAnswer) -> None:
         """Another route is driven from now on."""
-        assert route.poses is not None
         self._number += 1
         self._route, self._answer = route, None
-        steps = np.hypot(*np.diff(route.poses[:, :2], axis=0).T)
-        self._travelled = np.concatenate(([0.0], np.cumsum(steps)))
         self._furthest, self._onward = 0.0, self._clock.now()
 
     def end(self) -> None:
@@ -157,26 +150,21 @@ class RouteDeformation:
         """Metres of the route ahead; 0 without one."""
         if self._answer is None:
             return 0.0
-        return float(self._travelled[-1] - self._travelled[self._answer.place])
+        travelled = self._path.travelled
+        return float(travelled[-1] - travelled[self._answer.place])
 
-    def rest(self) -> PlanAnswer:
+    @property
+    def rest(self) -> PosePath:
         """The route from the truck on."""
-        route, answer = self._route, self._answer
-        assert route is not None
-        assert answer is not None
-        assert route.poses is not None
-        assert route.directions is not None
-        at = min(answer.place, len(route.poses) - 2)
-        return PlanAnswer(
-            Reason.OK,
-            "",
-            route.poses[at:],
-            route.directions[at:],
-            route.steering[at:],
-            self.left,
-            self.left,
-            None if route.clearance is None else route.clearance[at:],
-        )
+        assert self._answer is not None
+        count = len(self._path.poses)
+        return self._path.part(min(self._answer.place, count - 2), count)
+
+    @property
+    def _path(self) -> PosePath:
+        assert self._route is not None
+        assert self._route.path is not None
+        return self._route.path
 
     def _task(self, scan: LaserScan) -> DeformTask | None:
         odometry = self._pose.latest
@@ -187,16 +175,15 @@ class RouteDeformation:
         grid = None if self._grid is None else self._grid.latest
         route = None
         if self._route is not None and (self._fresh or self._sent_route != self._number):
-            assert self._route.poses is not None
-            assert self._route.directions is not None
-            route = LocalRoute(self._number, self._route.poses, self._route.directions, self._route.drivable)
-            self._sent_route = self._number
+            route, self._sent_route = self._path, self._number
         task = DeformTask(
             scan,
             pose_of(odometry),
             setup=self._setup if self._fresh else None,
             grid=grid if self._fresh or grid is not self._sent_grid else None,
             route=route,
+            number=self._number,
+            drivable=self._route is None or self._route.drivable,
             deviation=odometry.position_deviation,
             stamp=odometry.stamp,
             twist=twist_of(odometry),
@@ -208,7 +195,7 @@ class RouteDeformation:
         now = self._clock.now()
         if answer.finding == "blocked" and not self.held_up:
             self._since = now
-        along = float(self._travelled[answer.place])
+        along = float(self._path.travelled[answer.place])
         if answer.finding == "free" or along > self._furthest + 0.05:  # metres along the route that are progress
             self._furthest, self._onward = max(along, self._furthest), now
         self._answer = answer

@@ -8,9 +8,9 @@ from monstertruck_kinematics.se2 import Pose2
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_schemas.health import PLACELESS, SlamHealth
-from monstertruck_schemas.plan import Steering
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Ground, Odometry
@@ -91,43 +91,23 @@ class PlanTask:
 
 
 @dataclass(frozen=True, slots=True)
-class PlanAnswer:
+class RouteAnswer:
     """A path to drive, or the reason why there is none."""
 
     reason: Reason
     text: str = ""
-    poses: Array | None = None
-    """Shape (n, 3): of the base along the path; None without one."""
-    directions: Array | None = None
-    """Shape (n,): +1 or -1."""
-    steering: tuple[Steering, ...] = ()
-    """n of them; none: the tracker's own."""
+    path: PosePath | None = None
+    """Of the base; None without one."""
     length: float = 0.0
     """Metres."""
     cost: float = 0.0
     """Metres, with all prices."""
-    clearance: Array | None = None
-    """Shape (n,): see ``Path``; None = not known."""
     kept: bool = False
     """Whether it is the rest of the previous route."""
     drivable: bool = True
     """Whether the truck can drive it; else its poses only show where to go."""
     complete: bool = True
     """Whether it leads to the goal; else it is the beginning of a route too long for one path."""
-
-
-@dataclass(frozen=True, slots=True)
-class LocalRoute:
-    """A route to be deformed."""
-
-    number: int
-    """Number of this route."""
-    poses: Array
-    """Shape (n, 3): of the base."""
-    directions: Array
-    """Shape (n,): +1 or -1."""
-    drivable: bool = True
-    """Whether the truck can drive it; else a local path along it is always driven."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +119,12 @@ class DeformTask:
     """Of the base, in the map's frame."""
     setup: Setup | None = None
     grid: Grid | None = None
-    route: LocalRoute | None = None
+    route: PosePath | None = None
+    """Of the base, to be deformed."""
+    number: int = 0
+    """Number of this route."""
+    drivable: bool = True
+    """Whether the truck can drive it; else a local path along it is always driven."""
     deviation: float = 0.0
     """Standard deviation of the position, m."""
     stamp: int = 0
@@ -166,8 +151,8 @@ class DeformAnswer:
     """Index of the route's pose that the truck has come to."""
     complete: bool = False
     """The path leads to the route's end."""
-    path: PlanAnswer | None = None
-    """The new path."""
+    path: PosePath | None = None
+    """The new path, of the base."""
 
 
 def level(scan: LaserScan, config: PlannerConfig) -> bool:

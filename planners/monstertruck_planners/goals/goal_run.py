@@ -10,7 +10,7 @@ from typing import Final, Literal, assert_never
 
 from monstertruck_kinematics.se2 import Pose2
 from monstertruck_planners.goals.config import PlannerConfig
-from monstertruck_planners.goals.exchange import Place, PlanAnswer
+from monstertruck_planners.goals.exchange import Place, RouteAnswer
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.reasons import Reason
@@ -59,7 +59,7 @@ class Plan:
 class Follow:
     """Have this driven."""
 
-    answer: PlanAnswer
+    answer: RouteAnswer
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ class Observations:
     at_rest: bool
     pose: Pose2 | None
     """Of the base, in the goal's frame."""
-    answer: PlanAnswer | None = None
+    answer: RouteAnswer | None = None
     """The newest plan, once."""
     outcome: Reason | None = None
     """What the tracker says of the present path; None before it says something."""
@@ -222,13 +222,13 @@ def tick(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
             assert_never(phase)
 
 
-def _planned(run: GoalRun, observed: Observations, answer: PlanAnswer, config: PlannerConfig) -> Step:
+def _planned(run: GoalRun, observed: Observations, answer: RouteAnswer, config: PlannerConfig) -> Step:
     if run.planned == "escape":
-        if answer.poses is None:
+        if answer.path is None:
             return _recover(run, answer.reason, f"no way to back out: {answer.text}", config)
         report = Report(Reason.RECOVERING, Severity.INFO, f"goal {run.number}: backs out {answer.length:.2f} m")
         return _set_off(run, GoalPhase.BACKING_OUT), (Follow(answer), report)
-    if answer.poses is None:
+    if answer.path is None:
         if run.routes == 0 and answer.reason in REFUSED:
             return _end(run, answer.reason, answer.text)
         return _recover(run, answer.reason, answer.text, config)

@@ -1,7 +1,8 @@
 """Paths for the tracker: published, checked against scans, ended early; and standstill without disarming."""
 
+import contextlib
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +10,10 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, placed, poses_relative
 from monstertruck_planners.collision import Footprint, first_contact
-from monstertruck_planners.goals.exchange import PlanAnswer, pose_of
-from monstertruck_planners.track.segments import stops
+from monstertruck_planners.goals.exchange import pose_of
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Subscription
 from monstertruck_runtime.requests import planner_request
@@ -59,14 +61,12 @@ class GoalOutputs:
 
 
 @dataclass(frozen=True)
-class FollowedPath:
-    """The path the tracker was given."""
+class Followed:
+    """What the tracker was given."""
 
     message: Path
-    poses: Array
-    """Shape (n, 3): of the base."""
-    travelled: Array
-    """Shape (n,), metres from its start."""
+    path: PosePath
+    """The same path."""
     before: float = 0.0
     """Metres driven on the paths that it was deformed from."""
 
@@ -93,7 +93,7 @@ class PathPublisher:
     def __init__(self, clock: Clock, inputs: GoalInputs, outputs: GoalOutputs, deceleration: float) -> None:
         self._clock, self._in, self._out, self._deceleration = clock, inputs, outputs, deceleration
         self._paths = 0
-        self.followed: FollowedPath | None = None
+        self.followed: Followed | None = None
 
     @property
     def driving(self) -> bool:
@@ -106,18 +106,15 @@ class PathPublisher:
         """Whether another source's path is followed."""
         return self.followed is not None and self._in.path.latest is not self.followed.message
 
-    def follow(self, answer: PlanAnswer, name: str, before: float = 0.0) -> None:
+    def follow(self, path: PosePath, name: str, before: float = 0.0) -> None:
         """Have a path driven.
 
         Args:
-            answer: the path.
+            path: of the base.
             name: of it; a number is added.
             before: metres driven already on the route that it is part of.
         """
-        assert answer.poses is not None
-        assert answer.directions is not None
-        steering = answer.steering if len(answer.steering) == len(answer.poses) else ()
-        self._publish(answer.poses, answer.directions, steering, name, before, answer.clearance)
+        self._publish(path, name, before)
 
     def brake(self, name: str, *, halts: bool = False) -> None:
         """Let what is followed end as soon as the tracker can brake; of a truck at rest, where it stands.
@@ -134,15 +131,12 @@ class PathPublisher:
         standstill_path = 0.01  # length of a path that leads nowhere, m
         if speed > AT_REST and report is not None:
             rest = speed * speed / (2 * self._deceleration) + standstill_path
-            path = followed.message
-            at_rest = stops(path.directions[1:], path.steering[1:])
-            kept = kept_poses(followed.travelled, report.along, rest, np.flatnonzero(at_rest) + 1)
-            poses, directions = followed.poses[kept], path.directions[kept]
-            steering, clearance = path.steering[kept], path.clearance[kept]
-            self._publish(poses, directions, steering, name, driven, clearance, halts=halts)
+            path = followed.path
+            kept = kept_poses(path.travelled, report.along, rest, path.stops)
+            self._publish(path.part(kept.start, kept.stop), name, driven, halts=halts)
         else:
             ahead = np.array([[0.0, 0.0, 0.0], [standstill_path, 0.0, 0.0]])
-            self._publish(placed(ahead, pose_of(odometry)), np.ones(2), (), name, driven, halts=halts)
+            self._publish(PosePath(placed(ahead, pose_of(odometry)), np.ones(2)), name, driven, halts=halts)
 
     def halt(self, name: str) -> None:
         """Brake, and follow nothing."""
@@ -153,8 +147,9 @@ class PathPublisher:
         """Let a path that another source published, as the configured one, end as soon as the tracker can brake."""
         path = self._in.path.latest
         if path is not None and not path.halts and (self.followed is None or path is not self.followed.message):
-            self.followed = _followed(path)
-            self.halt(name)
+            with contextlib.suppress(InputError):  # the tracker has refused it, too
+                self.followed = Followed(path, PosePath.of(path))
+                self.halt(name)
 
     def stand_still(self) -> None:
         """Ask the gate for standstill, so that the truck stays armed while nothing is driven."""
@@ -165,17 +160,7 @@ class PathPublisher:
         # 0.25: lease of the request to stand still, s
         requests.put(planner_request(requests.next_seq(), gate, now, SOURCE, 0.25, speed=0.0, front=0.0, rear=0.0))
 
-    def _publish(
-        self,
-        poses: Array,
-        directions: Array,
-        steering: tuple[Any, ...],
-        name: str,
-        before: float,
-        clearance: Array | None = None,
-        *,
-        halts: bool = False,
-    ) -> None:
+    def _publish(self, path: PosePath, name: str, before: float, *, halts: bool = False) -> None:
         now, odometry = self._clock.now(), self._in.pose.latest
         assert odometry is not None
         self._paths += 1
@@ -184,33 +169,27 @@ class PathPublisher:
             received=now,
             seq=self._out.path.next_seq(),
             frame=odometry.frame,
-            poses=np.ascontiguousarray(poses).ravel(),
-            directions=np.array(directions),
-            steering=steering,
-            clearance=np.zeros(0) if clearance is None else np.array(clearance),
+            poses=np.ascontiguousarray(path.poses).ravel(),
+            directions=np.array(path.directions),
+            steering=path.steering,
+            clearance=np.zeros(0) if path.clearance is None else np.array(path.clearance),
             halts=halts,
             name=f"{name}.{self._paths}",
         )
-        self.followed = _followed(message, before)
+        self.followed = Followed(message, path, before)
         self._out.path.put(message)
 
 
-def _followed(path: Path, before: float = 0.0) -> FollowedPath:
-    poses = path.poses.reshape(-1, 3)
-    steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-    return FollowedPath(path, poses, np.concatenate(([0.0], np.cumsum(steps))), before)
-
-
-def poses_ahead(poses: Array, travelled: Array, along: float, reach: float, pose: Pose2) -> Array:
+def poses_ahead(path: PosePath, along: float, reach: float, pose: Pose2) -> Array:
     """The truck's pose, then the path's poses from ``along`` to ``along + reach``, one every few centimetres.
 
     Args:
-        poses: shape (n, 3), of the base.
-        travelled: shape (n,), metres from the path's start.
+        path: of the base.
         along: where the truck is, m.
         reach: m.
         pose: the truck's own.
     """
+    poses, travelled = path.poses, path.travelled
     first, last = np.searchsorted(travelled, (along, along + reach), side="right")
     chosen = poses[first : last + 1]
     check_step = 0.05  # metres between two poses of a path check

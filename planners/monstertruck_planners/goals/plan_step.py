@@ -21,14 +21,14 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_relative
 from monstertruck_planners.collision import OCCUPIED, DistanceField, Footprint, rectangle_distance
 from monstertruck_planners.goals.escape import escape
-from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, Setup, explained_within
+from monstertruck_planners.goals.exchange import PlanTask, RouteAnswer, Setup, explained_within
 from monstertruck_planners.goals.unseen import Unseen, unseen_around
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.api import Clock, RouteMap, RoutePlanner, RouteResult, Vehicle, make_planner, warm_up
 from monstertruck_planners.route.config import GoalConfig, GridAstarConfig, HybridConfig, LatticeConfig
 from monstertruck_planners.route.departure import leaving
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.replan import ViaPoint, replan, with_headings
-from monstertruck_planners.track.segments import stops
 from monstertruck_runtime.clock import processor_time
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
@@ -275,7 +275,7 @@ class PlanningStep:
         """Shape (k, 2), m: unseen places onto which the present route must not reverse."""
         self._now: Clock | None = None
 
-    def step(self, task: PlanTask) -> PlanAnswer:
+    def step(self, task: PlanTask) -> RouteAnswer:
         """Do one task.
 
         Raises:
@@ -290,13 +290,13 @@ class PlanningStep:
         if task.ground is not None:
             self._ground, self._layers = task.ground, None
         if self._map is None:
-            return PlanAnswer(*self._without)
+            return RouteAnswer(*self._without)
         places = [value for place in task.via for value in place if value is not None]
         numbers = np.array((*task.pose, *task.goal, *places))
         if not np.isfinite(numbers).all():
-            return PlanAnswer(Reason.NOT_FINITE, "expected a finite pose, goal and waypoints")
+            return RouteAnswer(Reason.NOT_FINITE, "expected a finite pose, goal and waypoints")
         if np.abs(numbers).max() > MAX_COORDINATE:
-            return PlanAnswer(Reason.BAD_INPUT, f"expected a pose, goal and waypoints of at most {MAX_COORDINATE:g}")
+            return RouteAnswer(Reason.BAD_INPUT, f"expected a pose, goal and waypoints of at most {MAX_COORDINATE:g}")
         if task.clear or task.afresh:
             self._route = None
         self._observe(self._setup, self._map, task)
@@ -337,7 +337,7 @@ class PlanningStep:
         tolerance = explained_within(setup.config, task.deviation)
         memory.drop_explained(lambda places: static_map.unexplained(places, tolerance))
 
-    def _plan(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
+    def _plan(self, static_map: StaticMap, task: PlanTask) -> RouteAnswer:
         """A route that does not reverse onto unseen ground, or one to where that can be seen.
 
         What one route would cover is closed to the next.
@@ -351,7 +351,7 @@ class PlanningStep:
         for _ in range(2):  # routes planned around unseen ground, at most; each closes more of it
             self._closed, self._route = np.vstack((self._closed, met)), None
             answer = self._plan_known(static_map, task)
-            if answer.poses is None:
+            if answer.path is None:
                 break
             if not len(met := self._met(unseen, answer)):
                 return answer
@@ -359,9 +359,9 @@ class PlanningStep:
         look = self._look(static_map, task, unseen)
         remedy = "drive it forward by hand first, or back with the second control"
         text = f"every way found leads back onto ground that no sensor has seen, at {x:.1f}, {y:.1f}: {remedy}"
-        return look or PlanAnswer(Reason.UNSEEN_STOP, text)
+        return look or RouteAnswer(Reason.UNSEEN_STOP, text)
 
-    def _look(self, static_map: StaticMap, task: PlanTask, unseen: Unseen) -> PlanAnswer | None:
+    def _look(self, static_map: StaticMap, task: PlanTask, unseen: Unseen) -> RouteAnswer | None:
         """A route to a place from which the closed ground can be seen; None if none was found."""
         assert self._route_map is not None
         lookouts = unseen.lookouts(self._closed, self._route_map.field, self._planner.config.margin)
@@ -375,15 +375,15 @@ class PlanningStep:
             x, y, yaw = lookouts[index].tolist()
             answer = self._plan_known(static_map, replace(task, goal=(x, y, yaw), via=()))
             self._route = None
-            if answer.poses is not None and not len(self._met(unseen, answer)):
+            if answer.path is not None and not len(self._met(unseen, answer)):
                 text = f"{answer.length:.2f} m to look at ground that no sensor has seen"
                 return replace(answer, text=text, complete=False)
         return None
 
-    def _met(self, unseen: Unseen, answer: PlanAnswer) -> Array:
+    def _met(self, unseen: Unseen, answer: RouteAnswer) -> Array:
         """See ``Unseen.met``."""
         assert self._route_map is not None
-        return unseen.met(answer, self._route_map.field)
+        return np.empty((0, 2)) if answer.path is None else unseen.met(answer.path, self._route_map.field)
 
     def _unseen(self, task: PlanTask) -> Unseen | None:
         """Unseen ground around the robot; None where it may reverse anywhere."""
@@ -395,7 +395,7 @@ class PlanningStep:
             else unseen_around(seen, keep, self._setup.lidar, self._setup.footprint)
         )
 
-    def _plan_known(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
+    def _plan_known(self, static_map: StaticMap, task: PlanTask) -> RouteAnswer:
         """A route that does not reverse into suspended places: those near it count again, then all."""
         answer = self._plan_once(static_map, task)
         for nearby in (NEARBY, math.inf):
@@ -409,18 +409,18 @@ class PlanningStep:
             answer = self._plan_once(static_map, task)
         return answer
 
-    def _backs_into(self, answer: PlanAnswer, places: Array) -> NDArray[np.bool_]:
+    def _backs_into(self, answer: RouteAnswer, places: Array) -> NDArray[np.bool_]:
         """Whether the backward motions of a route touch each place; shape (k,)."""
         assert self._setup is not None
-        if answer.poses is None or answer.directions is None or not len(places):
+        if answer.path is None or not len(places):
             return np.zeros(len(places), dtype=np.bool_)
-        backward = answer.poses[answer.directions < 0]
+        backward = answer.path.poses[answer.path.directions < 0]
         if not len(backward):
             return np.zeros(len(places), dtype=np.bool_)
         gaps = rectangle_distance(self._setup.footprint, backward, places).min(axis=0)
         return np.asarray(gaps < self._setup.config.route.margin + SQUARE / 2)
 
-    def _plan_once(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
+    def _plan_once(self, static_map: StaticMap, task: PlanTask) -> RouteAnswer:
         assert self._setup is not None
         points = self._memory.places
         if len(points):
@@ -445,18 +445,20 @@ class PlanningStep:
             wider = plan(self._wide)
             result = wider if self._cusp_clearance(route_map, wider) > room else result
         if not result.ok:
-            return PlanAnswer(result.reason, result.text)
+            return RouteAnswer(result.reason, result.text)
         self._route = result.path
         if result.path is not None:
-            answer = shortened(answer_of(result.path, result.cost, kept=bool(result.statistics["kept_route"])))
-            return replace(answer, clearance=self._clearance(route_map, answer))
+            path = result.path.base_path()
+            kept = bool(result.statistics["kept_route"])
+            answer = shortened(RouteAnswer(Reason.OK, "", path, result.path.length, result.cost, kept=kept))
+            assert answer.path is not None
+            return replace(answer, path=replace(answer.path, clearance=self._clearance(route_map, answer.path)))
         if result.poses is None or self._setup.config.local_planner is None:
-            return PlanAnswer(
+            return RouteAnswer(
                 Reason.BAD_INPUT, "this planner's routes are no motions of the robot: set planner.local_planner"
             )
-        poses = moved(result.poses, -self._vehicle.reference)
-        length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
-        return PlanAnswer(Reason.OK, "", poses, np.ones(len(poses)), (), length, result.cost, drivable=False)
+        path = PosePath(moved(result.poses, -self._vehicle.reference), np.ones(len(result.poses)))
+        return RouteAnswer(Reason.OK, "", path, path.length, result.cost, drivable=False)
 
     def _map_of(self, cells: Cells, static_map: StaticMap) -> RouteMap:
         assert self._setup is not None
@@ -503,20 +505,19 @@ class PlanningStep:
             unseen=self._closed_cells(freed.shape, static_map.resolution, origin),
         )
 
-    def _clearance(self, route_map: RouteMap, answer: PlanAnswer) -> Array:
+    def _clearance(self, route_map: RouteMap, path: PosePath) -> Array:
         assert self._setup is not None
-        assert answer.poses is not None
         # 0.2: clearance of the poses of an answer is measured up to this, m
-        return route_map.field.clearance(self._setup.footprint, answer.poses, 0.2)
+        return route_map.field.clearance(self._setup.footprint, path.poses, 0.2)
 
     def _cusp_clearance(self, route_map: RouteMap, result: RouteResult) -> float:
         """Least clearance of the cusps, m; +inf of a route without any, -inf without a route."""
         if result.path is None:
             return math.inf if result.ok else -math.inf
-        answer = answer_of(result.path, result.cost)
-        return float(np.min(self._clearance(route_map, answer)[stop_poses(answer)], initial=math.inf))
+        path = result.path.base_path()
+        return float(np.min(self._clearance(route_map, path)[path.stops], initial=math.inf))
 
-    def _escape(self, static_map: StaticMap, task: PlanTask) -> PlanAnswer:
+    def _escape(self, static_map: StaticMap, task: PlanTask) -> RouteAnswer:
         setup = self._setup
         assert setup is not None
         config = setup.config
@@ -533,12 +534,11 @@ class PlanningStep:
         )
         self._route = None
         if found is None:
-            return PlanAnswer(Reason.STUCK, "both ends of the robot are blocked, or ground there was not seen")
+            return RouteAnswer(Reason.STUCK, "both ends of the robot are blocked, or ground there was not seen")
         steering: tuple[Steering, ...] = (found.steering,) * len(found.poses)
-        poses = placed(found.poses, task.pose)
-        length = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())
-        directions = np.full(len(poses), float(found.direction))
-        return PlanAnswer(Reason.OK, "", poses, directions, steering, length, length)
+        directions = np.full(len(found.poses), float(found.direction))
+        path = PosePath(placed(found.poses, task.pose), directions, steering)
+        return RouteAnswer(Reason.OK, "", path, path.length, path.length)
 
     def _unseen_near(self, task: PlanTask) -> Array:
         """Unseen places around the robot, in base, shape (n, 2), m."""
@@ -546,38 +546,17 @@ class PlanningStep:
         return np.empty((0, 2)) if unseen is None else unseen.near(task.pose)
 
 
-def answer_of(path: MotionPath, cost: float, *, kept: bool = False) -> PlanAnswer:
-    """A drivable path as an answer: poses of the base every few centimetres."""
-    message = path.message(stamp=0, step=0.05)  # metres between two poses of an answer
-    poses, directions = np.array(message.poses).reshape(-1, 3), np.array(message.directions)
-    return PlanAnswer(Reason.OK, "", poses, directions, message.steering, path.length, cost, kept=kept)
-
-
-def stop_poses(answer: PlanAnswer) -> NDArray[np.intp]:
-    """Indices of the poses at which a path stops before its end."""
-    assert answer.directions is not None
-    return np.flatnonzero(stops(answer.directions[1:], answer.steering[1:])) + 1
-
-
-def shortened(answer: PlanAnswer) -> PlanAnswer:
+def shortened(answer: RouteAnswer) -> RouteAnswer:
     """The part of a path that fits one message: ``MAX_RUNS`` runs, ``MAX_POSES`` poses."""
-    poses, directions = answer.poses, answer.directions
-    assert poses is not None
-    assert directions is not None
-    ends = [*stop_poses(answer)[:MAX_RUNS].tolist(), len(poses) - 1]
+    path = answer.path
+    assert path is not None
+    ends = [*path.stops[:MAX_RUNS].tolist(), len(path.poses) - 1]
     count = min(ends[min(MAX_RUNS, len(ends)) - 1] + 1, MAX_POSES)
-    if count == len(poses):
+    if count == len(path.poses):
         return answer
-    length = float(np.hypot(*np.diff(poses[:count, :2], axis=0).T).sum())
-    return replace(
-        answer,
-        text=f"the first {length:.2f} m of {answer.length:.2f}",
-        poses=poses[:count],
-        directions=directions[:count],
-        steering=answer.steering[:count],
-        length=length,
-        complete=False,
-    )
+    first = path.part(0, count)
+    text = f"the first {first.length:.2f} m of {answer.length:.2f}"
+    return replace(answer, text=text, path=first, length=first.length, complete=False)
 
 
 class PlanningWorker(PlanningStep):

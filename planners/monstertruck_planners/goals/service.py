@@ -16,8 +16,8 @@ from monstertruck_planners.goals.exchange import (
     DeformAnswer,
     Finding,
     Place,
-    PlanAnswer,
     PlanTask,
+    RouteAnswer,
     SeenGround,
     SeenScan,
     Setup,
@@ -30,7 +30,7 @@ from monstertruck_planners.goals.exchange import (
 from monstertruck_planners.goals.goal_run import Action, Follow, GoalRun, Halt, Observations, Plan, Report
 from monstertruck_planners.goals.path_publisher import (
     AT_REST,
-    FollowedPath,
+    Followed,
     GoalInputs,
     GoalOutputs,
     PathPublisher,
@@ -115,7 +115,7 @@ class GoalService:
         self._goal: GoalRun | None = None
         self._held: set[str] = set()
         self._paths = PathPublisher(clock, inputs, outputs, deceleration)
-        self._planning: asyncio.Task[PlanAnswer] | None = None
+        self._planning: asyncio.Task[RouteAnswer] | None = None
         self._actor: Actor | None = None
         self._trouble: TruckError | None = None
         """Why the planner did not start the last time."""
@@ -291,11 +291,11 @@ class GoalService:
             held="" if gate is None else in_words(gate.hindrances),
         )
 
-    def _left(self, followed: FollowedPath | None, along: float) -> float:
+    def _left(self, followed: Followed | None, along: float) -> float:
         """Length of the route ahead, m; +inf without a route."""
         if self._deformation is not None and self._deformation.active:
             return self._deformation.left
-        return math.inf if followed is None else max(float(followed.travelled[-1]) - along, 0.0)
+        return math.inf if followed is None else max(float(followed.path.travelled[-1]) - along, 0.0)
 
     def _odometry(self, now: int) -> Odometry | None:
         odometry = self._in.pose.latest
@@ -306,14 +306,14 @@ class GoalService:
         on_the_way = self._deformation is not None and not self._deformation.complete
         return Reason.DRIVING if on_the_way and outcome in goal_run.ENDED else outcome
 
-    def _blocked(self, followed: FollowedPath, along: float, odometry: Odometry, now: int) -> bool:
+    def _blocked(self, followed: Followed, along: float, odometry: Odometry, now: int) -> bool:
         if self._deformation is not None and self._deformation.active:
             return self._deformation.blocked(now)
         points = self._scan(odometry, now)
         if not len(points):
             return False
         pose = pose_of(odometry)
-        ahead = poses_ahead(followed.poses, followed.travelled, along, self._config.look_ahead, pose)
+        ahead = poses_ahead(followed.path, along, self._config.look_ahead, pose)
         return path_blocked(self._setup.footprint, ahead, points, pose)
 
     def _keep_scan(self, now: int) -> None:
@@ -386,7 +386,7 @@ class GoalService:
         odometry = self._odometry(now)
         assert self._tasks is not None
         if odometry is None:
-            self._planning = self._tasks.create_task(_known(PlanAnswer(Reason.NO_MAP, "no fresh pose")))
+            self._planning = self._tasks.create_task(_known(RouteAnswer(Reason.NO_MAP, "no fresh pose")))
             return
         pose = pose_of(odometry)
         grid = None if self._in.grid is None else self._in.grid.latest
@@ -414,25 +414,26 @@ class GoalService:
         self._fresh, self._sent_grid, self._sent_ground = False, grid, ground
         self._planning = self._tasks.create_task(self._ask(task))
 
-    async def _ask(self, task: PlanTask) -> PlanAnswer:
+    async def _ask(self, task: PlanTask) -> RouteAnswer:
         """The planner's answer; if it failed and is restarted, an answer that says so."""
         assert self._actor is not None
         try:
-            answer: PlanAnswer = await self._actor.step(task)
+            answer: RouteAnswer = await self._actor.step(task)
         except TruckError as error:
             self._fresh = True
             self._out.events(error.reason, Severity.ERROR, self.name, str(error))
-            return PlanAnswer(error.reason, str(error).partition("\n")[0])
+            return RouteAnswer(error.reason, str(error).partition("\n")[0])
         return answer
 
-    def _follow(self, answer: PlanAnswer) -> None:
+    def _follow(self, answer: RouteAnswer) -> None:
         run, deformation = self._goal, self._deformation
         assert run is not None
         if deformation is not None:
             deformation.end()
             if run.planned == "route":
                 deformation.begin(answer)
-        self._paths.follow(answer, f"goal-{run.number}")
+        assert answer.path is not None
+        self._paths.follow(answer.path, f"goal-{run.number}")
 
     def _on_deformed(self, was: Finding, answer: DeformAnswer) -> None:
         """Follow the deformed route."""
@@ -444,7 +445,7 @@ class GoalService:
         if answer.path is not None:
             self._paths.follow(answer.path, f"{name}-deformed", before)
         elif answer.finding == "free" and was not in ("idle", "free"):
-            self._paths.follow(deformation.rest(), name, before)
+            self._paths.follow(deformation.rest, name, before)
         elif answer.finding == "blocked" and was != "blocked":
             self._paths.brake(f"{name}-held-up")
         if (event := event_of(was, answer)) is not None:
@@ -496,7 +497,7 @@ def _moved_on(before: Pose2, pose: Pose2) -> bool:
     return math.dist(before[:2], pose[:2]) > 0.25 or turned > 0.4
 
 
-async def _known(answer: PlanAnswer) -> PlanAnswer:
+async def _known(answer: RouteAnswer) -> RouteAnswer:
     return answer
 
 
@@ -505,7 +506,7 @@ def _undecided(state: GoalState) -> bool:
 
 
 def goal_state(
-    run: GoalRun | None, now: int, followed: FollowedPath | None, inputs: GoalInputs, left: float = 0.0
+    run: GoalRun | None, now: int, followed: Followed | None, inputs: GoalInputs, left: float = 0.0
 ) -> GoalState:
     """The report on a goal, with sequence number 0; at least ``left`` metres of the route are ahead."""
     odometry = inputs.pose.latest
@@ -515,7 +516,7 @@ def goal_state(
     x, y, yaw = run.goal
     remaining = 0.0
     if followed is not None and run.active:
-        remaining = max(float(followed.travelled[-1]) - followed.along(inputs.tracker.latest), left, 0.0)
+        remaining = max(float(followed.path.travelled[-1]) - followed.along(inputs.tracker.latest), left, 0.0)
     return GoalState(
         stamp=now,
         received=now,

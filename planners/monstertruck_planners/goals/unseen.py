@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_relative
 from monstertruck_planners.collision import DistanceField, Footprint, rectangle_distance
-from monstertruck_planners.goals.exchange import PlanAnswer, SeenGround
+from monstertruck_planners.goals.exchange import SeenGround
+from monstertruck_planners.pose_path import PosePath
 
 SOON: Final = 5.0
 """Time before a route begins, s."""
@@ -51,23 +52,23 @@ class Unseen:
         """Places that count as unseen now, in base at ``pose``, shape (n, 2), m."""
         return points_relative(self.places[self.left < SOON], pose)
 
-    def met(self, answer: PlanAnswer, obstacles: DistanceField) -> Array:
+    def met(self, path: PosePath, obstacles: DistanceField) -> Array:
         """Unseen places at and near the first pose at which a path backs onto one; shape (k, 2), m; empty if none.
 
         Args:
-            answer: the path.
+            path: of the base.
             obstacles: of the map, which block the lidar's view.
         """
         places, left = self.places, self.left
-        if answer.poses is None or answer.directions is None or not (answer.directions < 0).any():
+        if not (path.directions < 0).any():
             return np.empty((0, 2))
-        stood = rectangle_distance(self.footprint, answer.poses[:1], places)[0] < BESIDE
+        stood = rectangle_distance(self.footprint, path.poses[:1], places)[0] < BESIDE
         places, left, looked = places[~stood], left[~stood], -math.inf
-        last = int(np.flatnonzero(answer.directions < 0)[-1])
-        steps = np.diff(answer.poses, axis=0, prepend=answer.poses[:1])
+        last = int(np.flatnonzero(path.directions < 0)[-1])
+        steps = np.diff(path.poses, axis=0, prepend=path.poses[:1])
         travelled = np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))
         changed = travelled + np.cumsum(np.abs(steps[:, 2]))
-        on_path = zip(answer.poses[: last + 1], answer.directions, travelled, changed, strict=False)
+        on_path = zip(path.poses[: last + 1], path.directions, travelled, changed, strict=False)
         for pose, direction, along, change in on_path:
             gaps = rectangle_distance(self.footprint, pose[None], places)[0]
             unseen = left < SOON + along / PACE

@@ -1,4 +1,4 @@
-"""Interface of the local planners: path of poses, state, result. Loads numba.
+"""Interface of the local planners: state and result. Loads numba.
 
 Poses belong to the vehicle's reference point, as in the route planners: the rear axle's middle with front steering.
 """
@@ -13,58 +13,13 @@ from numpy.typing import ArrayLike
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath
-from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 
 CUSP_REACHED = 0.1
 """Nearer than this to a cusp of its band the truck continues with what follows, m."""
-
-
-@dataclass(frozen=True)
-class PosePath:
-    """Poses to be driven in order: a route, or an elastic band.
-
-    Args:
-        poses: shape (n, 3), x, y, yaw of the reference point, n at least 1.
-        directions: shape (n,), +1 where the truck arrives forward, -1 backward.
-
-    Raises:
-        InputError: shapes or numbers that are no path.
-    """
-
-    poses: Array
-    directions: Array
-
-    def __post_init__(self) -> None:
-        poses, directions = np.asarray(self.poses, dtype=np.float64), np.asarray(self.directions, dtype=np.float64)
-        if poses.ndim != 2 or poses.shape[1] != 3 or not len(poses) or directions.shape != (len(poses),):
-            raise InputError(f"path of {poses.shape} poses, {directions.shape} directions: expected (n, 3) and (n,)")
-        if not np.isfinite(poses).all() or not (np.abs(directions) == 1.0).all():
-            raise InputError("path of poses: expected finite poses and directions of +1 or -1")
-        object.__setattr__(self, "poses", poses)
-        object.__setattr__(self, "directions", directions)
-
-    @classmethod
-    def from_motion(cls, path: MotionPath, step: float = 0.08) -> "PosePath":
-        """Poses along a drivable path, one every ``step`` metres."""
-        samples = path.sample(step)
-        return cls(samples.poses, samples.direction)
-
-    def part(self, begin: int, end: int) -> "PosePath":
-        """Poses begin to end - 1."""
-        return PosePath(self.poses[begin:end], self.directions[begin:end])
-
-    def then(self, other: "PosePath") -> "PosePath":
-        """These poses and then the other ones."""
-        return PosePath(np.vstack((self.poses, other.poses)), np.concatenate((self.directions, other.directions)))
-
-    @property
-    def travelled(self) -> Array:
-        """Metres from the first pose to each."""
-        steps = np.hypot(*np.diff(self.poses[:, :2], axis=0).T)
-        return np.concatenate(([0.0], np.cumsum(steps)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,13 +18,13 @@ from monstertruck_planners.local.api import (
     CUSP_REACHED,
     LocalPlan,
     LocalPlannerState,
-    PosePath,
     direction_runs,
     nearest_pose,
     pose_distance,
 )
 from monstertruck_planners.local.config import LocalPlannerConfig
 from monstertruck_planners.local.elastic_band import CoveringDiscs, clearance, cover_footprint
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import RESOLUTIONS, HybridPlanner
@@ -211,7 +211,7 @@ class LocalPlannerCore:
         path, reason = self._search_to(obstacles, pose, goal)
         if path is None:
             return None, None, reason
-        found = PosePath.from_motion(path)
+        found = path.along()
         rest = band.part(last + 1, len(band.poses)) if last + 1 < len(band.poses) else None
         return path, found if rest is None else found.then(rest), Reason.OK
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DiscFootprint, DistanceField, Footprint
 from monstertruck_planners.collision_kernels import FieldData
-from monstertruck_planners.local.api import PosePath
 from monstertruck_planners.local.config import BandConfig
+from monstertruck_planners.pose_path import PosePath
 
 BoolArray = NDArray[np.bool_]
 

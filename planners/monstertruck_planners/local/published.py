@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DiscFootprint, DistanceField
 from monstertruck_planners.local import elastic_band
-from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath
+from monstertruck_planners.local.api import LocalPlan, LocalPlannerState
 from monstertruck_planners.local.config import BandConfig, PublishedConfig
 from monstertruck_planners.local.core import LocalPlannerCore, checked_pose, ends_at
 from monstertruck_planners.local.elastic_band import band_parameters, relax_band
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import MotionPath, joined, moved

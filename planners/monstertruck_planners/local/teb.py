@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
 from monstertruck_planners.collision_kernels import FieldData
-from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, PosePath, direction_runs
+from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, direction_runs
 from monstertruck_planners.local.config import TebConfig
 from monstertruck_planners.local.core import (
     LocalPlannerCore,
@@ -34,6 +34,7 @@ from monstertruck_planners.local.core import (
     starting_at,
 )
 from monstertruck_planners.local.elastic_band import CoveringDiscs, band_parameters, distance_and_gradient, relax_band
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_schemas.reasons import Reason
@@ -364,13 +365,13 @@ class TebPlanner:
             if found is None:
                 result = self._core.partial(state, obstacles, robot_pose, rest, why)
                 return replace(result, statistics=statistics)
-            path = self._optimised(PosePath.from_motion(found, self.config.spacing), obstacles, statistics) or found
+            path = self._optimised(found.along(self.config.spacing), obstacles, statistics) or found
             ahead = way or ahead
         done = state.final and ends_at(path, route.poses[-1])
         end = ahead.poses[-1]
         # 0.05: a path that ends further from its band's end is only a part of it, m
         whole = math.hypot(*(path.end - end)[:2]) < 0.05
-        band = PosePath.from_motion(path, self.config.spacing) if whole else ahead
+        band = path.along(self.config.spacing) if whole else ahead
         after = replace(state, band=band, path=path, failed=0)
         return LocalPlan(Reason.OK, after, path, done, statistics=statistics)
 

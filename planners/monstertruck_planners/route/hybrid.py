@@ -64,7 +64,8 @@ from monstertruck_planners.route.search import (
     segments_cost,
     segments_free,
 )
-from monstertruck_planners.route.smoothing import EditablePath, choose_headings, current_segments, editable, shortcut
+from monstertruck_planners.route.segment_buffer import SegmentBuffer, current_segments, editable
+from monstertruck_planners.route.smoothing import choose_headings, shortcut
 from monstertruck_schemas.plan import MAX_RUNS
 from monstertruck_schemas.reasons import Reason
 
@@ -775,7 +776,7 @@ class _PlanningRun:
         segments = current_segments(path).copy()
         return segments, self._cost(segments)
 
-    def _shortcut(self, path: EditablePath, gain: float = 1e-3, shift: float = 0.25) -> None:
+    def _shortcut(self, path: SegmentBuffer, gain: float = 1e-3, shift: float = 0.25) -> None:
         """Shortcut trials until a batch gains less than a share of the cost."""
         last, reach = np.inf, 40.0 * self.vehicle.radius
         batch = 1000  # smoothing trials between two checks of the budget

@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import Path, Steering
 
@@ -177,6 +178,17 @@ class MotionPath:
         segments = self.segments[index] if len(self.segments) else np.array([[1.0, 0.0, 0.0]])
         return MotionSamples(poses[:, :3], poses[:, 3], segments[:, 1], segments[:, 2], np.sign(segments[:, 0]), index)
 
+    def along(self, step: float = 0.08) -> PosePath:
+        """Poses of the reference point, one every ``step`` metres."""
+        samples = self.sample(step)
+        return PosePath(samples.poses, samples.direction)
+
+    def base_path(self, step: float = 0.05) -> PosePath:
+        """Poses of the base, one every ``step`` metres, with the ways of steering."""
+        samples = self.sample(step)
+        steering = tuple(self.steering[i] for i in samples.segment.tolist()) if self.steering else ()
+        return PosePath(moved(samples.poses, -self.reference), samples.direction, steering)  # type: ignore[arg-type]
+
     def base_poses(self, step: float) -> Array:
         """Poses of the base at the sampled points, shape (m, 3)."""
         return moved(self.sample(step).poses, -self.reference)
@@ -213,15 +225,15 @@ class MotionPath:
 
     def message(self, *, stamp: int, seq: int = 0, frame: str = "map", name: str = "", step: float = 0.05) -> Path:
         """The path of the base as a ``plan/path`` message, sampled every ``step`` metres."""
-        samples = self.sample(step)
+        path = self.base_path(step)
         return Path(
             stamp=stamp,
             received=stamp,
             seq=seq,
             frame=frame,
-            poses=moved(samples.poses, -self.reference).ravel(),
-            directions=samples.direction,
-            steering=tuple(self.steering[i] for i in samples.segment.tolist()) if self.steering else (),  # type: ignore[misc]
+            poses=path.poses.ravel(),
+            directions=path.directions,
+            steering=path.steering,
             name=name,
         )
 

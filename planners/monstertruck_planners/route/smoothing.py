@@ -10,7 +10,6 @@ changes direction.
 """
 
 from math import inf, pi, sqrt
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -18,11 +17,9 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision_kernels import FieldData, FootprintData
-from monstertruck_planners.route.motion import advance
 from monstertruck_planners.route.reeds_shepp import COST, MAX_SEGMENTS, connect
 from monstertruck_planners.route.search import (
     CostLayer,
-    IntArray,
     VehicleMotions,
     count_cusps,
     many_cusps_cost,
@@ -30,137 +27,15 @@ from monstertruck_planners.route.search import (
     segments_cost,
     segments_free,
 )
-
-MIN_SEGMENT = 1e-9
-"""Shorter segments are dropped, m."""
-
-
-class EditablePath(NamedTuple):
-    """A path that is changed in place."""
-
-    segments: Array
-    """Shape (n, 3), of which ``used[0]`` are in use."""
-    poses: Array
-    """Shape (n + 1, 3), before each segment and after the last."""
-    travelled: Array
-    """Shape (n + 1,), m."""
-    used: IntArray
-
-
-@njit(cache=True)
-def _update_poses(path: EditablePath, first: int) -> None:
-    """Compute poses and lengths from segment ``first`` on."""
-    if first == 0:
-        path.travelled[0] = 0.0
-    for i in range(first, path.used[0]):
-        length = path.segments[i, 0]
-        x, y, yaw = advance(
-            path.poses[i, 0], path.poses[i, 1], path.poses[i, 2], length, path.segments[i, 1], path.segments[i, 2]
-        )
-        path.poses[i + 1, 0], path.poses[i + 1, 1], path.poses[i + 1, 2] = x, y, yaw
-        path.travelled[i + 1] = path.travelled[i] + abs(length)
-
-
-@njit(cache=True)
-def _segment_at(path: EditablePath, s: float) -> int:
-    low, high = 0, path.used[0] - 1
-    while low < high:
-        middle = (low + high) >> 1
-        if path.travelled[middle + 1] > s:
-            high = middle
-        else:
-            low = middle + 1
-    return low
-
-
-@njit(cache=True)
-def _pose_at(path: EditablePath, i: int, s: float, out: Array) -> None:
-    part = min(s - path.travelled[i], abs(path.segments[i, 0]))
-    if path.segments[i, 0] < 0.0:
-        part = -part
-    x, y, yaw = advance(
-        path.poses[i, 0], path.poses[i, 1], path.poses[i, 2], part, path.segments[i, 1], path.segments[i, 2]
-    )
-    out[0], out[1], out[2] = x, y, yaw
-
-
-@njit(cache=True)
-def _append(out: Array, used: int, length: float, curvature: float, sideslip: float) -> int:
-    """Add a segment; one that continues the last one makes that longer."""
-    if abs(length) < MIN_SEGMENT:
-        return used
-    if used > 0:
-        k = used - 1
-        same = abs(out[k, 1] - curvature) < 1e-12 and abs(out[k, 2] - sideslip) < 1e-12
-        if same and out[k, 0] * length > 0.0:
-            out[k, 0] += length
-            return used
-    out[used, 0], out[used, 1], out[used, 2] = length, curvature, sideslip
-    return used + 1
-
-
-@njit(cache=True)
-def _merge_alike(path: EditablePath) -> None:
-    """Join segments that continue each other, and compute all poses."""
-    used = 0
-    for k in range(path.used[0]):
-        used = _append(path.segments, used, path.segments[k, 0], path.segments[k, 1], path.segments[k, 2])
-    path.used[0] = used
-    _update_poses(path, 0)
-
-
-def editable(start: Array, segments: Array) -> EditablePath:
-    """An editable path of these segments, with room for more."""
-    room = len(segments) + 400
-    path = EditablePath(np.empty((room, 3)), np.empty((room + 1, 3)), np.empty(room + 1), np.array([len(segments)]))
-    path.segments[: len(segments)] = segments
-    path.poses[0] = start
-    _merge_alike(path)
-    return path
-
-
-def current_segments(path: EditablePath) -> Array:
-    """Segments in use, shape (n, 3), not copied."""
-    return path.segments[: path.used[0]]
-
-
-@njit(cache=True)
-def _splice(
-    path: EditablePath, begin: float, i: int, end: float, j: int, middle: Array, many: int, spare: Array
-) -> None:
-    """Replace the stretch from ``begin`` (in segment i) to ``end`` (in segment j)."""
-    used = 0
-    first = max(i - 1, 0)
-    # Segments before the stretch stay; the last of them may grow.
-    for k in range(first, i):
-        used = _append(spare, used, path.segments[k, 0], path.segments[k, 1], path.segments[k, 2])
-    sign = 1.0 if path.segments[i, 0] > 0.0 else -1.0
-    used = _append(spare, used, sign * (begin - path.travelled[i]), path.segments[i, 1], path.segments[i, 2])
-    for k in range(many):
-        used = _append(spare, used, middle[k, 0], middle[k, 1], middle[k, 2])
-    sign = 1.0 if path.segments[j, 0] > 0.0 else -1.0
-    used = _append(spare, used, sign * (path.travelled[j + 1] - end), path.segments[j, 1], path.segments[j, 2])
-    for k in range(j + 1, path.used[0]):
-        used = _append(spare, used, path.segments[k, 0], path.segments[k, 1], path.segments[k, 2])
-    if first + used > len(path.segments):
-        return
-    for k in range(used):
-        path.segments[first + k, 0] = spare[k, 0]
-        path.segments[first + k, 1] = spare[k, 1]
-        path.segments[first + k, 2] = spare[k, 2]
-    path.used[0] = first + used
-    _update_poses(path, first)
-
-
-@njit(cache=True)
-def _stretch_segments(path: EditablePath, begin: float, i: int, end: float, j: int, out: Array) -> int:
-    """Segments of a stretch; returns their number."""
-    used = 0
-    for k in range(i, j + 1):
-        low, high = max(begin - path.travelled[k], 0.0), min(end, path.travelled[k + 1]) - path.travelled[k]
-        sign = 1.0 if path.segments[k, 0] > 0.0 else -1.0
-        used = _append(out, used, sign * (high - low), path.segments[k, 1], path.segments[k, 2])
-    return used
+from monstertruck_planners.route.segment_buffer import (
+    MIN_SEGMENT,
+    SegmentBuffer,
+    pose_at,
+    restore,
+    segment_at,
+    splice,
+    stretch_segments,
+)
 
 
 @njit(cache=True)
@@ -172,7 +47,7 @@ def _cusps_with_ends(segments: Array, count: int, before: float, after: float) -
 
 
 @njit(cache=True)
-def _around(path: EditablePath, begin: float, i: int, end: float, j: int) -> tuple[float, float]:
+def _around(path: SegmentBuffer, begin: float, i: int, end: float, j: int) -> tuple[float, float]:
     """Directions (sign; 0: none) before and after the stretch from ``begin`` (in segment i) to ``end`` (in j)."""
     before, after = path.segments[i, 0], path.segments[j, 0]
     if begin - path.travelled[i] <= MIN_SEGMENT:
@@ -183,16 +58,8 @@ def _around(path: EditablePath, begin: float, i: int, end: float, j: int) -> tup
 
 
 @njit(cache=True)
-def _whole_cost(field: FieldData, layer: CostLayer, model: VehicleMotions, path: EditablePath) -> float:
+def _whole_cost(field: FieldData, layer: CostLayer, model: VehicleMotions, path: SegmentBuffer) -> float:
     return route_cost(field, layer, model, path.poses[0], path.segments[: path.used[0]])
-
-
-@njit(cache=True)
-def _restore(path: EditablePath, segments: Array, used: int) -> None:
-    """The segments from before a trial."""
-    path.segments[:used] = segments[:used]
-    path.used[0] = used
-    _update_poses(path, 0)
 
 
 @njit(cache=True)
@@ -201,7 +68,7 @@ def shortcut(
     footprint: FootprintData,
     layer: CostLayer,
     model: VehicleMotions,
-    path: EditablePath,
+    path: SegmentBuffer,
     reach: float,
     shift: float,
     random: Array,
@@ -236,11 +103,11 @@ def shortcut(
         begin = max(begin, 0.0)
         if end - begin < 0.01:
             continue
-        i, j = _segment_at(path, begin), _segment_at(path, end)
-        _pose_at(path, i, begin, a)
-        _pose_at(path, j, end, b)
+        i, j = segment_at(path, begin), segment_at(path, end)
+        pose_at(path, i, begin, a)
+        pose_at(path, j, end, b)
         before, after = _around(path, begin, i, end, j)
-        count = _stretch_segments(path, begin, i, end, j, old)
+        count = stretch_segments(path, begin, i, end, j, old)
         present = segments_cost(field, layer, model, a, old, count, before)
         if after * old[count - 1, 0] < 0.0:
             present += model.weights[1] * model.radius
@@ -253,7 +120,7 @@ def shortcut(
                 continue
         else:
             middle = 0.5 * (begin + end)
-            _pose_at(path, _segment_at(path, middle), middle, q)
+            pose_at(path, segment_at(path, middle), middle, q)
             size = shift * (end - begin) * random[n, 3] ** 2
             q[0] += size * (2.0 * random[n, 4] - 1.0)
             q[1] += size * (2.0 * random[n, 5] - 1.0)
@@ -278,10 +145,10 @@ def shortcut(
         # Costs are summed at places along each segment, so those of a stretch are not quite its share of the route's.
         used = path.used[0]
         before_trial[:used] = path.segments[:used]
-        _splice(path, begin, i, end, j, new, many, spare)
+        splice(path, begin, i, end, j, new, many, spare)
         changed = _whole_cost(field, layer, model, path)
         if changed >= whole - 1e-6:
-            _restore(path, before_trial, used)
+            restore(path, before_trial, used)
             continue
         whole = changed
         cusps = count_cusps(path.segments, path.used[0], 0.0)

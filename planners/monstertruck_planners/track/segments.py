@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.pose_path import stops
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import MAX_COORDINATE, MAX_POSES, MAX_RUNS, Path, Steering
 from monstertruck_schemas.reasons import Reason
@@ -326,29 +327,6 @@ def _segments(steps: PathSteps, beyond: float, *, closed: bool) -> tuple[Segment
         segments.append(segment)
         before += segment.length
     return tuple(segments)
-
-
-def stops(directions: Array, steering: tuple[Steering, ...]) -> NDArray[np.bool_]:
-    """Whether the truck has to come to rest between each two steps.
-
-    Args:
-        directions: shape (n,), +1 or -1 of each step.
-        steering: of each step, or empty.
-
-    Returns:
-        Shape (n - 1,).
-    """
-    at_rest: NDArray[np.bool_] = np.diff(directions) != 0.0
-    if len(at_rest):
-        for i, (before, after) in enumerate(pairwise(steering)):
-            if before != after and _must_stand(before, after):
-                at_rest[i] = True
-    return at_rest
-
-
-def _must_stand(before: Steering, after: Steering) -> bool:
-    """Whether the axles turn so far between two different ways of steering that the truck has to stand meanwhile."""
-    return "crab" in (before, after) and "hybrid" not in (before, after)
 
 
 def _reach(points: Array, beyond: float) -> int:

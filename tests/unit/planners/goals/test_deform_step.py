@@ -10,8 +10,9 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.deform_step import DeformStep, blind_beams
-from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, LocalRoute, Setup
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Setup
 from monstertruck_planners.local.config import RsbandConfig
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
@@ -56,8 +57,8 @@ def begun(route: np.ndarray = ROUTE, directions: np.ndarray | None = None) -> tu
     """A step, and its first task."""
     config = PlannerConfig(local_planner=RsbandConfig())
     setup = Setup(config, FourWheelSteering(), Footprint(), ORIGIN)
-    way = LocalRoute(1, route, np.ones(len(route)) if directions is None else directions)
-    return DeformStep(), DeformTask(scan_of(ORIGIN), ORIGIN, setup, room(), way)
+    way = PosePath(route, np.ones(len(route)) if directions is None else directions)
+    return DeformStep(), DeformTask(scan_of(ORIGIN), ORIGIN, setup, room(), way, 1)
 
 
 def drive(step: DeformStep, until: str, *boxes: Box) -> tuple[DeformAnswer, set[str], tuple[float, float, float]]:
@@ -69,7 +70,6 @@ def drive(step: DeformStep, until: str, *boxes: Box) -> tuple[DeformAnswer, set[
         if answer.finding == until:
             return answer, found, pose
         if answer.path is not None:
-            assert answer.path.poses is not None
             path = answer.path.poses
         path = path[min(2, len(path) - 1) :]
         pose = (float(path[0, 0]), float(path[0, 1]), float(path[0, 2]))
@@ -109,7 +109,6 @@ def test_what_stands_on_the_route_is_passed_and_then_the_route_is_driven_again()
     answer = step.step(DeformTask(scan_of(ORIGIN, box), ORIGIN))
     assert (answer.finding, answer.path is not None) == ("new", True)
     assert answer.path is not None
-    assert answer.path.poses is not None
     assert np.abs(answer.path.poses[0] - ORIGIN).max() < 1e-6, "from the truck on"
     answer, found, pose = drive(step, "free", box)
     assert found == {"kept", "new", "free"}
@@ -143,12 +142,12 @@ def test_a_route_does_not_back_into_what_was_seen_before_the_truck_turned_away()
     back = np.column_stack((np.arange(0.4, 3.01, 0.05), np.zeros(53), np.full(53, math.pi)))
     step.step(first)
     step.step(DeformTask(scan_of(ORIGIN, box), ORIGIN))
-    route = LocalRoute(2, back, -np.ones(len(back)))
-    answer = step.step(DeformTask(scan_of(away, box), away, route=route))
+    route = PosePath(back, -np.ones(len(back)))
+    answer = step.step(DeformTask(scan_of(away, box), away, route=route, number=2))
     assert answer.finding != "free"
     never, first = begun()
     never.step(first)
-    assert never.step(DeformTask(scan_of(away, box), away, route=route)).finding == "free", "it saw nothing"
+    assert never.step(DeformTask(scan_of(away, box), away, route=route, number=2)).finding == "free", "it saw nothing"
 
 
 def test_single_beams_that_fail_hide_nothing():
@@ -167,7 +166,7 @@ def test_where_there_is_no_way_round_the_beginning_is_driven_and_then_it_is_bloc
     assert answer.text
     assert "new" in found
     assert 0.5 < pose[0] < 1.6 - 0.235, "as far as it is free"
-    step.step(DeformTask(scan_of(pose), pose, route=LocalRoute(2, ROUTE, np.ones(81))))
+    step.step(DeformTask(scan_of(pose), pose, route=PosePath(ROUTE, np.ones(81)), number=2))
     answer = step.step(DeformTask(scan_of(pose), pose))
     assert (answer.number, answer.finding) == (2, "free"), "what went away is forgotten"
 

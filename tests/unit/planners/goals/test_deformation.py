@@ -11,8 +11,9 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.deformation import RouteDeformation, event_of
-from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Finding, PlanAnswer, Setup
+from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Finding, RouteAnswer, Setup
 from monstertruck_planners.local.config import RsbandConfig
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import WorkerError
 from monstertruck_runtime.mailbox import Mailbox, latest
@@ -22,7 +23,7 @@ from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Odometry
 
 POSES = np.column_stack((np.linspace(0.0, 2.0, 21), np.zeros(21), np.zeros(21)))
-ROUTE = PlanAnswer(Reason.OK, "", POSES, np.ones(21), ("counter",) * 21, 2.0, 2.0)
+ROUTE = RouteAnswer(Reason.OK, "", PosePath(POSES, np.ones(21), ("counter",) * 21), 2.0, 2.0)
 FREE, BLOCKED = DeformAnswer(1, "free", complete=True), DeformAnswer(1, "blocked", Reason.PATH_BLOCKED)
 
 
@@ -155,8 +156,7 @@ def test_a_detour_without_end_is_blocked_too():
         await stage.scan(60)
         assert stage.deformation.blocked(stage.clock.now())
         assert stage.deformation.left == pytest.approx(1.3)
-        rest = stage.deformation.rest()
-        assert rest.poses is not None
+        rest = stage.deformation.rest
         assert (rest.poses[0, 0], len(rest.steering)) == (pytest.approx(0.7), 14)
 
     play(story)

@@ -15,10 +15,11 @@ from monstertruck_planners.collision import Footprint, clearance_to_points
 from monstertruck_planners.goals import goal_run
 from monstertruck_planners.goals.config import EscapeConfig, PlannerConfig
 from monstertruck_planners.goals.escape import blocked_sides, escape
-from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, SeenScan, Setup
+from monstertruck_planners.goals.exchange import PlanTask, RouteAnswer, SeenScan, Setup
 from monstertruck_planners.goals.goal_run import Action, Follow, GoalRun, Halt, Observations, Plan, Report
 from monstertruck_planners.goals.path_publisher import kept_poses, path_blocked, poses_ahead
-from monstertruck_planners.goals.plan_step import PlanningStep, shortened, stop_poses
+from monstertruck_planners.goals.plan_step import PlanningStep, shortened
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.config import HybridConfig, LatticeConfig
 from monstertruck_planners.track.segments import check_path
 from monstertruck_runtime.errors import InputError
@@ -30,7 +31,7 @@ from monstertruck_schemas.state import Grid
 
 GOAL = (2.0, 0.0, 0.0)
 CONFIG = PlannerConfig()
-WAY = PlanAnswer(Reason.OK, poses=np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), directions=np.ones(2), length=2.0)
+WAY = RouteAnswer(Reason.OK, path=PosePath(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), np.ones(2)), length=2.0)
 
 
 class SteppedRun:
@@ -84,7 +85,7 @@ def test_a_goal_is_planned_followed_and_reached():
 )
 def test_a_goal_without_a_way_is_refused_at_once(reason: Reason):
     run = SteppedRun()
-    run.step(answer=PlanAnswer(reason, "why"))
+    run.step(answer=RouteAnswer(reason, "why"))
     assert (run.run.outcome, run.run.text, run.run.recoveries) == (reason, "why", 0)
 
 
@@ -102,7 +103,7 @@ def test_an_end_beside_the_goal_is_planned_again_but_not_for_ever():
 def test_a_goal_where_the_truck_stands_is_reached_without_driving():
     here = (1.0, 1.5, 0.0)
     answer = PlanningStep().step(task(goal=(1.0, 1.5, 1e-9), setup=setup(), grid=hall()))
-    assert answer.poses is not None
+    assert answer.path is not None
     run = SteppedRun()
     run.run = replace(run.run, goal=here)
     actions = run.step(answer=answer, pose=here)
@@ -198,9 +199,9 @@ def test_the_recovery_behaviours_are_tried_in_order_and_then_the_goal_is_given_u
     run.step(stuck)
     assert run.phase is GoalPhase.WAITING
     assert Plan() in run.step(round(CONFIG.wait / 0.1) + 2)
-    run.step(answer=PlanAnswer(Reason.GOAL_UNREACHABLE, "walled in"))
+    run.step(answer=RouteAnswer(Reason.GOAL_UNREACHABLE, "walled in"))
     assert (run.phase, run.run.recoveries) == (GoalPhase.PLANNING, 4)
-    run.step(answer=PlanAnswer(Reason.GOAL_UNREACHABLE, "walled in"))
+    run.step(answer=RouteAnswer(Reason.GOAL_UNREACHABLE, "walled in"))
     assert (run.run.outcome, run.run.text) == (Reason.GOAL_UNREACHABLE, "walled in")
 
 
@@ -226,15 +227,15 @@ def test_driving_to_and_fro_between_two_ways_that_are_blocked_ends():
         if run.phase is GoalPhase.WAITING:
             run.step(round(CONFIG.wait / 0.1) + 2)
         elif run.run.planned == "escape":
-            run.step(answer=PlanAnswer(Reason.STUCK))
+            run.step(answer=RouteAnswer(Reason.STUCK))
             run.step(round(CONFIG.wait / 0.1) + 2)
     assert (run.run.outcome, run.run.recoveries) == (Reason.STUCK, 4)
 
 
 def test_a_failed_escape_is_the_next_recovery_behaviour():
     run = SteppedRun(PlannerConfig(recovery=("back_out", "wait")))
-    run.step(answer=PlanAnswer(Reason.START_BLOCKED))
-    run.step(answer=PlanAnswer(Reason.STUCK, "both ends"))
+    run.step(answer=RouteAnswer(Reason.START_BLOCKED))
+    run.step(answer=RouteAnswer(Reason.STUCK, "both ends"))
     assert run.phase is GoalPhase.WAITING
 
 
@@ -346,16 +347,15 @@ def test_frames_there_and_back():
 
 
 def test_the_way_ahead_is_blocked_by_what_stands_on_it_only():
-    poses = np.column_stack((np.linspace(1.0, 5.0, 81), np.ones(81), np.zeros(81)))
-    travelled = poses[:, 0] - 1.0
+    path = PosePath(np.column_stack((np.linspace(1.0, 5.0, 81), np.ones(81), np.zeros(81))), np.ones(81))
     at = (2.0, 1.0, 0.0)
-    way = poses_ahead(poses, travelled, 1.0, 1.5, at)
+    way = poses_ahead(path, 1.0, 1.5, at)
     assert way[0].tolist() == list(at)
     assert way[-1, 0] == pytest.approx(3.5, abs=0.06)
     assert path_blocked(BODY, way, np.array([[1.0, 0.1]]), at)
     assert not path_blocked(BODY, way, np.array([[1.0, 0.3], [2.5, 0.0]]), at)
     assert not path_blocked(BODY, way, np.empty((0, 2)), at)
-    none = np.zeros(0, np.intp)
+    none, travelled = np.zeros(0, np.intp), path.travelled
     assert travelled[kept_poses(travelled, 1.0, 0.2, none)][[0, -1]] == pytest.approx([1.0, 1.2], abs=0.06)
     assert kept_poses(travelled, 0.0, 0.0, none) == slice(0, 2)
     assert len(travelled[kept_poses(travelled, travelled[-1] + 1.0, 0.0, none)]) == 2
@@ -389,14 +389,14 @@ def task(goal=(4.5, 1.5, 0.0), points=(), **fields: Any) -> PlanTask:
 def test_routes_round_what_the_scan_shows_until_that_is_forgotten(route):
     step = PlanningStep()
     straight = step.step(task(setup=setup(route=route), grid=hall()))
-    assert straight.poses is not None
+    assert straight.path is not None
     assert straight.length == pytest.approx(3.5, abs=0.05)
     post = [(2.75, y) for y in np.arange(1.3, 1.75, 0.05)]
-    assert straight.poses is not None
+    assert straight.path is not None
     round_it = step.step(task(points=post))
     assert round_it.length > straight.length + 0.02
-    assert round_it.poses is not None
-    assert clearance_to_points(BODY, round_it.poses, np.array(post)).min() > 0.0
+    assert round_it.path is not None
+    assert clearance_to_points(BODY, round_it.path.poses, np.array(post)).min() > 0.0
     assert step.step(task()).length > straight.length + 0.02, "remembered"
     assert step.step(task(clear=True)).length == pytest.approx(straight.length, abs=0.05)
 
@@ -407,9 +407,9 @@ def test_what_scans_on_the_way_showed_counts_though_the_newest_does_not():
     post = np.array([(2.75, y) for y in np.arange(1.3, 1.75, 0.05)])
     sensor = np.array([1.0, 1.5])
     round_it = step.step(task(seen=(SeenScan(post, sensor),)))
-    assert round_it.poses is not None
+    assert round_it.path is not None
     assert round_it.length > straight.length + 0.02
-    assert clearance_to_points(BODY, round_it.poses, post).min() > 0.0
+    assert clearance_to_points(BODY, round_it.path.poses, post).min() > 0.0
     beyond = np.array([(5.95, y) for y in np.arange(0.5, 2.5, 0.01)])
     gone = step.step(task(seen=(SeenScan(post, sensor), SeenScan(beyond, sensor)), afresh=True))
     assert gone.length == pytest.approx(straight.length, abs=0.05), "a later one saw through"
@@ -421,13 +421,13 @@ def test_what_no_scan_sees_behind_the_truck_is_not_forgotten():
     wall = [(1.33, y) for y in np.arange(1.2, 1.8, 0.05)]
     step.step(task(setup=setup(), grid=hall(), points=post))
     out = step.step(task(what="escape", points=wall, clear=True))
-    assert out.poses is not None
-    assert 0.04 < 1.0 - out.poses[-1, 0] < 0.35, "not through the post"
+    assert out.path is not None
+    assert 0.04 < 1.0 - out.path.poses[-1, 0] < 0.35, "not through the post"
     gone = step.step(task(what="escape", pose=(3.0, 1.5, 0.0), points=[(x + 2.0, y) for x, y in wall], clear=True))
-    assert gone.poses is not None
+    assert gone.path is not None
     back = step.step(task(what="escape", points=wall))
-    assert back.poses is not None
-    assert 0.04 < 1.0 - back.poses[-1, 0] < 0.35, "cleared from afar, and seen through by no scan"
+    assert back.path is not None
+    assert 0.04 < 1.0 - back.path.poses[-1, 0] < 0.35, "cleared from afar, and seen through by no scan"
 
 
 def test_what_was_cleared_from_afar_is_driven_at_forward_and_not_backed_into():
@@ -466,15 +466,15 @@ def test_a_valid_route_is_kept():
     assert not step.step(task(setup=setup(), grid=hall())).kept
     again = step.step(task(pose=(1.5, 1.52, 0.02)))
     assert again.kept
-    assert again.poses is not None
-    assert np.allclose(again.poses[0], (1.5, 1.52, 0.02))
+    assert again.path is not None
+    assert np.allclose(again.path.poses[0], (1.5, 1.52, 0.02))
 
 
 def test_a_map_that_cannot_be_read_is_named_until_there_is_another_one(tmp_path: pathlib.Path):
     (tmp_path / "map.yaml").write_text("image: [")
     step = PlanningStep()
     answer = step.step(task(setup=setup(map=tmp_path / "map.yaml")))
-    assert (answer.reason, answer.poses) == (Reason.BAD_INPUT, None)
+    assert (answer.reason, answer.path) == (Reason.BAD_INPUT, None)
     assert str(tmp_path / "map.yaml") in answer.text
     assert step.step(task(grid=hall())).reason is Reason.OK
 
@@ -492,18 +492,18 @@ def test_goals_without_a_way_and_what_is_missing():
 
 def test_a_truck_that_stands_within_the_margin_may_leave():
     step = PlanningStep()
-    assert step.step(task(setup=setup(), grid=hall(), pose=(1.0, 0.25, 0.0))).poses is not None
+    assert step.step(task(setup=setup(), grid=hall(), pose=(1.0, 0.25, 0.0))).path is not None
 
 
 def test_backing_out_sees_the_map_behind_the_truck_too():
     step = PlanningStep()
     wall = [(1.33, y) for y in np.arange(1.2, 1.8, 0.05)]
     out = step.step(task(what="escape", setup=setup(), grid=hall(), points=wall))
-    assert out.poses is not None
-    assert out.poses is not None
-    assert np.allclose(out.poses[-1], (0.5, 1.5, 0.0), atol=0.03)
+    assert out.path is not None
+    assert out.path is not None
+    assert np.allclose(out.path.poses[-1], (0.5, 1.5, 0.0), atol=0.03)
     near = step.step(task(what="escape", pose=(0.36, 1.5, 0.0), points=[(x - 0.65, y) for x, y in wall]))
-    assert (near.poses, near.reason) == (None, Reason.STUCK)
+    assert (near.path, near.reason) == (None, Reason.STUCK)
 
 
 def test_waypoints_are_passed_one_by_one_and_asked_for_until_then():
@@ -534,7 +534,7 @@ def test_a_route_over_waypoints_passes_them_and_is_kept_only_as_long_as_it_does(
     at, goal, none = (1.0, 2.0, 0.0), (5.0, 2.0, 0.0), np.empty((0, 2))
 
     def nearest(answer: Any, x: float, y: float) -> float:
-        return float(np.hypot(answer.poses[:, 0] - x, answer.poses[:, 1] - y).min())
+        return float(np.hypot(answer.path.poses[:, 0] - x, answer.path.poses[:, 1] - y).min())
 
     straight = step.step(PlanTask("route", at, goal, none, setup, grid))
     over = step.step(PlanTask("route", at, goal, none, via=((3.0, 3.0, None),)))
@@ -549,35 +549,32 @@ def test_a_route_over_waypoints_passes_them_and_is_kept_only_as_long_as_it_does(
     assert nearest(by_lattice, 3.0, 3.0) < CONFIG.waypoint_radius
 
 
-def zigzag(runs: int, poses: int = 3) -> PlanAnswer:
+def zigzag(runs: int, poses: int = 3) -> RouteAnswer:
     """A drive to and fro, each run of so many poses."""
     x = np.concatenate([[0.0], *(np.linspace(0, 0.1, poses)[1:] if i % 2 == 0 else np.linspace(0.1, 0, poses)[1:]
                                  for i in range(runs))])  # fmt: skip
     directions = np.concatenate(([1.0], np.repeat([1.0 if i % 2 == 0 else -1.0 for i in range(runs)], poses - 1)))
-    return PlanAnswer(
-        Reason.OK, poses=np.column_stack((x, 0 * x, 0 * x)), directions=directions, steering=("counter",) * len(x),
-        length=0.1 * runs,
-    )  # fmt: skip
+    path = PosePath(np.column_stack((x, 0 * x, 0 * x)), directions, ("counter",) * len(x))
+    return RouteAnswer(Reason.OK, path=path, length=0.1 * runs)
 
 
 @pytest.mark.parametrize(
     ("answer", "length"), [(zigzag(64), 6.4), (zigzag(65), 6.4), (zigzag(200), 6.4), (zigzag(10, 1000), 0.5005)]
 )
-def test_a_route_too_long_for_one_path_is_driven_in_parts_that_the_tracker_takes(answer: PlanAnswer, length: float):
+def test_a_route_too_long_for_one_path_is_driven_in_parts_that_the_tracker_takes(answer: RouteAnswer, length: float):
     part = shortened(answer)
     assert part.complete is (answer.length == pytest.approx(length))
     assert part.length == pytest.approx(length, abs=1e-3)
-    assert part.poses is not None
-    assert part.directions is not None
+    assert part.path is not None
     check_path(
         Path(
             stamp=0,
             received=0,
             seq=0,
             frame="map",
-            poses=part.poses.ravel(),
-            directions=part.directions,
-            steering=part.steering,
+            poses=part.path.poses.ravel(),
+            directions=part.path.directions,
+            steering=part.path.steering,
         )
     )
 
@@ -633,6 +630,7 @@ def test_cusps_keep_the_distance_that_the_gate_asks_for_where_they_can():
         setup = Setup(PlannerConfig(route=HybridConfig(effort=5000, margin=0.04)), TRUCK, BODY, cusp_clearance=asked)
         task = PlanTask("route", (2.0, 0.6, 0.0), (2.0, 0.6, math.pi), np.empty((0, 2)), setup, grid)
         answer = PlanningStep().step(task)
-        assert answer.clearance is not None
-        least[asked] = answer.clearance[stop_poses(answer)].min()
+        assert answer.path is not None
+        assert answer.path.clearance is not None
+        least[asked] = answer.path.clearance[answer.path.stops].min()
     assert least[0.0] < 0.07 <= least[0.07] + 1e-9

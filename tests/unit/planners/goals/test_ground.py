@@ -81,6 +81,6 @@ def test_a_route_goes_round_a_rough_patch_if_that_is_not_much_longer(half, round
     straight = step.step(task)
     assert straight.length == pytest.approx(4.0, abs=0.01)
     answer = step.step(PlanTask("route", (1.0, 0.0, 0.0), (5.0, 0.0, 0.0), none, ground=patch, afresh=True))
-    over = (abs(answer.poses[:, 0] - 3.0) < 0.5) & (abs(answer.poses[:, 1]) < half)
+    over = (abs(answer.path.poses[:, 0] - 3.0) < 0.5) & (abs(answer.path.poses[:, 1]) < half)
     assert over.any() != round_it
     assert answer.length < 1.5 * straight.length

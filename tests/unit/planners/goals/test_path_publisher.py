@@ -5,14 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from monstertruck_planners.goals.exchange import PlanAnswer
 from monstertruck_planners.goals.path_publisher import PathPublisher
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.track.segments import SegmentedPath
 from monstertruck_schemas.reasons import Reason
 
 X = np.concatenate((np.arange(21), np.arange(19, -1, -1))) * 0.05
-THERE_AND_BACK = PlanAnswer(
-    Reason.OK,
+THERE_AND_BACK = PosePath(
     poses=np.column_stack((X, np.zeros((len(X), 2)))),
     directions=np.where(np.arange(len(X)) <= 20, 1.0, -1.0),
     steering=("counter",) * len(X),

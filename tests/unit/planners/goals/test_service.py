@@ -131,7 +131,7 @@ def test_a_planner_in_the_loop_that_refuses_its_input_is_an_answer_and_an_event(
     service._actor, service._fresh = Refusing(), False
     service._out = SimpleNamespace(events=lambda *event: reported.append(event))
     answer = asyncio.run(service._ask(None))
-    assert (answer.reason, answer.poses, service._fresh) == (Reason.BAD_INPUT, None, True)
+    assert (answer.reason, answer.path, service._fresh) == (Reason.BAD_INPUT, None, True)
     assert [event[0] for event in reported] == [Reason.BAD_INPUT]
 
 

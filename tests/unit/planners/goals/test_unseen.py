@@ -11,9 +11,10 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import DistanceField, Footprint, rectangle_distance
 from monstertruck_planners.goals.config import EscapeConfig, PlannerConfig
 from monstertruck_planners.goals.escape import escape
-from monstertruck_planners.goals.exchange import PlanAnswer, PlanTask, SeenGround, Setup
+from monstertruck_planners.goals.exchange import PlanTask, RouteAnswer, SeenGround, Setup
 from monstertruck_planners.goals.plan_step import PlanningStep
 from monstertruck_planners.goals.unseen import BESIDE, PACE, SOON, Unseen, unseen_around
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig, LatticeConfig
 from monstertruck_planners.route.hybrid import HybridPlanner
@@ -48,7 +49,7 @@ def survey(*, age: int = 0, pose: Pose2 = HERE) -> SeenGround:
 
 def planned(
     goal: Pose2, seen: SeenGround | None, *, room: np.ndarray | None = None, pose: Pose2 = HERE, route: Any = None
-) -> tuple[PlanAnswer, PlanningStep]:
+) -> tuple[RouteAnswer, PlanningStep]:
     cells = np.zeros((60, 100)) if room is None else room
     config = PlannerConfig(route=route or HybridConfig(margin=0.04, effort=3000, reverse_cost=2.0))
     setup = Setup(config, FourWheelSteering(), FOOTPRINT, LIDAR, seen_for=30.0)
@@ -57,23 +58,24 @@ def planned(
     return step.step(PlanTask("route", pose, goal, none, setup, grid(cells, (0.0, 0.0), "map"), ground_seen=seen)), step
 
 
-def backed_onto(answer: PlanAnswer, seen: SeenGround) -> np.ndarray:
+def backed_onto(path: PosePath | None, seen: SeenGround) -> np.ndarray:
     unseen = unseen_around(seen, 30.0, LIDAR, FOOTPRINT)
-    return unseen.met(answer, DistanceField(np.zeros((60, 100), np.bool_), 0.05))
+    assert path is not None
+    return unseen.met(path, DistanceField(np.zeros((60, 100), np.bool_), 0.05))
 
 
 @pytest.mark.parametrize("route", [None, LatticeConfig(effort=6000)])
 def test_a_goal_behind_is_reached_by_way_of_ground_that_is_seen(route):
     goal = (1.0, 1.5, 0.0)
     free, _ = planned(goal, None, route=route)
-    assert free.directions is not None
-    assert free.directions[0] < 0
-    assert len(backed_onto(free, survey()))
+    assert free.path is not None
+    assert free.path.directions[0] < 0
+    assert len(backed_onto(free.path, survey()))
     answer, _ = planned(goal, survey(), route=route)
     assert answer.reason is Reason.OK, answer.text
-    assert not len(backed_onto(answer, survey()))
-    assert answer.directions is not None
-    assert answer.directions[0] > 0, "forward first"
+    assert not len(backed_onto(answer.path, survey()))
+    assert answer.path is not None
+    assert answer.path.directions[0] > 0, "forward first"
 
 
 def test_where_the_body_stood_and_what_was_seen_lately_may_be_reversed_onto():
@@ -82,8 +84,8 @@ def test_where_the_body_stood_and_what_was_seen_lately_may_be_reversed_onto():
         answer, _ = planned(goal, seen)
         assert answer.reason is Reason.OK
         if seen is everywhere:
-            assert answer.directions is not None
-            assert (answer.directions < 0).all()
+            assert answer.path is not None
+            assert (answer.path.directions < 0).all()
 
 
 def test_before_a_wall_with_nothing_seen_behind_the_goal_is_refused_with_place_and_remedy():
@@ -105,10 +107,10 @@ def test_from_where_no_way_to_the_goal_is_seen_it_drives_to_a_place_that_shows_o
     goal = (1.0, 1.5, 0.0)
     answer, _ = planned(goal, survey(pose=(1.35, 1.5, 0.0)), room=room, pose=(1.35, 1.5, 0.0))
     assert answer.reason is Reason.OK, answer.text
-    assert not len(backed_onto(answer, survey(pose=(1.35, 1.5, 0.0))))
+    assert not len(backed_onto(answer.path, survey(pose=(1.35, 1.5, 0.0))))
 
 
-def path(*legs: tuple[float, float]) -> PlanAnswer:
+def path(*legs: tuple[float, float]) -> PosePath:
     """A path straight on from HERE: metres along, and the direction, of every leg."""
     xs, directions = [0.0], [legs[0][1]]
     for length, direction in legs:
@@ -116,7 +118,7 @@ def path(*legs: tuple[float, float]) -> PlanAnswer:
         xs += (xs[-1] + steps).tolist()
         directions += [direction] * len(steps)
     poses = np.array([(HERE[0] + x, HERE[1], 0.0) for x in xs])
-    return PlanAnswer(Reason.OK, poses=poses, directions=np.array(directions))
+    return PosePath(poses, np.array(directions))
 
 
 @pytest.mark.parametrize(
@@ -145,13 +147,13 @@ def test_walls_hide_ground_from_a_path():
     """It turns to look at what was behind it; a wall before that hides it."""
     turned = np.array([(HERE[0], HERE[1], yaw) for yaw in np.linspace(0.0, math.pi / 2, 10)])
     back = np.array([(HERE[0] - x, HERE[1], 0.0) for x in (0.05, 0.1, 0.15)])
-    answer = PlanAnswer(Reason.OK, poses=np.vstack((turned, back)), directions=np.array([1.0] * 10 + [-1.0] * 3))
+    looking = PosePath(np.vstack((turned, back)), np.array([1.0] * 10 + [-1.0] * 3))
     places = np.array([(HERE[0] - BACK - 0.11, HERE[1])])
     unseen = Unseen(places, np.zeros(1), (0.0, 0.0, 0.0), FIELD, 4.0, FOOTPRINT)
     free = np.zeros((60, 100), np.bool_)
-    assert not len(unseen.met(answer, DistanceField(free, 0.05)))
+    assert not len(unseen.met(looking, DistanceField(free, 0.05)))
     free[25:35, 36] = True  # between the body's middle and its end
-    assert len(unseen.met(answer, DistanceField(free, 0.05)))
+    assert len(unseen.met(looking, DistanceField(free, 0.05)))
 
 
 def test_it_does_not_back_out_onto_unseen_ground():

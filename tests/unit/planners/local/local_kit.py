@@ -3,7 +3,8 @@
 import numpy as np
 
 from monstertruck_planners.collision import DistanceField
-from monstertruck_planners.local.api import LocalPlannerState, PosePath
+from monstertruck_planners.local.api import LocalPlannerState
+from monstertruck_planners.pose_path import PosePath
 
 RES = 0.04
 

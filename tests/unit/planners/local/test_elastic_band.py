@@ -5,9 +5,9 @@ import pytest
 
 from monstertruck_planners.collision import DiscFootprint, Footprint, clearance_to_points
 from monstertruck_planners.local import elastic_band
-from monstertruck_planners.local.api import PosePath
 from monstertruck_planners.local.config import BandConfig
 from monstertruck_planners.local.elastic_band import band_parameters, cover_footprint, relax_band
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_runtime.errors import InputError
 from tests.unit.planners.local.local_kit import RES, line, window
 

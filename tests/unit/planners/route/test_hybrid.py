@@ -9,7 +9,8 @@ from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.hybrid import RESOLUTIONS, HybridPlanner
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_planners.route.replan import KeepPolicy, ViaPoint, plan_through, remaining_route, replan
-from monstertruck_planners.route.smoothing import current_segments, editable, shortcut
+from monstertruck_planners.route.segment_buffer import current_segments, editable
+from monstertruck_planners.route.smoothing import shortcut
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground, room

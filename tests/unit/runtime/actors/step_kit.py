@@ -9,8 +9,9 @@ from monstertruck_planners.collision import Footprint
 from monstertruck_planners.explore.config import TourConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask
 from monstertruck_planners.goals.config import PlannerConfig
-from monstertruck_planners.goals.exchange import DeformTask, LocalRoute, PlanTask, Setup
+from monstertruck_planners.goals.exchange import DeformTask, PlanTask, Setup
 from monstertruck_planners.local.config import RsbandConfig
+from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.steps import CODEC
 from monstertruck_planners.track.config import LqrConfig
@@ -43,7 +44,7 @@ def deform_tasks() -> list[DeformTask]:
         **HEAD, frame="lidar", start_angle=-2.0, end_angle=2.0, time_increment=0.0, scan_time=0.1, range_min=0.02,
         range_max=4.1, ranges=ranges, codes=np.where(np.isfinite(ranges), 255, 0).astype(np.uint8),
     )  # fmt: skip
-    first = DeformTask(scan, (1.0, 1.5, 0.0), setup, room(), LocalRoute(1, poses, np.ones(81)))
+    first = DeformTask(scan, (1.0, 1.5, 0.0), setup, room(), PosePath(poses, np.ones(81)), 1)
     return [first, DeformTask(scan, (1.0, 1.5, 0.0)), DeformTask(scan, (1.02, 1.5, 0.0))]
 
 

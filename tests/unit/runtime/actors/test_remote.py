@@ -9,7 +9,7 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import pytest
 
-from monstertruck_planners.goals.exchange import PlanAnswer
+from monstertruck_planners.goals.exchange import RouteAnswer
 from monstertruck_planners.goals.plan_step import PlanningStep
 from monstertruck_planners.steps import CODEC, STEPS
 from monstertruck_planners.track.service import TrackingWorker, TrackInput
@@ -34,7 +34,7 @@ class Wire:
 
 
 def test_planner_and_tracker_give_the_same_on_another_machine():
-    async def main(clock: Clock) -> tuple[PlanAnswer, list[Any]]:
+    async def main(clock: Clock) -> tuple[RouteAnswer, list[Any]]:
         queue = RemoteWorkQueue(CODEC)
         planning = queue.actor("planning", clock, deadline=60.0, start_timeout=60.0)
         tracking = queue.actor("tracking", clock, deadline=60.0, start_timeout=60.0)
@@ -60,7 +60,7 @@ def test_planner_and_tracker_give_the_same_on_another_machine():
         a, b = numbers(CODEC.to_json(ours)), numbers(CODEC.to_json(theirs))
         assert len(a) == len(b) > 3
         assert np.abs(np.subtract(a, b)).max() < 1e-9
-    assert plan.poses is not None
+    assert plan.path is not None
     assert tracked[-1].command.speed > 0.0
 
 
