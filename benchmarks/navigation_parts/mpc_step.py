@@ -145,7 +145,7 @@ class CasadiMpc(PathTracker[MpcConfig]):
         fine = state.reference.at(state.distances(self._middles))
         furthest = APPROACH * float(state.distances(self._middles[-1:])[0] - state.s)
         speeds = state.speeds(self._middles)
-        path = (fine.slip, fine.heading, fine.turn, state.segment.direction * fine.curvature, self._h * speeds)
+        path = (fine.slip, fine.heading, fine.turn, state.run.direction * fine.curvature, self._h * speeds)
         least = self._gains.at("front", float(speeds[-1]), self.response.lag).least
         side = min(max(state.lateral_error, -furthest), furthest)
         given = np.concatenate(

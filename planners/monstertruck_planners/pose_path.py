@@ -22,6 +22,7 @@ class PosePath:
         directions: shape (n,), +1 where the robot arrives forward, -1 backward.
         steering: n of them, how the axles steer where the robot arrives; none: the tracker's own.
         clearance: shape (n,), distance from the footprint to the nearest obstacle, m; None if not known.
+        speeds: shape (n,), greatest speed, m/s; None if the path sets none.
 
     Raises:
         InputError: shapes or numbers that are no path.
@@ -31,6 +32,7 @@ class PosePath:
     directions: Array
     steering: tuple[Steering, ...] = ()
     clearance: Array | None = None
+    speeds: Array | None = None
 
     def __post_init__(self) -> None:
         poses, directions = np.asarray(self.poses, dtype=np.float64), np.asarray(self.directions, dtype=np.float64)
@@ -56,7 +58,8 @@ class PosePath:
             raise InputError(f"path of {len(message.poses)} numbers: expected rows of x, y, yaw")
         poses = message.poses.reshape(-1, 3)
         directions = message.directions if len(message.directions) else np.ones(len(poses))
-        return cls(poses, directions, message.steering, message.clearance if len(message.clearance) else None)
+        clearance, speeds = (row if len(row) else None for row in (message.clearance, message.speeds))
+        return cls(poses, directions, message.steering, clearance, speeds)
 
     def part(self, begin: int, end: int) -> "PosePath":
         """Poses begin to end - 1."""
@@ -65,10 +68,21 @@ class PosePath:
             self.directions[begin:end],
             self.steering[begin:end],
             None if self.clearance is None else self.clearance[begin:end],
+            None if self.speeds is None else self.speeds[begin:end],
+        )
+
+    def at(self, index: NDArray[np.intp]) -> "PosePath":
+        """Return the poses of these indices, in this order."""
+        return PosePath(
+            self.poses[index],
+            self.directions[index],
+            tuple(self.steering[i] for i in index.tolist()) if self.steering else (),
+            None if self.clearance is None else self.clearance[index],
+            None if self.speeds is None else self.speeds[index],
         )
 
     def then(self, other: "PosePath") -> "PosePath":
-        """These poses and then the other ones; clearance and steering are left out."""
+        """These poses and then the other ones; steering, clearance and speeds are left out."""
         return PosePath(np.vstack((self.poses, other.poses)), np.concatenate((self.directions, other.directions)))
 
     @cached_property

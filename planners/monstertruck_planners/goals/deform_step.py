@@ -156,7 +156,7 @@ class DeformStep:
         self._setup: Setup | None = None
         self._walls: DistanceField | None = None
         self._number = 0
-        """Of the route; 0 = there is none yet."""
+        """Number of the route; 0 before the first one."""
         self._rest: PosePath | None = None
         """The route from where its deformation began; None while it is free."""
 

@@ -97,7 +97,7 @@ class RouteAnswer:
     reason: Reason
     text: str = ""
     path: PosePath | None = None
-    """Of the base; None without one."""
+    """Path of the base, or None."""
     length: float = 0.0
     """Metres."""
     cost: float = 0.0
@@ -120,7 +120,7 @@ class DeformTask:
     setup: Setup | None = None
     grid: Grid | None = None
     route: PosePath | None = None
-    """Of the base, to be deformed."""
+    """Route of the base to deform."""
     number: int = 0
     """Number of this route."""
     drivable: bool = True

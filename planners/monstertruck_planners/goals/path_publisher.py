@@ -62,11 +62,11 @@ class GoalOutputs:
 
 @dataclass(frozen=True)
 class Followed:
-    """What the tracker was given."""
+    """Path that the tracker follows."""
 
     message: Path
     path: PosePath
-    """The same path."""
+    """Content of ``message``."""
     before: float = 0.0
     """Metres driven on the paths that it was deformed from."""
 
@@ -173,6 +173,7 @@ class PathPublisher:
             directions=np.array(path.directions),
             steering=path.steering,
             clearance=np.zeros(0) if path.clearance is None else np.array(path.clearance),
+            speeds=np.zeros(0) if path.speeds is None else np.array(path.speeds),
             halts=halts,
             name=f"{name}.{self._paths}",
         )

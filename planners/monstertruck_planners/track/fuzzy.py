@@ -183,14 +183,14 @@ class Fuzzy(PathTracker[FuzzyConfig]):
 
     def _infer(self, state: TrackingState) -> tuple[FuzzyOutputs, float]:
         """What the rules say, and the direction."""
-        segment, (x, y, yaw) = state.segment, state.pose
-        s = min(state.s + self.config.sub_goal, segment.end)
-        goal = segment.at(s).point
+        run, (x, y, yaw) = state.run, state.pose
+        s = min(state.s + self.config.sub_goal, run.end)
+        goal = run.at(s).point
         dx, dy = goal[0] - x, goal[1] - y
         ahead, aside = math.cos(yaw) * dx + math.sin(yaw) * dy, math.cos(yaw) * dy - math.sin(yaw) * dx
         bearing = math.degrees(math.atan2(aside, ahead))
         orientation = math.degrees(math.remainder(state.reference.state(s).yaw - yaw, math.tau))
         # 120.0: sub-goals at a greater bearing are driven to backward, as published, deg
-        direction = (1.0 if abs(bearing) < 120.0 else -1.0) if self._published else segment.direction
+        direction = (1.0 if abs(bearing) < 120.0 else -1.0) if self._published else run.direction
         inputs = FuzzyInputs(bearing, orientation, math.hypot(dx, dy), aside, direction)
         return self._rules.infer(inputs), direction

@@ -171,7 +171,7 @@ class Mpc(PathTracker[MpcConfig]):
         """Errors along the plan in the path's curved frame; ``steps`` are the metres of the fine steps."""
         furthest = APPROACH * float(state.distances(self._times[-1:])[0] - state.s)
         side, turned = min(max(state.lateral_error, -furthest), furthest), state.heading_error
-        bend = state.segment.direction * reference.curvature
+        bend = state.run.direction * reference.curvature
         sides, yaws = [], []
         rows = np.array((turn, slip - reference.slip, reference.turn, bend, steps)).T.tolist()
         for body_turn, sideways, wanted_turn, curvature, ahead in rows:

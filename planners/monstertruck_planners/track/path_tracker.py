@@ -3,7 +3,7 @@
 Dead time and lag are the configured ones until the truck's turns contradict them, and estimated where none are
 configured (``response``).
 
-A segment ends for good: its successor, with its own direction and steering, begins when the truck has come to rest at
+A run ends for good: its successor, with its own direction and steering, begins when the truck has come to rest at
 the end, and starts to roll when the wheels have turned. No bearing decides the direction, so nothing chatters. Each
 end is judged by the pose at rest: at a cusp by the clearance there, at the end of the path by the tolerances.
 """
@@ -26,10 +26,10 @@ from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.response import Response, ResponseEstimator, choose, rounded
 from monstertruck_planners.track.segments import (
     PathProgress,
+    PathRun,
     Projection,
-    Reference,
     ReferenceState,
-    Segment,
+    RunStates,
     SegmentedPath,
 )
 from monstertruck_schemas.plan import MAX_RUNS, Steering
@@ -217,18 +217,18 @@ class SpeedProfile:
 
     Args:
         config: accelerations, and the distance within which the axles can turn.
-        segment: part of a path, with its speeds.
-        reference: of the segment.
+        run: part of a path, with its speeds.
+        reference: of the run.
     """
 
-    def __init__(self, config: TrackerConfig, segment: Segment, reference: Reference) -> None:
+    def __init__(self, config: TrackerConfig, run: PathRun, reference: RunStates) -> None:
         s = reference.places
         least_curvature = 1e-6  # curvatures (1/m) and turns (rad) are taken to be no smaller
         allowed = config.lateral_acceleration / np.maximum(np.abs(reference.at(s).curvature), least_curvature)
         change = np.maximum(reference.axle_change(config.steering_distance), least_curvature)
         turning = config.steering_distance * config.steering_rate / change
         gained = 2 * config.deceleration * s
-        limits = np.minimum(np.minimum(allowed, turning**2), segment.speeds(s) ** 2)
+        limits = np.minimum(np.minimum(allowed, turning**2), run.speeds(s) ** 2)
         least = np.minimum.accumulate((limits + gained)[::-1])[::-1]
         self._rows = np.column_stack((s, np.maximum(least - gained, 0.0)))
 
@@ -242,17 +242,17 @@ class SpeedProfile:
 
 
 def target_speed(
-    config: TrackerConfig, truck: TruckState, segment: Segment, profile: SpeedProfile, s: float, dead_time: float
+    config: TrackerConfig, truck: TruckState, run: PathRun, profile: SpeedProfile, s: float, dead_time: float
 ) -> float:
-    """Speed along the segment, m/s, at ``s`` metres and acting after ``dead_time`` s; its sign is the direction."""
-    if truck.speed * segment.direction < -config.min_speed:
+    """Speed along the run, m/s, at ``s`` metres and acting after ``dead_time`` s; its sign is the direction."""
+    if truck.speed * run.direction < -config.min_speed:
         return 0.0  # still rolling the other way
-    speed = config.speed if segment.direction > 0 else config.reverse_speed
+    speed = config.speed if run.direction > 0 else config.reverse_speed
     speed *= min(max(truck.clearance, 0.0) / config.slow_clearance, 1.0)
     speed *= speed_share(truck.tilt, config.slow_tilt) * speed_share(truck.roughness, config.slow_roughness)
-    left = segment.length - s - abs(truck.speed) * dead_time
+    left = run.length - s - abs(truck.speed) * dead_time
     speed = min(speed, math.sqrt(2 * config.deceleration * max(left, 0.0)), profile.at(s))
-    return segment.direction * max(speed, config.min_speed)
+    return run.direction * max(speed, config.min_speed)
 
 
 def speed_share(amount: float, limit: float) -> float:
@@ -283,11 +283,11 @@ class TrackingState(NamedTuple):
     """Speed that will be requested, m/s."""
     acceleration: float
     """With which it is reached, m/s^2."""
-    segment: Segment
-    reference: Reference
-    """Along the segment."""
+    run: PathRun
+    reference: RunStates
+    """Along the run."""
     s: float
-    """Metres from the segment's beginning."""
+    """Metres from the run's beginning."""
     steering: Steering
     lateral_error: float
     """Distance left of the reference, seen along ``target.heading``, m."""
@@ -299,10 +299,10 @@ class TrackingState(NamedTuple):
     def speeds(self, times: Array) -> Array:
         """Forward speed after ``times`` seconds: gained, never lost, as braking depends on what lies ahead."""
         size, most = abs(self.speed), max(abs(self.target_speed), abs(self.speed))
-        return self.segment.direction * np.minimum(size + self.acceleration * times, most)
+        return self.run.direction * np.minimum(size + self.acceleration * times, most)
 
     def distances(self, times: Array) -> Array:
-        """Metres from the segment's beginning after ``times`` seconds."""
+        """Metres from the run's beginning after ``times`` seconds."""
         size, most = abs(self.speed), max(abs(self.target_speed), abs(self.speed))
         gaining = np.minimum(times, (most - size) / self.acceleration)
         return self.s + size * times + self.acceleration * gaining * (times - 0.5 * gaining)
@@ -347,7 +347,7 @@ class PathTracker(ABC, Generic[C]):
         self.period = 1.0 / config.rate
         self._stop = min(config.min_speed**2 / (2 * config.deceleration), config.goal_tolerance)
         """Metres before the end at which the truck, then at its slowest, stops."""
-        self._prepared: dict[int, tuple[Segment, Reference, SpeedProfile]] = {}
+        self._prepared: dict[int, tuple[PathRun, RunStates, SpeedProfile]] = {}
 
     def reset(self) -> None:
         """Forget the requests: they were not obeyed."""
@@ -381,12 +381,12 @@ class PathTracker(ABC, Generic[C]):
         """Wanted angles of front and rear axle, rad, not yet limited."""
 
     def prepare(self, path: SegmentedPath, progress: PathProgress) -> bool:
-        """Compute what ``control`` needs of a path's present segment, once; whether that had to be done."""
-        segment = path.segments[progress.segment]
-        known = self._prepared.get(id(segment))
-        if known is not None and known[0] is segment:
+        """Compute what ``control`` needs of a path's present run, once; whether that had to be done."""
+        run = path.runs[progress.run]
+        known = self._prepared.get(id(run))
+        if known is not None and known[0] is run:
             return False
-        self._prepare(segment)
+        self._prepare(run)
         return True
 
     def control(self, truck: TruckState, path: SegmentedPath, progress: PathProgress, t: float) -> Command:
@@ -403,19 +403,19 @@ class PathTracker(ABC, Generic[C]):
             return Command(0.0, *self.axles.requested, progress, 0.0, 0.0, Reason.NOT_FINITE)
         config = self.config
         self._observe(truck, t)
-        segment = path.segments[progress.segment]
-        nearest = self._project(truck, segment, progress.s)
-        ended = self._ended(segment, nearest)
-        last = progress.segment + 1 == len(path.segments)
+        run = path.runs[progress.run]
+        nearest = self._project(truck, run, progress.s)
+        ended = self._ended(run, nearest)
+        last = progress.run + 1 == len(path.runs)
         judged = progress.outcome
         if ended and judged is Reason.DRIVING:
-            judged = self._judge(truck, segment, last=last)
+            judged = self._judge(truck, run, last=last)
         if judged is Reason.OK:
-            progress, judged = PathProgress(progress.segment + 1), Reason.DRIVING
-            segment = path.segments[progress.segment]
-            nearest, ended = self._project(truck, segment, 0.0), False
-            last = progress.segment + 1 == len(path.segments)
-        state = self._predict(truck, segment, nearest.s)
+            progress, judged = PathProgress(progress.run + 1), Reason.DRIVING
+            run = path.runs[progress.run]
+            nearest, ended = self._project(truck, run, 0.0), False
+            last = progress.run + 1 == len(path.runs)
+        state = self._predict(truck, run, nearest.s)
         outcome = judged
         if math.hypot(truck.pose[0] - nearest.point[0], truck.pose[1] - nearest.point[1]) > config.lost_distance:
             outcome = Reason.PATH_LOST
@@ -433,34 +433,34 @@ class PathTracker(ABC, Generic[C]):
             speed=speed,
             front=angles[0],
             rear=angles[1],
-            progress=PathProgress(progress.segment, nearest.s, judged),
+            progress=PathProgress(progress.run, nearest.s, judged),
             cross_track=math.cos(nearest.tangent) * dy - math.sin(nearest.tangent) * dx,
             heading_error=wrap_angle(truck.pose[2] - state.reference.state(nearest.s).yaw),
             outcome=outcome,
         )
 
-    def _ended(self, segment: Segment, nearest: Projection) -> bool:
-        """Whether the truck has come so near to the segment's end that it stops."""
-        return segment.length - nearest.s <= self._stop
+    def _ended(self, run: PathRun, nearest: Projection) -> bool:
+        """Whether the truck has come so near to the run's end that it stops."""
+        return run.length - nearest.s <= self._stop
 
-    def _judge(self, truck: TruckState, segment: Segment, *, last: bool) -> Reason:
-        """How a segment's end was met by a truck that stops: OK at a cusp within tolerance, DRIVING while it rolls."""
-        config, end = self.config, segment.at(segment.length)
+    def _judge(self, truck: TruckState, run: PathRun, *, last: bool) -> Reason:
+        """How a run's end was met by a truck that stops: OK at a cusp within tolerance, DRIVING while it rolls."""
+        config, end = self.config, run.at(run.length)
         dx, dy = truck.pose[0] - end.point[0], truck.pose[1] - end.point[1]
         past = math.cos(end.tangent) * dx + math.sin(end.tangent) * dy
         if abs(truck.speed) > REST and past <= config.goal_tolerance:
             return Reason.DRIVING
         away = math.hypot(dx, dy)
-        reference = self._prepare(segment)[0]
-        turned = abs(wrap_angle(truck.pose[2] - reference.state(segment.length).yaw))
-        if not reference.has_yaw(segment.length):
+        reference = self._prepare(run)[0]
+        turned = abs(wrap_angle(truck.pose[2] - reference.state(run.length).yaw))
+        if not reference.has_yaw(run.length):
             turned = 0.0
         if last:
             reached = away <= config.goal_tolerance and turned <= config.goal_yaw_tolerance
             return Reason.GOAL_REACHED if reached else Reason.GOAL_MISSED
         # 0.5: share of the clearance at a cusp that the truck may be off there: the rest is for the motion after it
         # 0.01: however narrow it is, m
-        tolerance = max(0.5 * segment.clearance, 0.01)
+        tolerance = max(0.5 * run.clearance, 0.01)
         # A corner moves by about the wheelbase for each radian.
         off = away + self.geometry.wheelbase * turned
         return Reason.OK if off <= tolerance else Reason.CUSP_MISSED
@@ -511,28 +511,28 @@ class PathTracker(ABC, Generic[C]):
             if response is not self.response:
                 self.respond(response)
 
-    def _prepare(self, segment: Segment) -> tuple[Reference, SpeedProfile]:
-        """Reference and greatest speeds of a segment, computed once."""
-        known = self._prepared.get(id(segment))
-        if known is None or known[0] is not segment:
+    def _prepare(self, run: PathRun) -> tuple[RunStates, SpeedProfile]:
+        """Reference and greatest speeds of a run, computed once."""
+        known = self._prepared.get(id(run))
+        if known is None or known[0] is not run:
             if len(self._prepared) >= MAX_RUNS:
                 self._prepared.clear()
-            reference = Reference(segment, self.geometry, self.config.steering)
-            known = self._prepared[id(segment)] = (segment, reference, SpeedProfile(self.config, segment, reference))
+            reference = RunStates(run, self.geometry, self.config.steering)
+            known = self._prepared[id(run)] = (run, reference, SpeedProfile(self.config, run, reference))
         return known[1:]
 
-    def _project(self, truck: TruckState, segment: Segment, s: float) -> Projection:
-        low = min(s, segment.length)
-        return segment.project(truck.pose[0], truck.pose[1], low, min(low + self.config.reach, segment.length))
+    def _project(self, truck: TruckState, run: PathRun, s: float) -> Projection:
+        low = min(s, run.length)
+        return run.project(truck.pose[0], truck.pose[1], low, min(low + self.config.reach, run.length))
 
-    def _predict(self, truck: TruckState, segment: Segment, s: float) -> TrackingState:
-        reference, profile = self._prepare(segment)
-        speed = truck.speed if truck.speed * segment.direction > self.config.min_speed else 0.0
+    def _predict(self, truck: TruckState, run: PathRun, s: float) -> TrackingState:
+        reference, profile = self._prepare(run)
+        speed = truck.speed if truck.speed * run.direction > self.config.min_speed else 0.0
         pose, angles = truck.pose, self.axles.angles
         errors, grip = self.axle_errors.errors, speed * speed / self.geometry.wheelbase
         if self.prediction:
             pose, angles = self.axles.ahead(pose, speed, self.geometry, self.prediction, errors)
-        nearest = segment.project(pose[0], pose[1], s, s + self.config.reach)
+        nearest = run.project(pose[0], pose[1], s, s + self.config.reach)
         target, steering = reference.state(nearest.s), reference.steering(nearest.s)
         dx, dy = pose[0] - nearest.point[0], pose[1] - nearest.point[1]
         asked, wheels = self.axles.requested, errors.wheels(self.axles.requested, grip)
@@ -542,10 +542,10 @@ class PathTracker(ABC, Generic[C]):
             pose=pose,
             angles=as_steered(steering, errors.wheels(angles, grip)),
             requested=requested,
-            speed=speed or segment.direction * self.config.min_speed,
-            target_speed=target_speed(self.config, truck, segment, profile, s, self.response.dead_time),
+            speed=speed or run.direction * self.config.min_speed,
+            target_speed=target_speed(self.config, truck, run, profile, s, self.response.dead_time),
             acceleration=self.config.acceleration,
-            segment=segment,
+            run=run,
             reference=reference,
             s=nearest.s,
             steering=steering,

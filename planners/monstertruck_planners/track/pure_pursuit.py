@@ -25,7 +25,7 @@ class PurePursuit(PathTracker[PurePursuitConfig]):
         c, sn = math.cos(yaw), math.sin(yaw)
         dx, dy = goal.point[0] - x, goal.point[1] - y
         ahead, aside = c * dx + sn * dy, c * dy - sn * dx
-        direction = state.segment.direction
+        direction = state.run.direction
         if state.steering == "crab":
             bearing = math.atan2(direction * aside, direction * ahead)
             return bearing, bearing
@@ -51,10 +51,10 @@ class PurePursuit(PathTracker[PurePursuitConfig]):
     def _goal(self, state: TrackingState, s: float) -> Projection:
         """Point at ``s`` metres; beyond a change of steering as if the path went on straight."""
         end = state.reference.section_end(state.s)
-        if s <= end or end >= state.segment.end:
-            return state.segment.at(s)
+        if s <= end or end >= state.run.end:
+            return state.run.at(s)
         # 1e-6: distance before a change of the steering mode at which the path still has the old one, m
-        last = state.segment.at(end - 1e-6)
+        last = state.run.at(end - 1e-6)
         x, y, more = *last.point, s - end
         return Projection(s, (x + more * math.cos(last.tangent), y + more * math.sin(last.tangent)), last.tangent)
 
@@ -68,8 +68,8 @@ class PurePursuit(PathTracker[PurePursuitConfig]):
         """Turn by the path's own heading at the goal, and go sideways by what is left."""
         distance = max(math.hypot(ahead, aside), LEAST_SQUARE)
         heading = state.reference.state(state.s + distance).yaw
-        turn = state.segment.direction * math.remainder(heading - state.pose[2], math.tau) / distance
-        forward = state.segment.direction
+        turn = state.run.direction * math.remainder(heading - state.pose[2], math.tau) / distance
+        forward = state.run.direction
         # An arc of this turn alone ends half its angle off the present heading.
         slip = math.atan2(forward * aside, forward * ahead) - 0.5 * forward * turn * distance
         slip = min(max(slip, -self.config.angle), self.config.angle)

@@ -1,10 +1,10 @@
-"""A path prepared for tracking: segments of one direction, all crab or none of it, measured by arc length.
+"""A path prepared for tracking: runs of one direction, all crab or none of it, measured by arc length.
 
 Progress along it only grows and is searched near the present one, so a path may cross or repeat itself.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final, NamedTuple, NoReturn
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.truck import FourWheelSteering
-from monstertruck_planners.pose_path import stops
+from monstertruck_planners.pose_path import PosePath, stops
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.plan import MAX_COORDINATE, MAX_POSES, MAX_RUNS, Path, Steering
 from monstertruck_schemas.reasons import Reason
@@ -30,16 +30,16 @@ MANY: Final = 40
 class PathProgress:
     """Place on a segmented path."""
 
-    segment: int = 0
-    """Index of the segment."""
+    run: int = 0
+    """Index of the run."""
     s: float = 0.0
-    """Metres from the segment's beginning."""
+    """Metres from the run's beginning."""
     outcome: Reason = Reason.DRIVING
     """How the path ended, once it is judged."""
 
 
 class Projection(NamedTuple):
-    """Point of a segment nearest to the truck."""
+    """Point of a run nearest to the truck."""
 
     s: float
     point: tuple[float, float]
@@ -47,31 +47,14 @@ class Projection(NamedTuple):
     """Direction of travel there, rad."""
 
 
-class PathSteps(NamedTuple):
-    """A path without repeated points."""
-
-    points: Array
-    """Shape (n, 2), m."""
-    yaws: Array
-    """Shape (n,), rad."""
-    directions: Array
-    """Shape (n - 1,): of each step."""
-    steering: tuple[Steering, ...]
-    """Of each step, or empty."""
-    clearance: Array
-    """Shape (n,), m; +inf where it is not known."""
-    speeds: Array
-    """Shape (n,), m/s; +inf where the path sets none."""
-
-
-class Segment:
+class PathRun:
     """Part of a path driven without a stop, with a straight or given extension behind its end.
 
     Args:
         points: shape (n, 2), n >= 2, m; from index ``last`` on they are the extension.
-        last: index of the segment's own last point.
+        last: index of the run's own last point.
         direction: +1 forward, -1 backward.
-        before: metres of the segments before this one.
+        before: metres of the runs before this one.
         yaws: of the own points, shape (last + 1,), rad.
         steering: of each own step, or empty.
         lap: the extension is the path's own beginning.
@@ -173,34 +156,36 @@ class SegmentedPath:
     """
 
     def __init__(self, path: Path, start: tuple[float, float, float], beyond: float) -> None:
-        steps = _steps(path)
-        first = _nearest(steps.points, steps.directions, start, closed=path.closed)
+        check_path(path)
+        vertices = PosePath.of(path)
+        vertices = _distinct(_lap(vertices) if path.closed else vertices, path)
+        first = _nearest(vertices.poses[:, :2], vertices.directions[1:], start, closed=path.closed)
         if path.closed:
-            steps = _distinct(_rolled(steps, first), path)
+            vertices = _distinct(_rolled(vertices, first), path)
             first = 0
         self.name = path.name
         self.frame = path.frame
         self.closed = path.closed
-        self.segments = _segments(steps, beyond, closed=path.closed)
-        self.length = sum(segment.length for segment in self.segments)
-        self.start = self._progress_of(steps.points, first)
+        self.runs = _runs(vertices, beyond, closed=path.closed)
+        self.length = sum(run.length for run in self.runs)
+        self.start = self._progress_of(vertices.poses[:, :2], first)
 
     def along(self, progress: PathProgress) -> float:
         """Metres from the line's beginning."""
-        return self.segments[progress.segment].before + progress.s
+        return self.runs[progress.run].before + progress.s
 
     def ahead(self, progress: PathProgress, horizon: float, count: int) -> Array:
-        """Poses of the truck along the present segment's next ``horizon`` metres, shape (count, 3)."""
-        segment = self.segments[progress.segment]
-        turned = 0.0 if segment.direction > 0 else math.pi
-        projections = [segment.at(progress.s + horizon * i / (count - 1)) for i in range(count)]
+        """Poses of the truck along the present run's next ``horizon`` metres, shape (count, 3)."""
+        run = self.runs[progress.run]
+        turned = 0.0 if run.direction > 0 else math.pi
+        projections = [run.at(progress.s + horizon * i / (count - 1)) for i in range(count)]
         return np.array([(*nearest.point, nearest.tangent + turned) for nearest in projections])
 
     def _progress_of(self, points: Array, vertex: int) -> PathProgress:
         steps = np.diff(points[: vertex + 1], axis=0)
         along = float(np.hypot(steps[:, 0], steps[:, 1]).sum())
-        i = max(i for i, segment in enumerate(self.segments) if segment.before <= along)
-        return PathProgress(i, along - self.segments[i].before)
+        i = max(i for i, run in enumerate(self.runs) if run.before <= along)
+        return PathProgress(i, along - self.runs[i].before)
 
 
 def check_path(path: Path) -> None:
@@ -238,28 +223,18 @@ def _refuse(path: Path, text: str) -> NoReturn:
     raise InputError(f"path {path.name[:MAX_NAME]!r}: {text}")
 
 
-def _steps(path: Path) -> PathSteps:
-    """What the path says of each step; a closed path ends on its beginning."""
-    check_path(path)
-    points, yaws = path.poses.reshape(-1, 3)[:, :2], path.poses[2::3]
-    directions = path.directions if len(path.directions) else np.ones(len(points))
-    arriving, steering = directions[1:], path.steering[1:]
-    clearance = path.clearance if len(path.clearance) else np.full(len(points), math.inf)
-    speeds = path.speeds if len(path.speeds) else np.full(len(points), math.inf)
-    if path.closed:
-        points, yaws = np.concatenate((points, points[:1])), np.concatenate((yaws, yaws[:1]))
-        arriving, steering = np.concatenate((arriving, directions[:1])), steering + path.steering[:1]
-        clearance, speeds = np.concatenate((clearance, clearance[:1])), np.concatenate((speeds, speeds[:1]))
-    return _distinct(PathSteps(points, yaws, arriving, steering, clearance, speeds), path)
+def _lap(path: PosePath) -> PosePath:
+    """A closed path, which ends on its beginning."""
+    return path.at(np.append(np.arange(len(path.poses)), 0))
 
 
-def _distinct(steps: PathSteps, path: Path) -> PathSteps:
-    """Without points that lie less than ``LEAST_STEP`` from the one that is kept before them.
+def _distinct(vertices: PosePath, path: Path) -> PosePath:
+    """Without points that lie less than ``LEAST_STEP`` from the one that is kept before them; yaws are continuous.
 
     Raises:
         InputError: only one is left.
     """
-    points, kept = steps.points, np.arange(len(steps.points))
+    points, kept = vertices.poses[:, :2], np.arange(len(vertices.poses))
     while True:
         step = np.diff(points[kept], axis=0)
         real = np.hypot(step[:, 0], step[:, 1]) > LEAST_STEP
@@ -268,21 +243,17 @@ def _distinct(steps: PathSteps, path: Path) -> PathSteps:
         kept = kept[np.concatenate(([True], real))]
     if len(kept) < 2:
         _refuse(path, "expected different poses, all are in one place")
-    arriving = kept[1:] - 1
-    steering = tuple(steps.steering[i] for i in arriving.tolist()) if steps.steering else ()
-    return PathSteps(
-        points[kept], np.unwrap(steps.yaws[kept]), steps.directions[arriving], steering, steps.clearance[kept],
-        steps.speeds[kept],
-    )  # fmt: skip
+    found = vertices.at(kept)
+    return replace(found, poses=np.column_stack((found.poses[:, :2], np.unwrap(found.poses[:, 2]))))
 
 
-def _rolled(steps: PathSteps, first: int) -> PathSteps:
+def _rolled(lap: PosePath, first: int) -> PosePath:
     """A closed path from another vertex on."""
-    points = np.concatenate((steps.points[first:-1], steps.points[: first + 1]))
-    yaws = np.unwrap(np.concatenate((steps.yaws[first:-1], steps.yaws[: first + 1])))
-    steering = steps.steering[first:] + steps.steering[:first]
-    clearance, speeds = (np.concatenate((row[first:-1], row[: first + 1])) for row in (steps.clearance, steps.speeds))
-    return PathSteps(points, yaws, np.roll(steps.directions, -first), steering, clearance, speeds)
+    last = len(lap.poses) - 1
+    begin, rest = np.arange(first, last), np.arange(1, first + 1)
+    arriving = lap.at(np.concatenate((begin, [last], rest)))
+    places = lap.at(np.concatenate((begin, [0], rest)))
+    return replace(places, directions=arriving.directions, steering=arriving.steering)
 
 
 def _nearest(points: Array, directions: Array, start: tuple[float, float, float], *, closed: bool) -> int:
@@ -301,32 +272,33 @@ def _nearest(points: Array, directions: Array, start: tuple[float, float, float]
     return int(groups[0][np.argmin(distance[groups[0]])])
 
 
-def _segments(steps: PathSteps, beyond: float, *, closed: bool) -> tuple[Segment, ...]:
-    cuts = [0, *(np.flatnonzero(stops(steps.directions, steps.steering)) + 1).tolist(), len(steps.directions)]
+def _runs(path: PosePath, beyond: float, *, closed: bool) -> tuple[PathRun, ...]:
+    points = path.poses[:, :2]
+    cuts = [0, *path.stops.tolist(), len(points) - 1]
     lap = closed and len(cuts) == 2
-    segments: list[Segment] = []
+    runs: list[PathRun] = []
     before = 0.0
     for begin, end in pairwise(cuts):
-        own = steps.points[begin : end + 1]
+        own = points[begin : end + 1]
         if lap:
             extension = own[1 : 1 + _reach(own, beyond)]
         else:
             way = own[-1] - own[-2]
             extension = own[-1:] + beyond * way / np.hypot(*way)
-        segment = Segment(
+        run = PathRun(
             np.concatenate((own, extension)),
             end - begin,
-            float(steps.directions[begin]),
+            float(path.directions[end]),
             before,
-            steps.yaws[begin : end + 1],
-            steps.steering[begin:end],
+            path.poses[begin : end + 1, 2],
+            path.steering[begin + 1 : end + 1],
             lap=lap,
-            clearance=float(steps.clearance[end]),
-            speeds=steps.speeds[begin : end + 1] if np.isfinite(steps.speeds[begin]) else None,
+            clearance=math.inf if path.clearance is None else float(path.clearance[end]),
+            speeds=None if path.speeds is None else path.speeds[begin : end + 1],
         )
-        segments.append(segment)
-        before += segment.length
-    return tuple(segments)
+        runs.append(run)
+        before += run.length
+    return tuple(runs)
 
 
 def _reach(points: Array, beyond: float) -> int:
@@ -343,7 +315,7 @@ QUANTILES: Final = -np.log1p(-(np.arange(16) + 0.5) / 16)
 
 
 class ReferenceStates(NamedTuple):
-    """Values at places of a segment, arrays of one shape."""
+    """Values at places of a run, arrays of one shape."""
 
     heading: Array
     """Direction of the body-forward motion, rad: the path's tangent, turned round backwards."""
@@ -367,37 +339,35 @@ class ReferenceState(NamedTuple):
     curvature: float
 
 
-class Reference:
-    """Reference along one segment.
+class RunStates:
+    """States that a tracker wants along one run: its reference.
 
     Args:
-        segment: part of a line.
+        run: part of a line.
         geometry: the truck's.
-        steering: where the segment does not say.
+        steering: where the run does not say.
     """
 
-    def __init__(self, segment: Segment, geometry: FourWheelSteering, steering: Steering) -> None:
-        self._segment = segment
+    def __init__(self, run: PathRun, geometry: FourWheelSteering, steering: Steering) -> None:
+        self._segment = run
         self._default: Steering = steering
-        count = (
-            min(max(math.ceil(segment.end / PATH_GRID), 4), 5000) + 1
-        )  # greatest number of reference points of a segment
-        self._s = np.linspace(0.0, segment.end, count)
-        tangent, curvature = _tangents(segment, self._s)
-        heading = tangent if segment.direction > 0 else tangent + math.pi
-        self.given = bool(segment.steering)
-        names: list[Steering] = sorted(set(segment.steering)) if self.given else [steering]
+        count = min(max(math.ceil(run.end / PATH_GRID), 4), 5000) + 1  # greatest number of reference points of a run
+        self._s = np.linspace(0.0, run.end, count)
+        tangent, curvature = _tangents(run, self._s)
+        heading = tangent if run.direction > 0 else tangent + math.pi
+        self.given = bool(run.steering)
+        names: list[Steering] = sorted(set(run.steering)) if self.given else [steering]
         number = {mode: i for i, mode in enumerate(names)}
-        modes = np.array([number[mode] for mode in segment.steering] if self.given else [0])
-        self._changes = segment.vertices[np.flatnonzero(np.diff(modes)) + 1]
+        modes = np.array([number[mode] for mode in run.steering] if self.given else [0])
+        self._changes = run.vertices[np.flatnonzero(np.diff(modes)) + 1]
         modes = modes[self._step_at(self._s)] if self.given else np.zeros(count, np.intp)
-        yaw, turn = heading.copy(), segment.direction * curvature
+        yaw, turn = heading.copy(), run.direction * curvature
         for mode in names:
             where = modes == number[mode]
             if self.given and mode in ("crab", "hybrid"):
-                own = np.interp(self._s, segment.vertices, segment.yaws)
+                own = np.interp(self._s, run.vertices, run.yaws)
                 yaw[where] = own[where]
-                turn[where] = (segment.direction * np.gradient(own, self._s))[where]
+                turn[where] = (run.direction * np.gradient(own, self._s))[where]
             elif mode != "crab":
                 lagged, bend = self._lagged(heading, curvature, _slip_free(mode, geometry))
                 yaw[where], turn[where] = lagged[where], bend[where]
@@ -410,7 +380,7 @@ class Reference:
 
     @property
     def places(self) -> Array:
-        """Metres from the segment's beginning where the reference was computed: from 0 to the end of the extension."""
+        """Metres from the run's beginning where the reference was computed: from 0 to the end of the extension."""
         return self._s
 
     def steering(self, s: float) -> Steering:
@@ -426,7 +396,7 @@ class Reference:
         return self._modes(s) if self.given else [self._default] * len(s)
 
     def at(self, s: Array) -> ReferenceStates:
-        """Values at ``s`` metres; outside the segment those of its ends."""
+        """Values at ``s`` metres; outside the run those of its ends."""
         return ReferenceStates(*(np.asarray(np.interp(s, self._s, column)) for column in self._table))
 
     def state(self, s: float) -> ReferenceState:
@@ -454,12 +424,10 @@ class Reference:
         return ["hybrid" if mode == "crab" else mode for mode in modes]
 
     def _step_at(self, s: Array) -> NDArray[np.intp]:
-        """Index of the segment's step at each of the places."""
-        segment = self._segment
-        index = np.searchsorted(
-            segment.vertices, np.remainder(s, segment.length) if segment.end > segment.length else s, side="right"
-        )
-        return np.clip(index - 1, 0, len(segment.steering) - 1)
+        """Index of the run's step at each of the places."""
+        run = self._segment
+        index = np.searchsorted(run.vertices, np.remainder(s, run.length) if run.end > run.length else s, side="right")
+        return np.clip(index - 1, 0, len(run.steering) - 1)
 
     def _lagged(self, heading: Array, curvature: Array, a: float) -> tuple[Array, Array]:
         """Yaw and turn of a body that does not slip sideways at its point ``a``."""
@@ -485,17 +453,17 @@ def _slip_free(mode: Steering, geometry: FourWheelSteering) -> float:
     return geometry.l_f if mode == "rear" else 0.5 * (geometry.l_f - geometry.l_r)
 
 
-def _tangents(segment: Segment, s: Array) -> tuple[Array, Array]:
+def _tangents(run: PathRun, s: Array) -> tuple[Array, Array]:
     """Tangent (continuous) and curvature from chords."""
-    half = min(PATH_GRID, segment.end / 4)
-    at = np.clip(s, half, segment.end - half)
-    tangent = np.unwrap(_chord(segment, at - half, at + half))
-    middle = np.clip(s, 2 * half, segment.end - 2 * half)
-    change = _chord(segment, middle, middle + 2 * half) - _chord(segment, middle - 2 * half, middle)
+    half = min(PATH_GRID, run.end / 4)
+    at = np.clip(s, half, run.end - half)
+    tangent = np.unwrap(_chord(run, at - half, at + half))
+    middle = np.clip(s, 2 * half, run.end - 2 * half)
+    change = _chord(run, middle, middle + 2 * half) - _chord(run, middle - 2 * half, middle)
     curvature = (np.remainder(change + math.pi, math.tau) - math.pi) / (2 * half)
     return tangent + curvature * (s - at), curvature
 
 
-def _chord(segment: Segment, begin: Array, end: Array) -> Array:
-    x, y = (segment.points(end) - segment.points(begin)).T
+def _chord(run: PathRun, begin: Array, end: Array) -> Array:
+    x, y = (run.points(end) - run.points(begin)).T
     return np.asarray(np.arctan2(y, x))

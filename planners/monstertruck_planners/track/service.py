@@ -246,7 +246,7 @@ class TrackingStep:
 
     def _lost(self, path: SegmentedPath, progress: PathProgress, at: tuple[float, float, float]) -> str:
         """Where the robot and the nearest part of its path are."""
-        x, y = path.segments[progress.segment].at(progress.s).point
+        x, y = path.runs[progress.run].at(progress.s).point
         return (
             f"path {path.name!r} is {math.dist((x, y), at[:2]):.2f} m from the robot, which is at {at[0]:.2f}, "
             f"{at[1]:.2f} m in {path.frame}; the nearest point of the path is {x:.2f}, {y:.2f} m, and the tracker "

@@ -28,7 +28,7 @@ class Stanley(PathTracker[StanleyConfig]):
         front, rear = self.geometry.steer_for(state.target.turn, slip)
         front = front - state.heading_error + self._back(state, self.geometry.l_f)
         rear = rear - state.heading_error + self._back(state, -self.geometry.l_r)
-        forward = state.segment.direction > 0
+        forward = state.run.direction > 0
         if state.steering == "hybrid":
             return front, rear
         if state.steering == "counter":
@@ -41,11 +41,11 @@ class Stanley(PathTracker[StanleyConfig]):
         """Angle by which the axle at ``x`` steers towards its place."""
         config = self.config
         offset = state.lateral_error + x * math.sin(state.heading_error)
-        return -state.segment.direction * math.atan(config.gain * offset / (abs(state.speed) + config.softening))
+        return -state.run.direction * math.atan(config.gain * offset / (abs(state.speed) + config.softening))
 
     def _by_heading(self, state: TrackingState, x: float) -> Angles:
         """The fixed axle at ``x`` leads: turn the truck so that it goes to its place."""
         wrong = state.heading_error - self._back(state, x)
-        turn = state.target.turn - state.segment.direction * self.config.heading_gain * wrong
+        turn = state.target.turn - state.run.direction * self.config.heading_gain * wrong
         _, front, rear = self.geometry.steer_for_twist(1.0, -x * turn, turn)
         return float(front), float(rear)

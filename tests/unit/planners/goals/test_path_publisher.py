@@ -42,7 +42,7 @@ def test_a_path_cut_short_begins_where_the_truck_is(along: float):
     path = SegmentedPath(paths[-1], (x, 0.0, 0.0), 2.0)
     left = path.length - path.along(path.start)
     assert left < 0.15, "the truck brakes within a few centimetres"
-    assert path.segments[path.start.segment].direction == (-1.0 if backward else 1.0)
+    assert path.runs[path.start.run].direction == (-1.0 if backward else 1.0)
     # What was driven counts once.
     assert publisher.followed.before == pytest.approx(along)
     assert path.along(path.start) < 0.06

@@ -11,13 +11,13 @@ from monstertruck_planners.track.config import PurePursuitConfig
 from monstertruck_planners.track.error_model import discretise, exponential, riccati
 from monstertruck_planners.track.fuzzy import FuzzyInputs, Rules
 from monstertruck_planners.track.path_tracker import AxleModel, SpeedProfile
-from monstertruck_planners.track.segments import Reference, SegmentedPath
+from monstertruck_planners.track.segments import RunStates, SegmentedPath
 from tests.unit.planners.kit import STEERING, circle, figure_eight, path, straight
 
 
 def course(route, mode="counter", geometry=STEERING):
     line = SegmentedPath(route, (0.0, 0.0, 0.0), 0.8)
-    return Reference(line.segments[0], geometry, mode)
+    return RunStates(line.runs[0], geometry, mode)
 
 
 @pytest.mark.parametrize(("lag", "rate"), [(0.1, 5.0), (0.1, 0.5), (0.0, 1.0)])
@@ -81,8 +81,8 @@ def test_one_spot_is_as_one_of_many():
 def test_the_pace_lets_every_curve_ahead_be_reached_slowly_enough():
     config = PurePursuitConfig(lateral_acceleration=0.02, deceleration=0.05, steering_distance=0.1, steering_rate=0.5)
     line = SegmentedPath(path(figure_eight(), closed=True), (0.0, 0.0, 0.0), 0.8)
-    found = Reference(line.segments[0], STEERING, "front")
-    pace = SpeedProfile(config, line.segments[0], found)
+    found = RunStates(line.runs[0], STEERING, "front")
+    pace = SpeedProfile(config, line.runs[0], found)
     s = found.places
     speed = np.array([pace.at(place) for place in s.tolist()])
     curvature = np.maximum(np.abs(found.at(s).curvature), 1e-6)

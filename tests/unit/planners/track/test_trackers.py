@@ -58,7 +58,7 @@ def test_a_cusp_is_driven_to_a_full_stop_and_the_direction_changes_once(kind):
         if truck.speed and math.copysign(1, truck.speed) != signs[-1]:
             signs.append(math.copysign(1, truck.speed))
     assert signs == [0.0, 1.0, -1.0]
-    runs = [c.progress.segment for c in truck.log]
+    runs = [c.progress.run for c in truck.log]
     change = runs.index(1)
     assert truck.log[change - 1].speed == 0.0
     assert sorted(runs) == runs
@@ -90,7 +90,7 @@ def at_the_cusp(off, clearance, kind="lqr"):
 def test_a_cusp_is_met_as_near_as_the_clearance_there_asks_for(kind, off, clearance, outcome):
     command = at_the_cusp(off, clearance, kind)
     assert command.outcome is outcome
-    assert command.progress.segment == (outcome is Reason.DRIVING)
+    assert command.progress.run == (outcome is Reason.DRIVING)
     assert command.speed <= 0.0
 
 
@@ -119,7 +119,7 @@ def test_the_end_is_judged_by_position_and_heading(kind, at, outcome):
 def test_what_is_said_of_the_end_is_true(kind):
     truck = Follower(path(figure_eight(1.5)), kind=kind, pose=(0.0, 0.0, math.pi / 4))
     outcome = truck.run()
-    end = truck.path.segments[-1].at(truck.path.length)
+    end = truck.path.runs[-1].at(truck.path.length)
     near = math.dist(truck.pose[:2], end.point) <= truck.config.goal_tolerance
     turned = abs(math.remainder(truck.pose[2] - end.tangent, math.tau)) <= truck.config.goal_yaw_tolerance
     assert outcome is (Reason.GOAL_REACHED if near and turned else Reason.GOAL_MISSED)
@@ -131,7 +131,7 @@ def test_many_short_runs_add_no_error_up():
     motion = MotionPath(np.zeros(3), np.array([[0.12 * (-1) ** i, 2.2 * (-1) ** i, 0.0] for i in range(12)]))
     truck = Follower(motion.message(stamp=0, frame="odom", step=0.05), kind="lqr")
     assert truck.run() is Reason.GOAL_REACHED
-    assert len(truck.path.segments) == 12
+    assert len(truck.path.runs) == 12
     assert math.dist(truck.pose[:2], motion.end[:2]) < 0.01
     assert abs(math.remainder(truck.pose[2] - motion.end[2], math.tau)) < 0.05
 
@@ -147,16 +147,16 @@ def test_the_wheels_turn_before_the_truck_rolls():
 @pytest.mark.parametrize("kind", KINDS)
 def test_noise_about_a_cusp_does_not_change_the_direction_again(kind):
     truck = Follower(there_and_back(), kind=kind)
-    end = truck.path.segments[0].length
+    end = truck.path.runs[0].length
     rng = np.random.default_rng(1)
     progress, runs = truck.path.start, []
-    x, y = truck.path.segments[0].at(end).point
+    x, y = truck.path.runs[0].at(end).point
     progress = type(progress)(0, end - 0.05)
     for k in range(40):
         near = (x + 0.01 * rng.standard_normal(), y + 0.01 * rng.standard_normal(), math.pi / 2)
         command = truck.tracker.control(TruckState(near, 0.0), truck.path, progress, 0.05 * k)
         progress = command.progress
-        runs.append(progress.segment)
+        runs.append(progress.run)
     assert sorted(runs) == runs
     assert runs[-1] == 1
     assert command.speed <= 0.0 or command.outcome is Reason.GOAL_REACHED
@@ -229,11 +229,7 @@ def test_the_path_says_where_to_crab(kind):
     assert all(c.front == pytest.approx(c.rear, abs=0.05) and c.front > 0.1 for c in crabbing)
     assert max(abs(c.heading_error) for c in crabbing) < 0.1
     assert truck.cross_track().max() < 0.06
-    stops = [
-        b.progress.segment
-        for a, b in pairwise(truck.log)
-        if a.progress.segment != b.progress.segment and a.speed == 0.0
-    ]
+    stops = [b.progress.run for a, b in pairwise(truck.log) if a.progress.run != b.progress.run and a.speed == 0.0]
     assert stops == [1, 2], "it stands while the wheels turn"
 
 
