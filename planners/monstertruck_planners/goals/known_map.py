@@ -3,11 +3,10 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.map_files import WorldMap, load_map
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Severity
@@ -15,7 +14,10 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import Grid
 
-Offload = Callable[[Callable[[], WorldMap]], Awaitable[WorldMap]]
+if TYPE_CHECKING:
+    from monstertruck_runtime.map_files import WorldMap
+
+Offload = Callable[[Callable[[], "WorldMap"]], Awaitable["WorldMap"]]
 """Runs a function that takes a file system's time."""
 
 NAME: Final = ServiceName.KNOWN_MAP.value
@@ -44,13 +46,18 @@ class KnownMapService:
     async def run(self, ready: Ready) -> None:
         """Publish, then wait until cancelled."""
         try:
-            self._publish(await self._offload(lambda: load_map(self._place)))
+            self._publish(await self._offload(self._load))
         except InputError as error:  # the planner refuses it by itself
             self._events(Reason.FILE_DAMAGED, Severity.WARNING, NAME, f"{error}; operators see no map")
         ready()
         await asyncio.Event().wait()
 
-    def _publish(self, known: WorldMap) -> None:
+    def _load(self) -> "WorldMap":
+        from monstertruck_runtime.map_files import load_map  # noqa: PLC0415  # reads pictures: not at the daemon's start
+
+        return load_map(self._place)
+
+    def _publish(self, known: "WorldMap") -> None:
         height, width = known.cells.shape
         x, y = known.origin
         now = self._clock.now()
