@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.daemon.wall_kit import ROOT, kept_armed, planner_ready, robot
+from tests.notebooks import run
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(400)]
 
@@ -47,5 +48,7 @@ async def test_examples_plot_save_drive_to_a_goal_and_along_a_path_of_their_own(
             async with kept_armed(client):
                 assert " m in " in await armed("route", tmp_path, made.endpoint, "1.9,3.95,0", "1.4,3.95")
                 assert "off the path" in await armed("planner", tmp_path, made.endpoint, "0.7", "0.03")
+            (printed,) = await asyncio.to_thread(run, "drive", ENDPOINT=made.endpoint)
+            assert printed.startswith("goal_reached")
         truth = await made.truth()
-        assert np.hypot(*(truth[-1, 1:3] - (2.6, 3.98))) < 0.35
+        assert np.hypot(*(truth[-1, 1:3] - (1.9, 3.95))) < 0.35
