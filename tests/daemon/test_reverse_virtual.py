@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -58,8 +59,14 @@ def test_the_truck_does_not_back_into_a_post_that_it_has_passed():
     assert Reason.OBSTACLE_STOP in run_virtual(main, start=SECOND)
 
 
-def test_a_contact_in_a_confirmed_drive_is_noticed_within_three_tenths_of_a_second_and_backed_off():
+def pushed(overlay: dict[str, Any], reason: Reason) -> tuple[float, float]:
+    """Back into a post with the second control held, for 10 s.
+
+    Returns:
+        Time from contact to the first gate state with the reason, s; distance from the place of contact at the end, m.
+    """
     config = load_config(YARD, SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
+    config = with_overlay(config, overlay)
 
     async def main(clock: VirtualClock) -> tuple[float, float]:
         rig = VirtualRig(config, clock)
@@ -81,13 +88,23 @@ def test_a_contact_in_a_confirmed_drive_is_noticed_within_three_tenths_of_a_seco
                     true = rig.world.truth(clock.now())
                     if true.stuck and touched is None:
                         touched, place = clock.now(), (true.x, true.y)
-                    if noticed is None and any(Reason.CONTACT in state.reasons for state in gate.drain()):
+                    if noticed is None and any(reason in state.reasons for state in gate.drain()):
                         noticed = clock.now()
                 assert touched is not None
                 assert noticed is not None
                 end = rig.world.truth(clock.now())
                 return (noticed - touched) / SECOND, math.dist((end.x, end.y), place)
 
-    seconds, metres = run_virtual(main, start=SECOND)
+    return run_virtual(main, start=SECOND)
+
+
+def test_a_contact_in_a_confirmed_drive_is_noticed_within_three_tenths_of_a_second_and_backed_off():
+    seconds, metres = pushed({}, Reason.CONTACT)
     assert 0.0 <= seconds <= 0.3
     assert metres == pytest.approx(0.03, abs=0.015)
+
+
+def test_a_contact_that_neither_motor_nor_gyroscope_shows_is_noticed_by_the_scans():
+    """As of a drive that measures no current: the wheels turn, and the scans show a robot that stands."""
+    seconds, _ = pushed({"gate": {"contact": None}}, Reason.SENSORS_DISAGREE)
+    assert 0.0 <= seconds <= 6.0
