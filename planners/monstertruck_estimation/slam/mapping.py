@@ -17,6 +17,7 @@ from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.grid import NONE, GridBuilder, passed_ends
 from monstertruck_estimation.slam.keyframes import LOOSENED, KeyframeMap, Trajectory
 from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry, velocity
+from monstertruck_estimation.slam.movers import MoverDetector
 from monstertruck_estimation.slam.relocation import (
     OFF_MOTION,
     OFF_MOTION_SUSPECT,
@@ -108,6 +109,7 @@ class Mapper:
         self._local: NDArray[np.intp] = np.zeros(0, np.intp)
         self._since_key = (np.zeros(3), np.zeros((3, 3)))
         self._loss = LossDetector()
+        self._movers = MoverDetector()
         self._relocation = Relocation()
 
     @property
@@ -143,7 +145,9 @@ class Mapper:
             return None
         dt = 0.0 if self._stamp is None else _evenly((stamp - self._stamp) / SECOND, period)
         self._loss.arrive(stamp)
-        (delta, noise), match = self._best_match(scan, self._motion.predict(dt, odom))
+        predicted, noise = self._motion.predict(dt, odom)
+        scan = self._movers.still(stamp, predicted if self._motion.by_wheels(predicted) else None, scan)
+        (delta, noise), match = self._best_match(scan, (predicted, noise))
         # Time between two scans, s, in which their motion gives the velocity during a scan (for deskewing).
         deskew_period = (0.02, 0.5)
         if again is not None and match.accepted and deskew_period[0] <= dt <= deskew_period[1]:
@@ -154,10 +158,12 @@ class Mapper:
             gap = self._loss.after_gap or self._loss.sparse
             led = gap and self._led(match, delta, *_moved(self._pose, self._covariance, delta, noise))
             driven = math.hypot(delta[0], delta[1]) / self.config.key_distance
-            moved = (driven, self._key_share(delta)) if self._motion.by_wheels(delta) else (0.0, 0.0)
-            self._loss.take(match, moved, led=led)
+            driven_by = (driven, self._key_share(delta)) if self._motion.by_wheels(delta) else (0.0, 0.0)
+            self._loss.take(match, driven_by, led=led)
         trusted = not self._motion.check.contradicted
-        self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
+        moved = between(self._pose, match.pose)
+        self._motion.learn(dt, delta, noise, moved, match)
+        self._movers.settle(float(moved[2]))
         if trusted and self._motion.check.contradicted:
             self.map.loosen_odometry(stamp - round(self._motion.check.since * SECOND))
             self._since_key = self._since_key[0], self._since_key[1] * LOOSENED**2

@@ -1,0 +1,126 @@
+"""Mapping among people who walk in drawn logs (``drawn``): along with the robot, against it and across its path.
+
+People are discs that walk along the robot's own path, so no wall is in their way: ahead or behind at its speed, the
+other way, or across. There are as many as hide ``SHARES`` of the beams; in logs of an odd seed they come after a third
+of the time. Wheels are right, so every scan at which they are dropped counts; a live pose that is wrong by more than
+``WRONG`` must be reported within ``UNREPORTED``.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from monstertruck_estimation.slam.mapping import Mapper
+from monstertruck_estimation.slam.scans import ScanGeometry, prepare
+from monstertruck_kinematics.se2 import between, compose
+from monstertruck_schemas.health import OdometryUse
+from slam_parts.drawn import MAPS, PERIOD, REACH, drawn
+
+SHARES = (0.1, 0.2, 0.3, 0.4)
+SEEDS = 5
+SCANS = 400
+"""Scans of a log."""
+RADIUS = 0.25
+"""Of a person, m."""
+KINDS = ("along", "against", "across")
+MOST = 60
+"""People of a log."""
+WRONG, UNREPORTED = 0.10, 3.0
+"""Greatest error of a live pose, m, and how long it may be greater without a report, s."""
+
+
+def run(folder: Path, *, quick: bool) -> tuple[dict[str, float], dict[str, float], bool]:
+    """Figures, goals, and whether all are met."""
+    figures: dict[str, float] = {}
+    goals: dict[str, float] = {}
+    for name in MAPS:
+        for seed in range(1, 2 if quick else SEEDS + 1):
+            log = drawn(folder.parent / "maps", name, seed)
+            for share in (0.0, *SHARES):
+                found = followed(log, name, seed, share)
+                key = f"crowds.{name}-{seed}.{100 * share:.0f}"
+                print(key, found, flush=True)
+                figures |= {f"{key}.{what}": round(value, 4) for what, value in found.items()}
+                if share:
+                    goals |= {f"{key}.unreported_s": UNREPORTED, f"{key}.dropped": 0}
+    return figures, goals, all(figures[key] <= goal for key, goal in goals.items())
+
+
+def followed(
+    log: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, ScanGeometry], name: str, seed: int, share: float
+) -> dict[str, float]:
+    """Errors of the live pose, m, how long it was wrong and unreported, s, and the number of scans without wheels."""
+    stamps, ranges, odometry, poses, geometry = log
+    rng = np.random.default_rng((seed, len(name), round(100 * share)))
+    seen, hidden = among(ranges[:SCANS], poses, geometry, share, rng, SCANS // 3 * (seed % 2))
+    mapper, rows = Mapper(start=tuple(poses[0].tolist())), []
+    for stamp, row, odom, pose in zip(stamps.tolist(), seen, odometry, poses, strict=False):
+        step = mapper.step(prepare(row, geometry, longest=mapper.config.longest), stamp, odom)
+        assert step is not None
+        off = between(pose, step.pose)
+        rows.append((math.hypot(off[0], off[1]), mapper.lost, mapper.odometry is not OdometryUse.USED))
+    off, lost, dropped = np.array(rows[1:]).T
+    wrong = (off > WRONG) & ~lost.astype(bool)
+    return {
+        "beams": hidden,
+        "max_m": float(off.max()),
+        "mean_m": float(off.mean()),
+        "unreported_s": longest(wrong) * PERIOD,
+        "dropped": float(dropped.sum()),
+    }
+
+
+def longest(marks: np.ndarray) -> int:
+    """Length of the longest row of marks."""
+    best = row = 0
+    for mark in marks.tolist():
+        row = row + 1 if mark else 0
+        best = max(best, row)
+    return best
+
+
+def among(
+    ranges: np.ndarray, poses: np.ndarray, geometry: ScanGeometry, share: float, rng: np.random.Generator, since: int
+) -> tuple[np.ndarray, float]:
+    """Ranges, shape (n, beams), among people from scan ``since`` on, and the share of those beams that meet one."""
+    seen = ranges.copy()
+    here = poses[: len(ranges)]
+    hidden = 0.0
+    for number in range(MOST):
+        if hidden >= share:
+            break
+        people = _walk(poses, len(ranges), KINDS[number % len(KINDS)], rng)
+        seen[since:] = np.minimum(seen[since:], _met(people, here, geometry, ranges.shape[1])[since:])
+        hidden = float((seen[since:] < ranges[since:]).mean())
+    met = seen < ranges
+    return np.where(met, seen + rng.normal(0.0, 0.01, seen.shape), seen), hidden
+
+
+def _walk(poses: np.ndarray, count: int, kind: str, rng: np.random.Generator) -> np.ndarray:
+    """Places, shape (count, 2), of a person at every scan, m."""
+    scans = np.arange(count)
+    lead, aside = rng.integers(8, 40), rng.uniform(-0.6, 0.6)
+    at = np.full(count, 0)
+    if kind == "along":
+        at = scans + lead
+    elif kind == "against":
+        at = scans + lead - 2 * ((scans + rng.integers(60)) % 60)
+    else:
+        at = (scans // 40 + 1) * 40 - lead // 4
+        aside = 1.5 * np.sin(scans * PERIOD * rng.uniform(0.4, 0.9) + rng.uniform(0, math.tau))
+    at = np.clip(at, 0, len(poses) - 1)
+    offset = np.zeros((count, 3))
+    offset[:, 1] = aside
+    return compose(poses[at], offset)[:, :2]
+
+
+def _met(people: np.ndarray, poses: np.ndarray, geometry: ScanGeometry, beams: int) -> np.ndarray:
+    """Distance, shape (n, beams), of every beam to the person; ``REACH`` + 1 where it does not meet them."""
+    place = between(poses, np.column_stack((people, np.zeros(len(people)))))[:, :2]
+    angles = geometry.start_angle + geometry.angle_increment * np.arange(beams)
+    ahead = place @ np.stack((np.cos(angles), np.sin(angles)))
+    across = (place**2).sum(axis=1)[:, None] - ahead**2
+    far = ahead - np.sqrt(np.maximum(RADIUS**2 - across, 0.0))
+    inside = (across < RADIUS**2) & (far > geometry.range_min)
+    return np.where(inside & (far < REACH), far, REACH + 1.0)
