@@ -98,7 +98,7 @@ def test_of_twin_rooms_neither_is_taken():
 
 def test_a_search_that_takes_many_scans_finds_where_the_robot_is_when_it_ends(monkeypatch):
     """With one piece of a search at each scan."""
-    monkeypatch.setattr(global_search, "SHARE", 1e-3)
+    monkeypatch.setattr(global_search, "BUDGET", 1e-3 * global_search.BUDGET)
     truth = rounds(160, laps=1.2)
     estimates = followed(SavedMap(drawn(), None), ROOM, truth)
     found = next(k for k, estimate in enumerate(estimates) if estimate.status in PLACED)
