@@ -10,7 +10,8 @@ An emulated robot that explores (``configs/explore.yaml``), its daemon and ``mon
   sending to its request on the bus of a robot without devices.
 - A hostile publisher sends to that robot for five seconds as fast as it can, beside ``pyzeros``: unknown identities,
   repetitions, old stamps.
-- Goals of ``navigate_to_pose`` are driven, cancelled, and refused for their reason.
+- Goals of ``navigate_to_pose`` are driven, cancelled, and refused for their reason; poses are driven through by
+  ``navigate_through_poses``, and a path is followed backward by ``follow_path``.
 - ``--rclpy``: a Python with the wheels of ROS 2 (``ros-jazzy-rclpy[fastrtps]`` and messages, on Python 3.12) and this
   program's own libraries. There the face ``rclpy`` runs, and a node of ``rclpy`` reads, arms, drives, sends a goal and
   stops. Without it this part is not measured.
@@ -60,10 +61,14 @@ GOALS = {
     "lease_s": 0.5,
     "hostile_passed": 0,
     "cpu_percent": 5.0,
-    "goal": "driven, cancelled, refused",
+    "goal": "driven, cancelled, refused, through, followed",
 }
 TICKS = os.sysconf("SC_CLK_TCK")
-ACTION = "nav2_msgs/action/NavigateToPose"
+ACTIONS = {
+    "/navigate_to_pose/_action": "nav2_msgs/action/NavigateToPose",
+    "/navigate_through_poses/_action": "nav2_msgs/action/NavigateThroughPoses",
+    "/follow_path/_action": "nav2_msgs/action/FollowPath",
+}
 TWIST = "geometry_msgs/msg/Twist"
 
 
@@ -271,7 +276,7 @@ async def pyzeros(port: int, count: int) -> AsyncIterator[asyncio.subprocess.Pro
     compiled = Path(gettempdir()) / "pyzeros"  # which it compiles in the folder that it runs in
     compiled.mkdir(exist_ok=True)
     words = (sys.executable, str(PARTS / "pyzeros_driver.py"), str(port), str(count))
-    async with process(*words, folder=compiled, PYTHONPATH=str(ROOT)) as driver:
+    async with process(*words, folder=compiled) as driver:
         assert driver.stdout is not None
         assert (await driver.stdout.readline()).strip() == b"ready"
         yield driver
@@ -384,42 +389,52 @@ async def hostile(robot: Any, ros: str, seconds: float = 5.0) -> dict[str, Any]:
 
 
 async def goals(client: TruckClient, ros: str) -> dict[str, Any]:
-    """Status and text of a goal that is driven, one that is cancelled, and one that cannot be reached."""
+    """Status and text of goals: driven, cancelled, without a route; of poses driven through and a path followed."""
     asker = ServiceClient(ros, "bench_nav")
-    action = "/navigate_to_pose/_action"
 
-    async def send(number: int, x: float, y: float) -> dict[str, Any]:
-        pose = {"header": {"frame_id": "map"}, "pose": {"position": {"x": x, "y": y}, "orientation": {"w": 1.0}}}
+    def pose(x: float, y: float, yaw: float) -> dict[str, Any]:
+        turn = {"z": math.sin(yaw / 2.0), "w": math.cos(yaw / 2.0)}
+        return {"header": {"frame_id": "map"}, "pose": {"position": {"x": x, "y": y}, "orientation": turn}}
+
+    async def send(action: str, number: int, goal: dict[str, Any]) -> dict[str, Any]:
         uuid = {"uuid": bytes([number]) * 16}
-        accepted = await asker.ask(
-            f"{action}/send_goal", f"{ACTION}_SendGoal", {"goal_id": uuid, "goal": {"pose": pose}}
-        )
+        with suppress(TruckError):
+            await client.order(Order.ARM)
+        request = {"goal_id": uuid, "goal": goal}
+        accepted = await asker.ask(f"{action}/send_goal", f"{ACTIONS[action]}_SendGoal", request)
         assert accepted["accepted"]
         return uuid
 
-    async def result(uuid: dict[str, Any]) -> tuple[int, str]:
-        answer = await asker.ask(f"{action}/get_result", f"{ACTION}_GetResult", {"goal_id": uuid}, 90.0)
+    async def result(action: str, uuid: dict[str, Any]) -> tuple[int, str]:
+        answer = await asker.ask(f"{action}/get_result", f"{ACTIONS[action]}_GetResult", {"goal_id": uuid}, 90.0)
         return answer["status"], answer["result"]["error_msg"]
 
-    place = None
-    async for message in client.subscribe(t.POSE, latest()):
-        place = message.pose
-        break
-    with suppress(TruckError):
-        await client.order(Order.ARM)
-    ahead = place.x + 0.6 * math.cos(place.yaw), place.y + 0.6 * math.sin(place.yaw)
-    found = {"driven": await result(await send(1, *ahead))}
-    with suppress(TruckError):
-        await client.order(Order.ARM)
-    further = place.x + 1.1 * math.cos(place.yaw), place.y + 1.1 * math.sin(place.yaw)
-    uuid = await send(2, *further)
+    async def done(action: str, number: int, goal: dict[str, Any]) -> tuple[int, str]:
+        return await result(action, await send(action, number, goal))
+
+    async def ahead(*distances: float) -> list[dict[str, Any]]:
+        """Poses so far ahead of the robot, m."""
+        async for message in client.subscribe(t.POSE, latest()):
+            place = message.pose
+            break
+        return [
+            pose(place.x + d * math.cos(place.yaw), place.y + d * math.sin(place.yaw), place.yaw) for d in distances
+        ]
+
+    to_pose, through, follow = ACTIONS
+    near, far = await ahead(0.6, 1.1)
+    found = {"driven": await done(to_pose, 1, {"pose": near})}
+    uuid = await send(to_pose, 2, {"pose": far})
     await asyncio.sleep(1.5)
     info = {"goal_info": {"goal_id": uuid}}
-    await asker.ask(f"{action}/cancel_goal", "action_msgs/srv/CancelGoal", info)
-    found["cancelled"] = await result(uuid)
-    found["refused"] = await result(await send(3, 80.0, 80.0))
+    await asker.ask(f"{to_pose}/cancel_goal", "action_msgs/srv/CancelGoal", info)
+    found["cancelled"] = await result(to_pose, uuid)
+    found["refused"] = await done(to_pose, 3, {"pose": pose(80.0, 80.0, 0.0)})
+    found["through"] = await done(through, 4, {"poses": [near, far]})
+    rows = await ahead(*(-0.05 * step for step in range(10)))  # backward, where it has come from
+    found["followed"] = await done(follow, 5, {"path": {"header": {"frame_id": "map"}, "poses": rows}})
     await asyncio.to_thread(asker.close)
-    right = [found[name][0] for name in ("driven", "cancelled", "refused")] == [4, 5, 6] and found["refused"][1]
+    right = [status for status, _ in found.values()] == [4, 5, 6, 4, 4] and found["refused"][1]
     return {"goals": found, "goal": GOALS["goal"] if right else "no"}
 
 

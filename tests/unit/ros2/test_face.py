@@ -14,7 +14,7 @@ from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import BusyError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.req import Role
+from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Transforms
 from monstertruckd.ros2.actions import ActionGoal, CancelCode, GoalStatus, chosen
@@ -153,6 +153,48 @@ async def test_everybody_may_stop_but_only_known_clients_arm():
         assert "no client of this service" in refused["message"]
         assert (await call(found, "/truck/arm", name="rqt"))["success"]
         assert [outcome["source"] for outcome in found.outcomes] == ["face", "ros2:rqt"]
+
+
+@pytest.mark.parametrize("order", [Order.DISARM, Order.RESET, Order.STOP])
+async def test_orders_are_given_under_the_name_of_the_client_s_node(order):
+    async with scene() as found:
+        assert (await call(found, f"/truck/{order.value}", name="rqt"))["success"]
+        assert [(outcome["source"], outcome["order"]) for outcome in found.outcomes] == [("ros2:rqt", order)]
+
+
+async def publish_often(node, topic, interface, values):
+    """The first message opens the session of the node."""
+    publish = node.publisher(topic, interface, RELIABLE)
+    await asyncio.sleep(0.3)  # until the graph has it
+    for _ in range(20):
+        publish(values)
+        await asyncio.sleep(0.05)
+
+
+async def test_an_ackermann_drive_is_a_speed_and_the_angle_of_the_front_axle():
+    async with scene() as found, found.node() as node:
+        values = {"drive": {"speed": 0.125, "steering_angle": -0.25}}
+        await publish_often(node, "ackermann_cmd", "ackermann_msgs/msg/AckermannDriveStamped", values)
+        await found.until(lambda: found.requests.latest is not None)
+        request = found.requests.latest
+        assert (request.source, request.speed, request.front, request.rear) == ("ros2:teleop", 0.125, -0.25, 0.0)
+        refused = {"header": {"frame_id": "laser"}, **values}
+        await publish_often(node, "ackermann_cmd", "ackermann_msgs/msg/AckermannDriveStamped", refused)
+        assert "frame 'laser': expected base_link" in found.texts[-1]
+
+
+async def test_a_goal_pose_is_a_goal_and_an_initial_pose_is_refused_with_the_reason():
+    async with scene() as found, found.node("rviz") as node:
+        goals = node.publisher("goal_pose", "geometry_msgs/msg/PoseStamped", RELIABLE)
+        initial = node.publisher("initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped", RELIABLE)
+        await asyncio.sleep(0.3)
+        goals(pose(3.0, "odom"))
+        await found.until(lambda: found.outcomes)
+        asked = found.outcomes[0]
+        assert (asked["source"], asked["frame"], asked["goal"]["x"]) == ("ros2:rviz", "odom", 3.0)
+        initial({"header": {"frame_id": "map"}})
+        await found.until(lambda: found.texts)
+        assert "by its own scans" in found.texts[0]
 
 
 async def test_a_face_that_does_not_drive_still_stops():
