@@ -70,12 +70,16 @@ class Plant:
 
     def step(self, front: float, rear: float) -> None:
         """One step with these requests."""
-        self.queue.append((front, rear))
-        front, rear = self.queue.popleft()
-        self.front, self.rear = self._turn(self.front, front), self._turn(self.rear, rear)
+        self.turn(front, rear)
         self.pose = self.geometry.integrate(
             self.pose, *self.geometry.body_twist(self.speed, self.front, self.rear), STEP
         )
+
+    def turn(self, front: float, rear: float) -> None:
+        """Turn the axles for one step with these requests."""
+        self.queue.append((front, rear))
+        front, rear = self.queue.popleft()
+        self.front, self.rear = self._turn(self.front, front), self._turn(self.rear, rear)
 
     def _turn(self, now: float, wanted: float) -> float:
         wanted = min(max(wanted, -self.limit), self.limit)
