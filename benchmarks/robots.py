@@ -1,10 +1,11 @@
 """Robots that can be bought today (docs/robots-of-today.md), each whole and at its top speed, on the virtual clock.
 
-    python benchmarks/robots.py [--robots turtle ...] [--parts lap goals explore faults] [--goals 3] [--faults 500]
+    python benchmarks/robots.py [--robots turtle ...] [--parts lap goals explore faults] [--goals 8] [--faults 500]
 
 ``lap``: a lap of the circuit while it maps: distance from the path by the world's truth, and the map's walls against
-the world's. ``goals``: drawn places on the circuit, among two people who walk, on a map that grows. ``explore``: from
-nothing to a whole map, and home. ``faults``: a drill of families of faults (benchmarks/drill.py), driven at random.
+the world's. ``goals``: places drawn along the circuit, each 2.5 to 4 m further, among two people who walk, on a map
+that grows. ``explore``: from nothing to a whole map, and home. ``faults``: a drill of families of faults
+(benchmarks/drill.py), driven at random.
 
 Results are kept in ``runs/benchmarks/robots.json``, part by part, so that the parts can run one by one. Only what was
 run is in the figures; a goal of a part that was not run is not met.
@@ -131,11 +132,11 @@ def lap_of(name: str) -> dict[str, Any]:
 
 
 def goals_of(name: str, count: int, seed: int = 1) -> dict[str, Any]:
-    """Drawn places on the circuit, one after the other, among people."""
+    """Places drawn along the circuit, each within sight of the one before, among people."""
     config = configured(name, sim={"world": {"people": list(PEOPLE)}})
     rng = np.random.default_rng([seed, count])
     line = lap(CIRCUIT)
-    drawn = rng.integers(0, len(line), count)
+    drawn = np.cumsum(rng.integers(50, 80, count)) % len(line)  # points of 0.05 m: 2.5 to 4 m from place to place
     places = [(*(line[k, :2] + rng.uniform(-0.3, 0.3, 2)), line[k, 2]) for k in drawn]
 
     async def story(rig: VirtualRig, operator: LocalOperator) -> dict[str, Any]:
@@ -276,7 +277,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=ROBOTS)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
-    parser.add_argument("--goals", type=int, default=5)
+    parser.add_argument("--goals", type=int, default=8)
     parser.add_argument("--faults", type=int, default=FAULTS)
     arguments = parser.parse_args()
     logging.disable(logging.CRITICAL)

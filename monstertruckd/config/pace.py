@@ -7,6 +7,7 @@ route would end in what it should have seen. Speeds m/s, distances m.
 from collections.abc import Iterator
 from typing import Final
 
+from monstertruck_estimation.consistency.config import MAX_SPEED
 from monstertruck_estimation.odometry import OdometrySettings
 from monstertruck_estimation.slam.config import SlamConfig
 from monstertruck_planners.goals.config import PlannerConfig
@@ -23,6 +24,8 @@ def too_slow(
     tracker: TrackerConfig | None,
     planner: PlannerConfig | None,
     slam: SlamConfig | None,
+    *,
+    consistent: bool,
 ) -> Iterator[str]:
     """Every setting that does not keep up with ``gate.speed``, with what it must be.
 
@@ -32,12 +35,16 @@ def too_slow(
         tracker: None = there is none.
         planner: likewise.
         slam: likewise.
+        consistent: the sensors are compared.
     """
     believed = getattr(odometry, "max_speed", None)
     if believed is not None and believed < SPARE * speed:
         yield f"odometry.max_speed {believed:g} m/s: expected at least {SPARE * speed:g}, {SPARE} times gate.speed"
     if slam is not None and slam.mapper.fastest[0] < SPARE * speed:
         yield f"slam.mapper.fastest {slam.mapper.fastest[0]:g} m/s: expected at least {SPARE * speed:g}, likewise"
+    if consistent and SPARE * speed > MAX_SPEED:
+        most = MAX_SPEED / SPARE
+        yield f"gate.speed {speed:g} m/s: at most {most:g}, up to which the sensors are compared, or consistency null"
     if planner is None or tracker is None:
         return
     needed = distance_to_stop(min(speed, tracker.speed), planner, tracker)

@@ -265,7 +265,8 @@ class TruckConfig(Schema):
         body = self.body_limits
         times = unattended_times(self.devices)
         devices = beyond_devices(self.devices, self.monitors, self.gate.standstill, body)
-        pace = too_slow(self.gate.speed, self.odometry, self.tracker, self.planner, self.slam)
+        compared = self.consistency is not None
+        pace = too_slow(self.gate.speed, self.odometry, self.tracker, self.planner, self.slam, consistent=compared)
         for excess in (*impossible_settings(self.gate, body, times), *devices, *pace):
             raise ValueError(excess)
         if self.gate.attitude is None and self.devices.measures(COMPASS):

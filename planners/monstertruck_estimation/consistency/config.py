@@ -9,6 +9,8 @@ from monstertruck_schemas.base import Positive, Schema
 Share = Annotated[float, Field(ge=0, lt=1)]
 SCAN_LIBRARIES: Final = ("numba", "scipy")
 """Packages without which the motion by scans is not measured."""
+MAX_SPEED: Final = 5.0
+"""A drive position that would need more than this, m/s, is a new origin, not a motion."""
 
 
 class ConsistencyConfig(Schema):

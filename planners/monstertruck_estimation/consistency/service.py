@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from monstertruck_estimation.consistency.comparison import Measure
-from monstertruck_estimation.consistency.config import ConsistencyConfig
+from monstertruck_estimation.consistency.config import MAX_SPEED, ConsistencyConfig
 from monstertruck_estimation.consistency.exchange import StepInput, StepOutput
 from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
 from monstertruck_estimation.inertial import Inertial
@@ -115,8 +115,7 @@ class ConsistencyService:
             (Measure.STAND, Measure.STAND.value, inputs.stand is not None),
         )
         self.monitor = ConsistencyMonitor(config, {measure: role for measure, role, there in measured if there})
-        max_speed = 5.0  # a drive position that would need more than this, m/s, is a new origin, not a motion
-        self._wheels = WheelMotion(chassis, max_speed)
+        self._wheels = WheelMotion(chassis, MAX_SPEED)
         self._taken: tuple[object, ...] = ()
         self._steered: object = None
         self._rolled: tuple[int, float, float] | None = None
