@@ -232,9 +232,9 @@ class ConsistencyMonitor:
         track, before = self._tracks.get(Measure.WHEELS), self._sampled.get(Measure.SCANS)
         return None if track is None or before is None else track.motion(before, stamp)
 
-    def rest_claim(self, stamp: int) -> Claim | None:
-        """That the robot stands as its wheels do, up to the next scan, at ``stamp`` (ns)."""
-        return None if self._resting is None else self._resting.claim(stamp)
+    def rest_claim(self, stamp: int, end: int) -> Claim | None:
+        """That the robot stands as its wheels do, up to the next scan: from its first to its last beam, ns."""
+        return None if self._resting is None else self._resting.claim(stamp, end)
 
     @property
     def unshown(self) -> UnshownMotion | None:

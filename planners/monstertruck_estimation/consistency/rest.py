@@ -51,9 +51,16 @@ class RestWatch:
         self.motion = UnshownMotion(since=asked.since, stamp=output.stamp, distance=distance, turn=turn)
         self._rest = deque([output.stamp])  # what is proven next is new motion
 
-    def claim(self, stamp: int) -> Claim | None:
-        """Return the claim that the body moves no more than its wheels up to a scan at ``stamp``, ns."""
-        if not self._rest or not self._wheels.rests(stamp):
+    def claim(self, stamp: int, end: int) -> Claim | None:
+        """Return the claim that the body moves no more than its wheels up to a scan.
+
+        None if they turn before its last beam: a robot that sets off distorts the scan.
+
+        Args:
+            stamp: of its first beam, ns.
+            end: of its last beam, ns.
+        """
+        if not self._rest or not self._wheels.rests(stamp) or not self._wheels.rests(end):
             return None
         motion = self._wheels.motion(self._rest[0], stamp)
         self._asked = None if motion is None else Claim(self._rest[0], motion[:2], motion[2], (0.0, 0.0))

@@ -246,7 +246,8 @@ class ConsistencyService:
         monitor = self.monitor
         if anew:
             return StepInput(inputs, front, anew=True)
-        claim, rest = monitor.claim(scan.stamp), monitor.rest_claim(scan.stamp)
+        end = scan.stamp + round(len(scan.ranges) * scan.time_increment * SECOND)
+        claim, rest = monitor.claim(scan.stamp), monitor.rest_claim(scan.stamp, end)
         rolled = monitor.rolled(scan.stamp)
         return StepInput(inputs, front, claim=claim, lag=monitor.lag(), rest=rest, rolled=rolled)
 

@@ -77,7 +77,7 @@ def drive(walls, poses, lies=None, front="own", sensors=SENSORS, config=None, gy
                 range_max=30.0,
             )
             monitor.observe_whole("lidar", stamp, beams.tobytes() if np.isfinite(beams).sum() > 20 else None)
-            claim, rest, rolled = monitor.claim(stamp), monitor.rest_claim(stamp), monitor.rolled(stamp)
+            claim, rest, rolled = monitor.claim(stamp), monitor.rest_claim(stamp, stamp), monitor.rolled(stamp)
             step = StepInput(scan, front, claim=claim, lag=monitor.lag(), rest=rest, rolled=rolled)
             monitor.observe_scan(odometry.step(step))
         for doubt in monitor.findings():

@@ -76,7 +76,7 @@ def watched(poses, walls=HALL, crowd=None):
             range_min=0.02,
             range_max=30.0,
         )
-        monitor.observe_scan(odometry.step(StepInput(scan, "own", rest=monitor.rest_claim(stamp))))
+        monitor.observe_scan(odometry.step(StepInput(scan, "own", rest=monitor.rest_claim(stamp, stamp))))
         shown.append(monitor.unshown)
     return shown
 
