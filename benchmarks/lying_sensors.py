@@ -398,7 +398,8 @@ def replayed(log: Recording) -> tuple[list[str], float, float]:
             monitor.observe_wheels(WheelIncrement(last, stamp, twist, abs(x), (), ()))
         last = stamp
         scan = ScanInput(stamp, log.ranges[k], log.start, log.step, 0.02, longest, log.time_step, mount=log.mount)
-        claim, rest, rolled = monitor.claim(stamp), monitor.rest_claim(stamp), monitor.rolled(stamp)
+        end = stamp + round(len(scan.ranges) * scan.time_increment * SECOND)
+        claim, rest, rolled = monitor.claim(stamp), monitor.rest_claim(stamp, end), monitor.rolled(stamp)
         output = odometry.step(StepInput(scan, "kiss", claim=claim, lag=monitor.lag(), rest=rest, rolled=rolled))
         compared += 0.0 if output.since is None else (output.stamp - output.since) / SECOND
         monitor.observe_scan(output)
