@@ -27,7 +27,7 @@ HERE = Path(__file__).resolve()
 sys.path += [str(HERE.parents[1] / "drivers"), str(HERE.parents[2])]  # a checkout's, an installation's
 
 from monstertruck_drivers.arduino_bridge import protocol as board
-from monstertruck_drivers.epos.protocol import BAUD, Frame, FrameError, decode_body, stop_frames
+from monstertruck_drivers.epos.protocol import EPOS_BAUD, Frame, FrameError, decode_body, stop_frames
 from monstertruck_drivers.maestro import protocol as maestro
 from monstertruck_drivers.steppers import protocol as steppers
 from monstertruck_drivers.vesc import protocol as vesc
@@ -81,7 +81,7 @@ def drive(argument: str) -> tuple[str, int, int]:
     """Port, node and baud rate of an EPOS that an argument names."""
     port, _, rest = argument.partition("=")
     node, _, baud = rest.partition("@")
-    return port, int(node or 1), int(baud or BAUD)
+    return port, int(node or 1), int(baud or EPOS_BAUD)
 
 
 def insist(port: str, work: Callable[[], None], stopped: list[str]) -> None:

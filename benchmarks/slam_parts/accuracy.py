@@ -11,7 +11,7 @@ import numpy as np
 
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.graph import optimise
-from monstertruck_estimation.slam.kiss_matcher import KissMatcher
+from monstertruck_estimation.slam.kiss import KissMatcher
 from monstertruck_estimation.slam.mapping import Mapper, MappingEvent
 from monstertruck_estimation.slam.scan_matcher import PlanarMatcher, ScanMatcher
 from monstertruck_estimation.slam.scans import prepare

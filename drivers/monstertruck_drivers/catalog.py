@@ -11,19 +11,18 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final, Literal, NamedTuple, cast
 
-from monstertruck_drivers.arduino_bridge.protocol import BAUD as BOARD_BAUD
-from monstertruck_drivers.ax12.protocol import BAUD as AX12_BAUD
-from monstertruck_drivers.bno085.protocol import BAUD as BNO085_BAUD
+from monstertruck_drivers.arduino_bridge.protocol import BOARD_BAUD
+from monstertruck_drivers.ax12.protocol import AX12_BAUD
+from monstertruck_drivers.bno085.protocol import BNO085_BAUD
 from monstertruck_drivers.emulation import EmulatorFactory
-from monstertruck_drivers.epos.protocol import BAUD as EPOS_BAUD
-from monstertruck_drivers.ld19.protocol import BAUD as LD19_BAUD
+from monstertruck_drivers.epos.protocol import EPOS_BAUD
+from monstertruck_drivers.ld19.protocol import LD19_BAUD
 from monstertruck_drivers.link import Framing
 from monstertruck_drivers.os4000.protocol import FACTORY_BAUD as OS4000_BAUD
-from monstertruck_drivers.receiver.crsf import BAUD as CRSF_BAUD
-from monstertruck_drivers.receiver.sbus import BAUD as SBUS_BAUD
-from monstertruck_drivers.steppers.protocol import BAUD as STEPPERS_BAUD
-from monstertruck_drivers.vesc.protocol import BAUD as VESC_BAUD
-from monstertruck_drivers.wt61.protocol import BAUD as WT61_BAUD
+from monstertruck_drivers.receiver.protocol import CRSF_BAUD, SBUS_BAUD
+from monstertruck_drivers.steppers.protocol import STEPPERS_BAUD
+from monstertruck_drivers.vesc.protocol import VESC_BAUD
+from monstertruck_drivers.wt61.protocol import WT61_BAUD
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.plugins import Catalog, Plugin, load
 from monstertruck_schemas import topics

@@ -48,6 +48,8 @@ class LaserScan(Message):
         return min(self.start_angle, self.end_angle), max(self.start_angle, self.end_angle)
 
 
+STANDARD_GRAVITY = 9.80665
+"""1 g, the unit of accelerometers, m/s^2 (ISO 80000-3)."""
 VALID_BEAM = 255
 """``LaserScan.codes`` value of a beam that measured a range."""
 NO_ECHO = 2

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
-from monstertruck_drivers.arduino_bridge.protocol import BAUD, OK, REFUSED, BoardLines
+from monstertruck_drivers.arduino_bridge.protocol import BOARD_BAUD, OK, REFUSED, BoardLines
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.disobedience import USAGE, DisobedientMotor
 from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ReceivedBytes
@@ -136,7 +136,7 @@ class ArduinoBridgeEmulator:
             case b"r":
                 self._origin = [plant.reading(self._clock.now()).turns for plant in self._plants]
             case b"b":
-                return b"%d" % BAUD
+                return b"%d" % BOARD_BAUD
             case b"u":
                 pass  # the emulated controller needs no gains
             case _:
@@ -184,5 +184,5 @@ def _atoi(word: bytes) -> int:
 
 def emulated(setup: EmulatorSetup) -> ArduinoBridgeEmulator:
     """The board of a simulated robot's first two shafts, on a line of real speed."""
-    setup.port.device.baud = BAUD
+    setup.port.device.baud = BOARD_BAUD
     return ArduinoBridgeEmulator(setup.clock, setup.physics.motors[:2], setup.settings)

@@ -22,12 +22,12 @@ the board stops both motors. The interval is compiled in.
 import re
 from typing import Final
 
-BAUD: Final = 57_600
+BOARD_BAUD: Final = 57_600
 PID_RATE: Final = 30.0
 """Periods of the controller in a second, as published."""
 AUTO_STOP: Final = 2.0
 """Seconds, as published."""
-LONGEST: Final = 64
+LONGEST_LINE: Final = 64
 OK: Final = b"OK"
 REFUSED: Final = b"Invalid Command"
 _COUNTS: Final = re.compile(rb"(-?\d{1,10}) (-?\d{1,10})")
@@ -72,5 +72,5 @@ class BoardLines:
         """Return lines that became complete, without their ends; a line that never ends is dropped."""
         self._rest += data
         *lines, rest = bytes(self._rest).split(self._end)
-        self._rest = bytearray(rest if len(rest) <= LONGEST else b"")
+        self._rest = bytearray(rest if len(rest) <= LONGEST_LINE else b"")
         return [line.strip(b"\r\n") for line in lines]

@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from monstertruck_drivers.ax12.protocol import BAUD, POSITION_MAX, SPEED_UNIT, STEP
+from monstertruck_drivers.ax12.protocol import AX12_BAUD, POSITION_MAX, SPEED_UNIT, STEP
 from monstertruck_schemas.base import Positive, Schema
 
 Steps = Annotated[int, Field(ge=0, le=POSITION_MAX)]
@@ -95,7 +95,7 @@ class Ax12Config(Schema):
         """``speed`` in the unit's units; never 0, which would mean unlimited."""
         return max(1, round(self.speed / SPEED_UNIT))
 
-    def timeout(self, size: int, baud: int = BAUD) -> float:
+    def timeout(self, size: int, baud: int = AX12_BAUD) -> float:
         """Seconds to wait for an exchange of ``size`` bytes: line, return delay, and the adapter both ways."""
         timeout_min = 0.005  # seconds; below that a busy host misses answers that came in time
         scheduling = 0.002  # seconds a host may take in addition to line and adapter

@@ -63,7 +63,7 @@ class Ax12Bus:
         seed: int = 0,
         echo: bool = False,
         latency_s: float = 0.001,
-        host_baud: int = p.BAUD,
+        host_baud: int = p.AX12_BAUD,
         answers_damage: bool = True,
         positions: Mapping[int, float] | None = None,
         load: Load = no_load,
@@ -283,7 +283,7 @@ class Ax12Bus:
                 case "late":
                     asyncio.get_running_loop().call_later(self._late_s, end.write, wire)
                     return
-        end.write(wire, self.latency_s + delay + 10 / p.BAUD)
+        end.write(wire, self.latency_s + delay + 10 / p.AX12_BAUD)
 
     def _garbled(self, wire: bytes) -> bytes:
         noise = self._rng.integers(1, 256, len(wire), dtype=np.uint8)
@@ -332,6 +332,6 @@ def emulated(setup: EmulatorSetup) -> Ax12Bus:
         return direction * setup.physics.mount_torque(number)
 
     bus = Ax12Bus(setup.clock, [joint.id for joint in joints], load=load, seed=setup.seed, positions=places)
-    setup.port.device.baud = p.BAUD
+    setup.port.device.baud = p.AX12_BAUD
     setup.physics.carry_lidar(TrueJoints(bus, config, horns))
     return bus

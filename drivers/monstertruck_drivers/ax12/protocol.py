@@ -13,9 +13,9 @@ HEADER: Final = b"\xff\xff"
 BROADCAST: Final = 254
 """Unit number that all units execute and none answers."""
 ID_MAX: Final = 253
-LONGEST: Final = 150
+LONGEST_PACKET: Final = 150
 """Greatest length byte a parser waits for; what lies beyond is taken for damage."""
-BAUD: Final = 1_000_000
+AX12_BAUD: Final = 1_000_000
 MODEL: Final = 12
 """Model number of an AX-12A."""
 POSITION_MAX: Final = 1023
@@ -233,7 +233,7 @@ class Ax12Parser:
         longest: greatest valid length byte.
     """
 
-    def __init__(self, longest: int = LONGEST) -> None:
+    def __init__(self, longest: int = LONGEST_PACKET) -> None:
         self.damaged: list[int] = []
         """Units named in frames of the last ``feed`` whose sum was wrong."""
         self._longest = longest

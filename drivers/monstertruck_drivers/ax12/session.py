@@ -41,7 +41,7 @@ class Ax12Session:
         self._link = link
         self._clock = clock
         self._timeout = timeout
-        self.baud = link.baud or protocol.BAUD
+        self.baud = link.baud or protocol.AX12_BAUD
         """Bits per second of the line."""
         self._quiet_until = 0
         self._behind: dict[int, int] = {}

@@ -4,7 +4,7 @@ from math import cos, hypot, pi, sin, tau
 from typing import Final
 
 from monstertruck_drivers.bno085.config import Bno085Config
-from monstertruck_drivers.bno085.protocol import GRAVITY, INDICES, RATE, RvcFrame, RvcParser
+from monstertruck_drivers.bno085.protocol import INDICES, RATE, RvcFrame, RvcParser
 from monstertruck_drivers.inertial import Xyz, corrected_force, corrected_rate, mean
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.streaming import DeviceStream
@@ -13,7 +13,7 @@ from monstertruck_runtime.errors import ProtocolError, WrongDeviceError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import Attitude, Imu
+from monstertruck_schemas.sensor import STANDARD_GRAVITY, Attitude, Imu
 
 LONGEST_GAP: Final = 10
 """Frames that may be missing between two of which a turn rate is computed: at 10 rad/s half a turn is 31 frames."""
@@ -127,7 +127,7 @@ class Bno085Driver:
         if self._attitude is None:
             return
         yaw, pitch, roll = frame.angles
-        force = hypot(*frame.acceleration) / GRAVITY
+        force = hypot(*frame.acceleration) / STANDARD_GRAVITY
         self._attitude.put(
             Attitude(
                 stamp=newest,

@@ -9,14 +9,14 @@ from typing import Final
 
 import numpy as np
 
-from monstertruck_drivers.bno085.protocol import BAUD, INDICES, RATE, RvcFrame, build, measured
+from monstertruck_drivers.bno085.protocol import BNO085_BAUD, INDICES, RATE, RvcFrame, build, measured
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ImuSource, ReceivedBytes
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
-NOISE: Final = 4.0
+ACCELERATION_NOISE: Final = 4.0
 """Standard deviation of the accelerometer, 0.001 g."""
 REPORTED: Final = ("yaw", "pitch", "roll", "x", "y", "z")
 
@@ -82,7 +82,7 @@ class Bno085Emulator:
 
     async def run(self, end: DeviceEnd) -> None:
         """DeviceStream until cancelled."""
-        end.baud = BAUD
+        end.baud = BNO085_BAUD
         end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
         self.power_cycle()
         due = self._clock.now()
@@ -120,7 +120,7 @@ class Bno085Emulator:
         pitch, roll = pitch + pitch_rate, roll + roll_rate
         self._tilt = pitch + share * (felt[0] - pitch), roll + share * (felt[1] - roll)
         true = measured(self._index, (self._yaw, *self._tilt), reading.acceleration)
-        noise = np.rint(NOISE * self._rng.standard_normal(3)).astype(int).tolist()
+        noise = np.rint(ACCELERATION_NOISE * self._rng.standard_normal(3)).astype(int).tolist()
         numbers = dict(zip(REPORTED, (*true[1:4], *(a + b for a, b in zip(true[4:], noise, strict=True))), strict=True))
         shown = {name: max(-32767, min(32767, self.signals.report(name, value))) for name, value in numbers.items()}
         if self._faults["frozen"] and self._last is not None:

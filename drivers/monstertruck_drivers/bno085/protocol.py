@@ -9,15 +9,16 @@ import struct
 from math import degrees, radians
 from typing import Final, NamedTuple
 
-BAUD: Final = 115200
+from monstertruck_schemas.sensor import STANDARD_GRAVITY
+
+BNO085_BAUD: Final = 115200
 RATE: Final = 100
 HEADER: Final = b"\xaa\xaa"
-SIZE: Final = 19
+RVC_SIZE: Final = 19
 INDICES: Final = 256
-GRAVITY: Final = 9.80665
 _BODY: Final = struct.Struct("<B6h3x")
 _ANGLE: Final = radians(0.01)
-_FORCE: Final = GRAVITY / 1000
+_FORCE: Final = STANDARD_GRAVITY / 1000
 _MOST: Final = 32767
 
 Xyz = tuple[float, float, float]
@@ -82,10 +83,10 @@ class RvcParser:
 
     def _next(self) -> RvcFrame | None:
         buffer = self._buffer
-        while len(buffer) >= SIZE:
-            if buffer.startswith(HEADER) and sum(buffer[2 : SIZE - 1]) & 0xFF == buffer[SIZE - 1]:
-                frame = RvcFrame(*_BODY.unpack(buffer[2 : SIZE - 1]))
-                del buffer[:SIZE]
+        while len(buffer) >= RVC_SIZE:
+            if buffer.startswith(HEADER) and sum(buffer[2 : RVC_SIZE - 1]) & 0xFF == buffer[RVC_SIZE - 1]:
+                frame = RvcFrame(*_BODY.unpack(buffer[2 : RVC_SIZE - 1]))
+                del buffer[:RVC_SIZE]
                 return frame
             del buffer[0]
             self.refused += 1

@@ -17,7 +17,7 @@ from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.firmware import AccessRefusedError, Firmware, FreeMotor
 from monstertruck_drivers.epos.protocol import (
     ANSWER,
-    BAUD,
+    EPOS_BAUD,
     MAX_WORDS,
     READY,
     REFUSED,
@@ -331,5 +331,5 @@ def _flag(word: str) -> bool:
 def emulated(setup: EmulatorSetup) -> EposEmulator:
     """The controller of one driven shaft of a simulated truck, on a line of real speed."""
     shaft = SHAFTS.index(DeviceRole(setup.role))
-    setup.port.device.baud = BAUD
+    setup.port.device.baud = EPOS_BAUD
     return EposEmulator(setup.clock, setup.physics.motors[shaft], seed=setup.seed + shaft)

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 from monstertruck_drivers.epos.objects import CONTROLWORD, ObjectEntry
 
-BAUD = 38400
+EPOS_BAUD = 38400
 """Of the RS232 line, as set at the author's controller."""
 
 READY = 0x4F

@@ -4,12 +4,12 @@ import numpy as np
 
 from monstertruck_drivers.ld19.config import Ld19Config
 from monstertruck_drivers.ld19.protocol import (
-    BAUD,
     FULL_TURN,
+    LD19_BAUD,
+    LD19_SIZE,
     MODELS,
     POINT,
     POINTS,
-    SIZE,
     STAMP_TURN,
     Ld19Packet,
     Ld19Parser,
@@ -51,7 +51,7 @@ class Ld19Session:
             DeviceTimeoutError: silence.
         """
         try:
-            batch = 4 * SIZE  # bytes worth waking for
+            batch = 4 * LD19_SIZE  # bytes worth waking for
             data = await self._link.read(within, least=batch)
         except TimeoutError:
             raise DeviceTimeoutError(f"{self._link.name}: silent for {within:.1f} s") from None
@@ -158,7 +158,7 @@ class Ld19Driver:
         async with await self._port.open() as link:
             session, cutter, samples = Ld19Session(link, self._clock), TurnCutter(), PacketSamples()
             transfer = 0.001  # seconds assumed from the end of a packet on the line to its arrival
-            mapping = ClockMap(round((SIZE * 10 / BAUD + transfer) * SECOND), turn=STAMP_TURN)
+            mapping = ClockMap(round((LD19_SIZE * 10 / LD19_BAUD + transfer) * SECOND), turn=STAMP_TURN)
             due, first = self._clock.now() + round(config.first_scan * SECOND), True
             packets = await session.start()
             heard = session.packets

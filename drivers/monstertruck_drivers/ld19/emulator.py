@@ -9,8 +9,8 @@ from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import BeamSource, EmulatorSetup, ReceivedBytes
 from monstertruck_drivers.ld19.config import Ld19Config
 from monstertruck_drivers.ld19.protocol import (
-    BAUD,
     FULL_TURN,
+    LD19_BAUD,
     MODELS,
     POINT,
     POINTS,
@@ -60,7 +60,7 @@ class Ld19Emulator:
 
     async def run(self, end: DeviceEnd) -> None:
         """Stream until cancelled."""
-        end.baud = BAUD
+        end.baud = LD19_BAUD
         end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
         self.power_cycle()
         async with asyncio.TaskGroup() as group:

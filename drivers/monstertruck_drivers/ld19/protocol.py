@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import RangeSheet
 
-BAUD: Final = 230400
+LD19_BAUD: Final = 230400
 POINTS: Final = 12
-SIZE: Final = 47
+LD19_SIZE: Final = 47
 HEADER: Final = b"\x54\x2c"
 STAMP_TURN: Final = 30_000
 """Milliseconds after which the time stamp starts again."""
@@ -110,12 +110,12 @@ class Ld19Parser:
         """Packets that became complete."""
         self._buffer += data
         buffer, at, packets = self._buffer, 0, []
-        while (found := buffer.find(HEADER, at)) >= 0 and len(buffer) - found >= SIZE:
+        while (found := buffer.find(HEADER, at)) >= 0 and len(buffer) - found >= LD19_SIZE:
             self.refused += found - at
-            body = bytes(buffer[found : found + SIZE])
+            body = bytes(buffer[found : found + LD19_SIZE])
             if crc8(body[:-1]) == body[-1]:
                 _, speed, start, points, end, stamp, _ = _PACKET.unpack(body)
-                at = found + SIZE
+                at = found + LD19_SIZE
                 packets.append(Ld19Packet(speed, start, points, end, stamp))
             else:
                 at = found + 1

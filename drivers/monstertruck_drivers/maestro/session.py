@@ -7,9 +7,9 @@ from monstertruck_drivers.maestro.protocol import ERROR_MASK, POSITION_MAX, Enco
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError, WrongDeviceError
 
-ATTEMPTS: Final = 3
+IDENTIFY_ATTEMPTS: Final = 3
 """Tries to identify: another program may be talking into a freshly plugged port."""
-QUIET: Final = 0.02
+QUIET_AFTER_ANSWER: Final = 0.02
 """Seconds of silence that end an answer; a Maestro says nothing unasked."""
 RESYNC_TRIES: Final = 4
 """Tries to come into step with the answers again, at one time."""
@@ -92,7 +92,7 @@ class MaestroSession:
             WrongDeviceError: bytes came that no Maestro sends.
         """
         heard = False
-        for _ in range(ATTEMPTS):
+        for _ in range(IDENTIFY_ATTEMPTS):
             heard |= await self._speaks()
             try:
                 *positions, errors = await self.ask(
@@ -118,7 +118,7 @@ class MaestroSession:
     async def _speaks(self) -> bool:
         """Whether unrequested bytes come; they are dropped."""
         try:
-            async with self._clock.deadline(QUIET):
+            async with self._clock.deadline(QUIET_AFTER_ANSWER):
                 return bool(await self._link.read())
         except TimeoutError:
             return False

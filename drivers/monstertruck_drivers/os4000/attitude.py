@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.os4000.config import IronConfig, Os4000Config
 from monstertruck_drivers.os4000.protocol import Sentence
-from monstertruck_schemas.sensor import Attitude, Vector3
+from monstertruck_schemas.sensor import STANDARD_GRAVITY, Attitude, Vector3
 
 Real = TypeVar("Real", float, NDArray[np.float64])
 
@@ -31,8 +31,6 @@ def level_field(field: tuple[Real, Real, Real], pitch: Real, roll: Real, iron: I
     return np.cos(pitch) * x + np.sin(pitch) * up, left
 
 
-GRAVITY: Final = 9.80665
-"""m/s^2 in 1 g."""
 MILLIGAUSS: Final = 0.1
 """Microtesla in 1 mG."""
 
@@ -67,7 +65,7 @@ def to_attitude(sentence: Sentence, config: Os4000Config, stamp: int, received: 
         pitch=-math.radians(pitch),
         temperature=sentence.temperature,
         magnetic_field=_scaled(sentence.field, MILLIGAUSS),
-        acceleration=_scaled(sentence.acceleration, GRAVITY),
+        acceleration=_scaled(sentence.acceleration, STANDARD_GRAVITY),
         heading_disturbed=_is_disturbed(sentence, config),
         tilt_valid=_is_tilt(sentence, config),
     )

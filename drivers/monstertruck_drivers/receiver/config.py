@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from monstertruck_drivers.receiver.channels import CHANNELS
+from monstertruck_drivers.receiver.protocol import CHANNELS
 from monstertruck_schemas.base import Schema
 
 Channel = Annotated[int, Field(ge=1, le=CHANNELS)]

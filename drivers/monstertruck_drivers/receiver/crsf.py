@@ -8,14 +8,17 @@ and more. Without its transmitter an ExpressLRS receiver sends no channels, and 
 
 from typing import Final
 
-from monstertruck_drivers.receiver.channels import PACKED, ChannelWords, pack, unpack
 from monstertruck_drivers.receiver.frames import ReceiverFrame
-
-BAUD: Final = 420_000
-ADDRESS: Final = 0xC8
-CHANNELS_TYPE: Final = 0x16
-LINK_TYPE: Final = 0x14
-LINK_SIZE: Final = 10
+from monstertruck_drivers.receiver.protocol import (
+    CHANNELS_TYPE,
+    CRSF_ADDRESS,
+    LINK_SIZE,
+    LINK_TYPE,
+    PACKED,
+    ChannelWords,
+    pack,
+    unpack,
+)
 
 
 def _crc_of(byte: int) -> int:
@@ -38,7 +41,7 @@ def crc8(data: bytes) -> int:
 def frame(kind: int, payload: bytes) -> bytes:
     """Return the bytes of a frame."""
     body = bytes((kind,)) + payload
-    return bytes((ADDRESS, len(body) + 1)) + body + bytes((crc8(body),))
+    return bytes((CRSF_ADDRESS, len(body) + 1)) + body + bytes((crc8(body),))
 
 
 def channels_frame(channels: ChannelWords) -> bytes:
@@ -74,7 +77,7 @@ class CrsfParser:
         while len(buffer) >= 2:
             size = buffer[1] + 2
             longest = 62  # greatest length byte
-            if buffer[0] == ADDRESS and 4 <= size <= longest + 2:
+            if buffer[0] == CRSF_ADDRESS and 4 <= size <= longest + 2:
                 if len(buffer) < size:
                     return None
                 body = bytes(buffer[2 : size - 1])

@@ -4,10 +4,10 @@ from collections import deque
 from typing import Final
 
 from monstertruck_drivers.link import Port
-from monstertruck_drivers.receiver.channels import ChannelWords, position
 from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig
 from monstertruck_drivers.receiver.crsf import CrsfParser
 from monstertruck_drivers.receiver.frames import ReceiverFrame, ReceiverParser
+from monstertruck_drivers.receiver.protocol import ChannelWords, position
 from monstertruck_drivers.receiver.sbus import SbusParser
 from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_runtime.clock import SECOND, Clock

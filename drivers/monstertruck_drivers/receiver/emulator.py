@@ -12,8 +12,8 @@ import numpy as np
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes
 from monstertruck_drivers.receiver import crsf, sbus
-from monstertruck_drivers.receiver.channels import CENTRE, CHANNELS, LOW, raw
 from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig, SbusConfig
+from monstertruck_drivers.receiver.protocol import CENTRE, CHANNELS, CRSF_BAUD, LOW, SBUS_BAUD, SBUS_PERIOD, raw
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
@@ -87,9 +87,9 @@ class ReceiverEmulator:
 
     async def run(self, end: DeviceEnd) -> None:
         """DeviceStream until cancelled."""
-        end.baud = crsf.BAUD if self._crsf else sbus.BAUD
+        end.baud = CRSF_BAUD if self._crsf else SBUS_BAUD
         crsf_period = SECOND // 100  # between two packets of a transmitter at 100 Hz, ns
-        period = crsf_period if self._crsf else round(sbus.PERIOD * SECOND)
+        period = crsf_period if self._crsf else round(SBUS_PERIOD * SECOND)
         due = self._clock.now()
         while True:
             due += period

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple, Protocol
 
-from monstertruck_drivers.receiver.channels import ChannelWords
+from monstertruck_drivers.receiver.protocol import ChannelWords
 
 
 class ReceiverFrame(NamedTuple):

@@ -1,9 +1,9 @@
 """Is a receiver on the port, and what does it hear?"""
 
 from monstertruck_drivers.link import Port
-from monstertruck_drivers.receiver.channels import position
 from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig, SbusConfig
 from monstertruck_drivers.receiver.driver import first_frames, parser_of
+from monstertruck_drivers.receiver.protocol import position
 from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError

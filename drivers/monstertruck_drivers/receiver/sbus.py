@@ -8,23 +8,25 @@ position, so a frame that follows damage counts only once the next one begins wh
 
 from typing import Final
 
-from monstertruck_drivers.receiver.channels import PACKED, ChannelWords, pack, unpack
 from monstertruck_drivers.receiver.frames import ReceiverFrame
+from monstertruck_drivers.receiver.protocol import (
+    PACKED,
+    SBUS_FAILSAFE,
+    SBUS_HEADER,
+    SBUS_LOST,
+    SBUS_SIZE,
+    ChannelWords,
+    pack,
+    unpack,
+)
 
-BAUD: Final = 100_000
-SIZE: Final = 25
-HEADER: Final = 0x0F
 FOOTERS: Final = frozenset((0x00, 0x04, 0x14, 0x24, 0x34))
-LOST: Final = 0x04
-FAILSAFE: Final = 0x08
-PERIOD: Final = 0.014
-"""Seconds between two frames."""
 
 
 def frame(channels: ChannelWords, *, lost: bool = False, failsafe: bool = False) -> bytes:
     """Return the bytes of a frame."""
-    flags = LOST * lost | FAILSAFE * failsafe
-    return bytes((HEADER,)) + pack(channels) + bytes((flags, 0))
+    flags = SBUS_LOST * lost | SBUS_FAILSAFE * failsafe
+    return bytes((SBUS_HEADER,)) + pack(channels) + bytes((flags, 0))
 
 
 class SbusParser:
@@ -41,12 +43,12 @@ class SbusParser:
         self._buffer += data
         messages = []
         buffer = self._buffer
-        while len(buffer) >= (SIZE if self._in_step else 2 * SIZE):
-            if _is_frame(buffer) and (self._in_step or _is_frame(buffer[SIZE:])):
+        while len(buffer) >= (SBUS_SIZE if self._in_step else 2 * SBUS_SIZE):
+            if _is_frame(buffer) and (self._in_step or _is_frame(buffer[SBUS_SIZE:])):
                 if self._in_step:
-                    messages.append(_message(bytes(buffer[:SIZE])))
+                    messages.append(_message(bytes(buffer[:SBUS_SIZE])))
                 self._in_step = True
-                del buffer[:SIZE]
+                del buffer[:SBUS_SIZE]
             else:
                 self._in_step = False
                 del buffer[0]
@@ -55,11 +57,11 @@ class SbusParser:
 
 
 def _is_frame(data: bytearray) -> bool:
-    return data[0] == HEADER and data[SIZE - 1] in FOOTERS
+    return data[0] == SBUS_HEADER and data[SBUS_SIZE - 1] in FOOTERS
 
 
 def _message(data: bytes) -> ReceiverFrame:
     flags = data[1 + PACKED]
     return ReceiverFrame(
-        channels=unpack(data[1 : 1 + PACKED]), failsafe=bool(flags & FAILSAFE), lost=bool(flags & LOST)
+        channels=unpack(data[1 : 1 + PACKED]), failsafe=bool(flags & SBUS_FAILSAFE), lost=bool(flags & SBUS_LOST)
     )

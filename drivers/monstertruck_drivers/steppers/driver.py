@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_drivers.steppers.protocol import Identity, MotorState, RefusalCode, Status, step_of
-from monstertruck_drivers.steppers.session import ATTEMPTS, RequestRefusedByDeviceError, StepperSession
+from monstertruck_drivers.steppers.session import ASK_ATTEMPTS, RequestRefusedByDeviceError, StepperSession
 from monstertruck_drivers.transaction import Misses
 from monstertruck_runtime.clock import POLLING, SECOND, Clock, Schedule
 from monstertruck_runtime.errors import (
@@ -155,12 +155,12 @@ class StepperDriver:
         if self._last is not None and len(self._last[0].positions) != identity.motors:
             self._last = None  # another controller is plugged in
         began = self._clock.now()
-        while any((await session.status("Q", identity.motors, attempts=ATTEMPTS)).rates):
+        while any((await session.status("Q", identity.motors, attempts=ASK_ATTEMPTS)).rates):
             if self._clock.now() - began > SAFE_DEADLINE * SECOND:
                 raise ProtocolError(f"{self._port.name}: the motors do not come to rest")
             await self._clock.sleep(1.0 / config.rate)
         settings = (config.acceleration, config.quick_deceleration, round(1000 * config.watchdog))
-        taken = await session.ask("C", *settings, attempts=ATTEMPTS)
+        taken = await session.ask("C", *settings, attempts=ASK_ATTEMPTS)
         if taken.words != tuple(map(str, settings)):
             raise ProtocolError(f"{self._port.name}: settings {settings} were taken as {' '.join(taken.words)}")
         text = f"{identity.name} version {identity.version}, {identity.motors} motors"
@@ -268,10 +268,10 @@ class StepperDriver:
         with contextlib.suppress(DeviceError, TimeoutError):
             async with self._clock.deadline(SAFE_DEADLINE):
                 motors = (await session.identify()).motors if self._last is None else len(self._last[0].positions)
-                end = self._clock.now() + round((SAFE_DEADLINE - ATTEMPTS * self._config.answer_timeout) * SECOND)
-                while any((await session.status("Q", motors, attempts=ATTEMPTS)).rates) and self._clock.now() < end:
+                end = self._clock.now() + round((SAFE_DEADLINE - ASK_ATTEMPTS * self._config.answer_timeout) * SECOND)
+                while any((await session.status("Q", motors, attempts=ASK_ATTEMPTS)).rates) and self._clock.now() < end:
                     await self._clock.sleep(0.02)
-                await session.status("D", motors, attempts=ATTEMPTS)
+                await session.status("D", motors, attempts=ASK_ATTEMPTS)
             return
         with contextlib.suppress(DeviceLostError):
             session.send("Q")

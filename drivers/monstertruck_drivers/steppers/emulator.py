@@ -17,10 +17,10 @@ from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ReceivedBy
 from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_drivers.steppers.protocol import (
-    BAUD,
     MAX_RATE,
     MOTORS,
     NAME,
+    STEPPERS_BAUD,
     VERSION,
     Identity,
     Line,
@@ -303,6 +303,6 @@ def _stepped(rate: float) -> float:
 
 def emulated(setup: EmulatorSetup) -> StepperEmulator:
     """The controller of all driven shafts of a simulated robot, on a line of real speed."""
-    setup.port.device.baud = BAUD
+    setup.port.device.baud = STEPPERS_BAUD
     steps = {} if setup.settings is None else {"steps_per_turn": setup.settings.steps_per_turn}
     return StepperEmulator(setup.clock, setup.physics.motors[:MOTORS], **steps)

@@ -2,7 +2,7 @@
 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.steppers.config import StepperConfig
-from monstertruck_drivers.steppers.session import ATTEMPTS, StepperSession
+from monstertruck_drivers.steppers.session import ASK_ATTEMPTS, StepperSession
 from monstertruck_runtime.clock import Clock
 
 
@@ -23,7 +23,7 @@ async def probe(port: Port, clock: Clock, settings: StepperConfig | None = None)
     async with await port.open() as link:
         session = StepperSession(link, clock, (settings or StepperConfig()).answer_timeout)
         identity = await session.identify()
-        status = await session.status("S", identity.motors, attempts=ATTEMPTS)
+        status = await session.status("S", identity.motors, attempts=ASK_ATTEMPTS)
     return {
         "device": "stepper motors on a microcontroller",
         "port": port.name,

@@ -27,7 +27,7 @@ from typing import Final
 
 NAME: Final = "STEP4"
 VERSION: Final = 1
-BAUD: Final = 115_200
+STEPPERS_BAUD: Final = 115_200
 MOTORS: Final = 4
 MAX_LINE: Final = 160
 """Bytes of the longest line; the controller drops longer ones."""

@@ -16,7 +16,7 @@ from monstertruck_drivers.steppers.protocol import (
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 
-ATTEMPTS: Final = 3
+ASK_ATTEMPTS: Final = 3
 """Tries of the requests of a session's beginning."""
 
 
@@ -98,7 +98,7 @@ class StepperSession:
             WrongDeviceError: something else answers.
         """
         try:
-            identity = Identity.of(await self.ask("I", attempts=ATTEMPTS))
+            identity = Identity.of(await self.ask("I", attempts=ASK_ATTEMPTS))
         except (DeviceTimeoutError, ProtocolError, LineError) as error:
             if self.splitter.bad and not self.heard:
                 text = f"{self._link.name}: no {NAME}, sends {self.splitter.strange!r}"

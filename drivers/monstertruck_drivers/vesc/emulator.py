@@ -20,9 +20,9 @@ from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_drivers.vesc.config import VescConfig
 from monstertruck_drivers.vesc.protocol import (
-    BAUD,
     SERVO_SCALE,
     TICKS_PER_ELECTRICAL_TURN,
+    VESC_BAUD,
     Deframer,
     FirmwareIdentity,
     MotorValues,
@@ -380,6 +380,6 @@ def _limited(value: float, limit: float) -> float:
 def emulated(setup: EmulatorSetup) -> VescEmulator:
     """The controllers of a simulated robot; the servo output moves the servo on channel 0."""
     settings: VescConfig = setup.settings or VescConfig()
-    setup.port.device.baud = BAUD
+    setup.port.device.baud = VESC_BAUD
     servos = None if settings.servo is None else setup.physics.servos
     return VescEmulator(setup.clock, setup.physics.motors[: settings.shafts], servos, settings)

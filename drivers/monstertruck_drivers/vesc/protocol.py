@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Self
 
-BAUD: Final = 115_200
+VESC_BAUD: Final = 115_200
 SHORT: Final = 2
 LONG: Final = 3
 STOP: Final = 3

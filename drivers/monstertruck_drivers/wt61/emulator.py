@@ -8,7 +8,7 @@ import numpy as np
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ImuSource, ReceivedBytes
 from monstertruck_drivers.signals import SignalKind, Signals
-from monstertruck_drivers.wt61.protocol import BAUD, RATE, TOGGLE_SLEEP, Wt61Kind, Wt61Packet, build, measured
+from monstertruck_drivers.wt61.protocol import RATE, TOGGLE_SLEEP, WT61_BAUD, Wt61Kind, Wt61Packet, build, measured
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
@@ -50,7 +50,7 @@ class Wt61Emulator:
 
     async def run(self, end: DeviceEnd) -> None:
         """DeviceStream, and take commands."""
-        end.baud = BAUD
+        end.baud = WT61_BAUD
         end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
         self.power_cycle()
         async with asyncio.TaskGroup() as group:

@@ -10,16 +10,17 @@ from enum import IntEnum
 from math import radians
 from typing import Final, NamedTuple
 
-BAUD: Final = 115200
+from monstertruck_schemas.sensor import STANDARD_GRAVITY
+
+WT61_BAUD: Final = 115200
 RATE: Final = 100
 """Triples of packets a second at this baud rate."""
 HEADER: Final = 0x55
-SIZE: Final = 11
-GRAVITY: Final = 9.80665
+WT61_SIZE: Final = 11
 TOGGLE_SLEEP: Final = b"\xff\xaa\x60"
 """Standby and back."""
 _BODY: Final = struct.Struct("<BB4h")
-_ACCELERATION: Final = 16 * GRAVITY / 32768
+_ACCELERATION: Final = 16 * STANDARD_GRAVITY / 32768
 _RATE: Final = radians(2000) / 32768
 _MOST: Final = 32767
 
@@ -94,11 +95,11 @@ class Wt61Parser:
 
     def _next(self) -> Wt61Packet | None:
         buffer = self._buffer
-        while len(buffer) >= SIZE:
+        while len(buffer) >= WT61_SIZE:
             known = buffer[0] == HEADER and buffer[1] in tuple(Wt61Kind)
-            if known and sum(buffer[: SIZE - 1]) & 0xFF == buffer[SIZE - 1]:
-                _, kind, *numbers = _BODY.unpack(buffer[: SIZE - 1])
-                del buffer[:SIZE]
+            if known and sum(buffer[: WT61_SIZE - 1]) & 0xFF == buffer[WT61_SIZE - 1]:
+                _, kind, *numbers = _BODY.unpack(buffer[: WT61_SIZE - 1])
+                del buffer[:WT61_SIZE]
                 return Wt61Packet(Wt61Kind(kind), *numbers)
             del buffer[0]
             self.refused += 1

@@ -21,7 +21,7 @@ from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 
 REQUEST_PERIOD: Final = 0.05
 """Seconds between two requests."""
-LEASE: Final = 0.5
+MOVE_LEASE: Final = 0.5
 """Requested, s; the gate may grant less."""
 ARMING: Final = 3.0
 """Seconds in which the truck must be armed."""
@@ -217,7 +217,7 @@ class _Run:
             while not self._driving():
                 if self._clock.now() > end:
                     raise refusal or NoAnswerError(f"the gate did not arm the robot within {ARMING:g} s")
-                await self._truck.drive(0.0, 0.0, 0.0, LEASE)
+                await self._truck.drive(0.0, 0.0, 0.0, MOVE_LEASE)
                 requests += 1
                 if arming is not None and arming.done():
                     refusal, arming = arming.result(), None
@@ -251,7 +251,7 @@ class _Run:
         """
         end = self._clock.now() + round(seconds * SECOND)
         while self._clock.now() < end:
-            await self._truck.drive(speed, front, rear, LEASE)
+            await self._truck.drive(speed, front, rear, MOVE_LEASE)
             await self._clock.sleep(min(REQUEST_PERIOD, (end - self._clock.now()) / SECOND))
             self._take()
             self._check()

@@ -15,7 +15,7 @@ CALM: Final = 0.5
 """Share up to which it is calm."""
 FIRST_D, RAISE_D = 0.5, 1.8
 """First K_d, of K_p, and the factor by which it grows."""
-MOST: Final = 16
+MOST_RUNS: Final = 16
 """Runs."""
 
 
@@ -63,11 +63,11 @@ def recipe(k_p: float) -> Generator[WallGains, RunVerdict, WallGains | None]:
     gains, runs = WallGains(k_p, 0.0), 1
     verdict = yield gains
     raise_p = 1.5, 1.2  # factors of K_p, at first and again later
-    while verdict.overshoot < OVERSHOOTS and runs < MOST and gains.k_p * raise_p[0] <= 60.0:  # k_p that is tried
+    while verdict.overshoot < OVERSHOOTS and runs < MOST_RUNS and gains.k_p * raise_p[0] <= 60.0:  # k_p that is tried
         gains, runs = WallGains(gains.k_p * raise_p[0], 0.0), runs + 1
         verdict = yield gains
     best: tuple[float, WallGains] | None = None
-    while runs < MOST:
+    while runs < MOST_RUNS:
         if verdict.overshoot <= CALM:
             if best is None or verdict.steady < best[0]:
                 best = verdict.steady, gains

@@ -11,7 +11,7 @@ from typing import Final
 
 LEAST_ROW: Final = 40
 """Equal values in a row that such noise does not give."""
-WINDOW: Final = 20
+NOISE_READINGS: Final = 20
 """Values over which the noise is measured."""
 
 
@@ -23,7 +23,7 @@ class RepeatDetector:
         self._row = 0
         self._longest = 0
         self._digit = math.inf
-        self._still: deque[float] = deque(maxlen=WINDOW)
+        self._still: deque[float] = deque(maxlen=NOISE_READINGS)
         self._noise = math.inf
         """Of the quietest window."""
         self._windows = 0
@@ -55,9 +55,9 @@ class RepeatDetector:
             self._still.clear()
             return
         self._still.append(value)
-        if len(self._still) == WINDOW:
-            mean = math.fsum(self._still) / WINDOW
-            spread = math.sqrt(math.fsum((one - mean) ** 2 for one in self._still) / WINDOW)
+        if len(self._still) == NOISE_READINGS:
+            mean = math.fsum(self._still) / NOISE_READINGS
+            spread = math.sqrt(math.fsum((one - mean) ** 2 for one in self._still) / NOISE_READINGS)
             self._noise, self._windows = min(self._noise, spread), self._windows + 1
             self._still.clear()
 

@@ -33,7 +33,7 @@ class KissFront:
     """kiss-icp's registration to its own voxel map."""
 
     def __init__(self) -> None:
-        from monstertruck_estimation.slam.kiss_map import KissMap  # noqa: PLC0415  # its library is for this only
+        from monstertruck_estimation.slam.kiss import KissMap  # noqa: PLC0415  # its library is for this only
 
         self._map = KissMap()
 

@@ -30,7 +30,7 @@ from monstertruck_runtime.clock import SECOND
 LEVELS: Final = 7
 QUERY_KEYS: Final = 6
 """Keyframes that make the query: more would carry the drift of a search without odometry."""
-MIN_OVERLAP: Final = (0.85, 0.7)
+MIN_SEARCH_OVERLAP: Final = (0.85, 0.7)
 """Share of the query's points that must fit the place found, and a unique one: in a recording from an office right
 places had 0.92 and more, wrong ones 0.84 at most; at the edge of the map unique ones of 0.7 were right."""
 MAX_CONTRADICTION: Final = (0.15, 0.3)
@@ -132,7 +132,7 @@ class GlobalLocaliser:
                 continue
             numbers, led = self._surroundings(newest), self._led(hypothesis, newest)
             fit = register(self._merged(numbers, newest), self._submap.cloud, led)
-            if fit.overlap < MIN_OVERLAP[False] or not _near(led, fit.pose):
+            if fit.overlap < MIN_SEARCH_OVERLAP[False] or not _near(led, fit.pose):
                 continue
             if self._contradiction(numbers, newest, fit.pose) > MAX_CONTRADICTION[False]:
                 continue
@@ -205,7 +205,7 @@ class GlobalLocaliser:
         ambiguous = peak.rival > ambiguous_ratio * peak.score
         unique = max(peak.rival, peak.unseen) < unique_ratio * peak.score
         fit = register(query, self._submap.cloud, peak.pose)
-        if fit.overlap < MIN_OVERLAP[unique]:
+        if fit.overlap < MIN_SEARCH_OVERLAP[unique]:
             return None
         if self._contradiction(numbers, newest, fit.pose) > MAX_CONTRADICTION[unique]:
             return None
@@ -243,7 +243,7 @@ class GlobalLocaliser:
         """
         centre, newest = hypothesis.searches[-1][0], len(self._mapper.map) - 1
         query = self._merged(np.arange(since, newest + 1), centre)
-        if measure(query, self._submap.cloud, hypothesis.pose).overlap < MIN_OVERLAP[unique]:
+        if measure(query, self._submap.cloud, hypothesis.pose).overlap < MIN_SEARCH_OVERLAP[unique]:
             return False
         numbers = np.arange(hypothesis.searches[0][0], newest + 1)
         stretches = np.array_split(numbers, math.ceil(len(numbers) / QUERY_KEYS))

@@ -24,7 +24,7 @@ from monstertruck_runtime.memory import give_back
 from monstertruck_schemas.health import OdometryUse
 
 if TYPE_CHECKING:
-    from monstertruck_estimation.slam.kiss_witness import KissWitness
+    from monstertruck_estimation.slam.kiss import KissWitness
 
 
 class SlamWorker:
@@ -151,13 +151,13 @@ def matcher_of(kind: str) -> ScanMatcher | None:
     """The scan matcher of this name; None = the default one."""
     if kind == "planar":
         return None
-    from monstertruck_estimation.slam.kiss_matcher import KissMatcher  # noqa: PLC0415  # its library is for this kind only
+    from monstertruck_estimation.slam.kiss import KissMatcher  # noqa: PLC0415  # its library is for this kind only
 
     return KissMatcher()
 
 
 def _witness() -> "KissWitness":
-    from monstertruck_estimation.slam.kiss_witness import KissWitness  # noqa: PLC0415  # its library is for this only
+    from monstertruck_estimation.slam.kiss import KissWitness  # noqa: PLC0415  # its library is for this only
 
     return KissWitness()
 

@@ -42,7 +42,7 @@ from monstertruck_schemas.reasons import Reason
 
 LEVEL: Final = 0.0005
 """Clearances are compared in whole steps of this, m."""
-SPARE: Final = 0.002
+SPARE_MARGIN: Final = 0.002
 """Kept beyond the margin where a departure ends, m: the first motion of a search may come a little nearer."""
 CHECK: Final = 0.004
 """Distance between two poses checked, m."""
@@ -214,7 +214,7 @@ def departures(
 
 def _wanted(margin: float) -> int:
     """Clearance at the end, in steps of LEVEL."""
-    return int(np.ceil((margin + CHECK_MARGIN + SPARE) / LEVEL))
+    return int(np.ceil((margin + CHECK_MARGIN + SPARE_MARGIN) / LEVEL))
 
 
 def _arcs(vehicle: Vehicle) -> list[Array]:

@@ -26,7 +26,7 @@ KEPT_CELLS: Final = 100
 """Cells of history that are needed before the newest: the longest dead time and the longest pause between poses."""
 EARLY: Final = 1e-6
 """Cells by which rounding may make an instant early."""
-NOISE: Final = 0.003
+TURN_NOISE: Final = 0.003
 """Standard deviation of a measured turn before any was compared, rad."""
 
 
@@ -81,7 +81,7 @@ class ResponseEstimator:
         self._products = np.empty_like(self._by_x)
         self._yy = self._yd = self._dd = self._count = 0.0
         self._samples = 0
-        self._variance = NOISE**2
+        self._variance = TURN_NOISE**2
         self.estimate = self._judged()
         self.forget_requests()
         self._end = DEAD_TIMES + 1  # a truck begins with its wheels straight
@@ -189,7 +189,7 @@ class ResponseEstimator:
         explained = (xy * (dd * xy - 2 * self._yd * xd) + self._yd**2 * xx) / (xx * dd - xd * xd)
         most = float(explained.max())
         believed = 5.0  # turns that this is worth
-        self._variance = (self._yy + by_gain - most + believed * NOISE**2) / (self._count + believed)
+        self._variance = (self._yy + by_gain - most + believed * TURN_NOISE**2) / (self._count + believed)
         # 3.0: turns that say as much as one independent turn: what the model does not know lasts longer than a step
         cost = (most - explained) / (2 * self._variance * 3.0) + self._prior
         moments = (self._powers @ np.exp(float(cost.min()) - cost)).tolist()

@@ -10,7 +10,7 @@ from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
 from monstertruck_drivers.arduino_bridge.driver import ArduinoBridgeDriver, setpoint_of
 from monstertruck_drivers.arduino_bridge.emulator import ArduinoBridgeEmulator
 from monstertruck_drivers.arduino_bridge.probe import probe
-from monstertruck_drivers.arduino_bridge.protocol import BAUD, pwm, speeds
+from monstertruck_drivers.arduino_bridge.protocol import BOARD_BAUD, pwm, speeds
 from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import (
@@ -34,7 +34,7 @@ RPM = 60 / math.tau
 class Rig(DriverRig):
     def __init__(self, clock, config):
         super().__init__(clock, None)
-        self.port.device.baud = BAUD
+        self.port.device.baud = BOARD_BAUD
         self.rotors = [FreeMotor() for _ in range(2)]
         self.emulator = ArduinoBridgeEmulator(clock, tuple(self.rotors), config)
         self.commands = [Mailbox(latest(), lambda _: None) for _ in range(4)]

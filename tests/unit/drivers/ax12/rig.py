@@ -8,7 +8,7 @@ from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import Ax12Config
 from monstertruck_drivers.ax12.driver import Ax12Driver
 from monstertruck_drivers.ax12.emulator import Ax12Bus
-from monstertruck_drivers.ax12.protocol import BAUD, ID, STEP, Ax12Parser, Packet, Present
+from monstertruck_drivers.ax12.protocol import AX12_BAUD, ID, STEP, Ax12Parser, Packet, Present
 from monstertruck_drivers.ax12.unit import Unit
 from monstertruck_drivers.cable import EmulatedPort
 from monstertruck_drivers.link import Link
@@ -78,7 +78,7 @@ async def bench(
     config: Ax12Config | None = None,
     *,
     port: EmulatedPort | None = None,
-    host_baud: int = BAUD,
+    host_baud: int = AX12_BAUD,
     **bus: Any,
 ) -> AsyncIterator[Rig]:
     """Bus plugged in and running; the driver is started by the test."""

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monstertruck_drivers.ax12 import protocol as p
-from monstertruck_drivers.ax12.protocol import LONGEST, Alarm, Ax12Parser, Packet, Present
+from monstertruck_drivers.ax12.protocol import LONGEST_PACKET, Alarm, Ax12Parser, Packet, Present
 from tests.unit.drivers.ax12.rig import instruction, reg_write
 
 
@@ -100,7 +100,9 @@ def test_the_control_table_has_no_overlap():
     assert {r.address for r in p.REGISTERS if r.is_stored} == {0, 2, 3, 4, 5, 6, 8, 11, 12, 13, 14, 16, 17, 18}
 
 
-packets = st.builds(Packet, unit=st.integers(0, 254), code=st.integers(0, 255), params=st.binary(max_size=LONGEST - 2))
+packets = st.builds(
+    Packet, unit=st.integers(0, 254), code=st.integers(0, 255), params=st.binary(max_size=LONGEST_PACKET - 2)
+)
 
 
 @settings(max_examples=60)
@@ -121,7 +123,7 @@ def test_packets_come_out_however_they_are_cut(sent: list[Packet], cuts: list[in
 def test_garbage_is_survived_in_bounded_space(garbage: bytes):
     parser = Ax12Parser()
     parser.feed(garbage)
-    assert len(parser) < LONGEST + 4
+    assert len(parser) < LONGEST_PACKET + 4
 
 
 HEAVY = st.lists(st.sampled_from((0xFF, 0xFE, 0x01, 0x02, 0x96)), max_size=300).map(bytes)
@@ -131,7 +133,7 @@ HEAVY = st.lists(st.sampled_from((0xFF, 0xFE, 0x01, 0x02, 0x96)), max_size=300).
 @given(HEAVY, st.binary(max_size=20).map(lambda data: Packet(1, 0, data.replace(b"\xff", b"\x00"))))
 def test_after_garbage_packets_are_found_once_a_false_header_ran_out(garbage: bytes, packet: Packet):
     parser = Ax12Parser()
-    again = (LONGEST + 4) // len(packet.encode()) + 2
+    again = (LONGEST_PACKET + 4) // len(packet.encode()) + 2
     assert packet in parser.feed(garbage) + parser.feed(packet.encode() * again)
 
 

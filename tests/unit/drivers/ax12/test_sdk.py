@@ -141,7 +141,7 @@ async def test_the_driver_over_the_same_pty(tmp_path: Path):
         commands: Mailbox[StabiliserCommand] = Mailbox(latest())
         out, events = Kept(), Events()
         ready = asyncio.Event()
-        driver = Ax12Driver(Ax12Config(), SerialPort(path, p.BAUD), clock, commands, out, events)
+        driver = Ax12Driver(Ax12Config(), SerialPort(path, p.AX12_BAUD), clock, commands, out, events)
         async with background(driver.run(ready.set)):
             await asyncio.wait_for(ready.wait(), 5)
             seq, goals = 0, pytest.approx((0.1, -0.1), abs=p.STEP)

@@ -12,7 +12,7 @@ from monstertruck_drivers.bno085.config import Bno085Config
 from monstertruck_drivers.bno085.driver import Bno085Driver, body_rates
 from monstertruck_drivers.bno085.emulator import Bno085Emulator
 from monstertruck_drivers.bno085.probe import probe
-from monstertruck_drivers.bno085.protocol import BAUD, GRAVITY, measured
+from monstertruck_drivers.bno085.protocol import BNO085_BAUD, measured
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.emulation import ImuReading
 from monstertruck_drivers.inertial import ImuCorrection
@@ -25,7 +25,7 @@ from monstertruck_runtime.errors import (
     WrongDeviceError,
 )
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import Attitude, Imu
+from monstertruck_schemas.sensor import STANDARD_GRAVITY, Attitude, Imu
 from tests.unit.drivers.kit import DriverRig, Kept, background
 
 TILT = 0.1
@@ -37,7 +37,7 @@ class Turning:
     """A unit that turns left at 0.5 rad/s with its nose down."""
 
     def imu(self, time_ns):
-        return ImuReading((0.0, 0.0, 0.5), (-GRAVITY * sin(TILT), 0.0, GRAVITY * cos(TILT)), 25.0)
+        return ImuReading((0.0, 0.0, 0.5), (-STANDARD_GRAVITY * sin(TILT), 0.0, STANDARD_GRAVITY * cos(TILT)), 25.0)
 
 
 class Rig(DriverRig):
@@ -82,8 +82,8 @@ def test_turn_rate_force_and_tilt():
             rates = [imu.angular_velocity.z for imu in rig.out.kept[20:]]
             assert sum(rates) / len(rates) == pytest.approx(0.5 * cos(TILT), abs=0.01)
             last, attitude = rig.out.last, rig.attitude.last
-            assert last.linear_acceleration.x == pytest.approx(-GRAVITY * sin(TILT), abs=0.15)
-            assert last.linear_acceleration.z == pytest.approx(GRAVITY * cos(TILT), abs=0.15)
+            assert last.linear_acceleration.x == pytest.approx(-STANDARD_GRAVITY * sin(TILT), abs=0.15)
+            assert last.linear_acceleration.z == pytest.approx(STANDARD_GRAVITY * cos(TILT), abs=0.15)
             assert last.frame == "imu"
             assert 0.004 * SECOND < last.received - last.stamp < 0.03 * SECOND
             assert (rig.out.kept[-1].received - rig.out.kept[-51].received) / SECOND == pytest.approx(1.0, abs=0.03)
@@ -205,7 +205,7 @@ async def test_a_foreign_client_reads_what_the_unit_feels(tmp_path):
     port.plug()
 
     def read():
-        with serial.Serial(port.name, BAUD, timeout=2) as line:
+        with serial.Serial(port.name, BNO085_BAUD, timeout=2) as line:
             return BNO08x_RVC(line, timeout=5).heading
 
     try:
@@ -217,4 +217,4 @@ async def test_a_foreign_client_reads_what_the_unit_feels(tmp_path):
         with contextlib.suppress(asyncio.CancelledError):
             await running
     assert (pitch, roll) == pytest.approx((degrees(TILT), 0.0), abs=0.6)
-    assert (x, y, z) == pytest.approx((-GRAVITY * sin(TILT), 0.0, GRAVITY * cos(TILT)), abs=0.2)
+    assert (x, y, z) == pytest.approx((-STANDARD_GRAVITY * sin(TILT), 0.0, STANDARD_GRAVITY * cos(TILT)), abs=0.2)

@@ -8,7 +8,7 @@ import pytest
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.maestro.protocol import ERROR_MASK, POSITION_MAX, Encoder
-from monstertruck_drivers.maestro.session import ATTEMPTS, QUIET, RESYNC_TRIES, MaestroSession
+from monstertruck_drivers.maestro.session import IDENTIFY_ATTEMPTS, QUIET_AFTER_ANSWER, RESYNC_TRIES, MaestroSession
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError, WrongDeviceError
 
@@ -91,12 +91,12 @@ def test_nothing_is_asked_while_a_late_answer_is_still_coming():
         with pytest.raises(DeviceTimeoutError):
             await peer.session.ask(ERRORS)
         peer.link.feed(b"\1")
-        asyncio.get_running_loop().call_later(0.9 * QUIET, peer.link.feed, b"\2")
+        asyncio.get_running_loop().call_later(0.9 * QUIET_AFTER_ANSWER, peer.link.feed, b"\2")
         peer.replies = [words(CENTRE), words(5)]
         began = clock.now()
         assert await peer.session.ask(ERRORS) == [5]
         assert peer.written == [ERRORS, POSITION, ERRORS]
-        assert (clock.now() - began) / SECOND == pytest.approx(2.9 * QUIET, abs=1e-3)
+        assert (clock.now() - began) / SECOND == pytest.approx(2.9 * QUIET_AFTER_ANSWER, abs=1e-3)
 
     with_peer(None)(test)
 
@@ -163,7 +163,7 @@ def test_a_device_that_answers_out_of_form_is_no_maestro(answer: bytes):
         peer.replies = [answer if reply is None else reply for reply in peer.replies]
         with pytest.raises(WrongDeviceError, match="no Maestro"):
             await peer.session.identify(0)
-        assert peer.written.count(POSITION + ERRORS) == ATTEMPTS == 3
+        assert peer.written.count(POSITION + ERRORS) == IDENTIFY_ATTEMPTS == 3
 
     with_peer(None, None, None)(test)
 

@@ -9,13 +9,24 @@ from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.emulation import EmulatorSetup
 from monstertruck_drivers.receiver import crsf, sbus
-from monstertruck_drivers.receiver.channels import CENTRE, CHANNELS, HIGH, LOW, pack, position, raw, unpack
 from monstertruck_drivers.receiver.config import CrsfConfig, SbusConfig
 from monstertruck_drivers.receiver.crsf import CrsfParser
 from monstertruck_drivers.receiver.driver import ReceiverDriver
 from monstertruck_drivers.receiver.emulator import ReceiverEmulator
 from monstertruck_drivers.receiver.frames import ReceiverFrame
 from monstertruck_drivers.receiver.probe import probe
+from monstertruck_drivers.receiver.protocol import (
+    CENTRE,
+    CHANNELS,
+    CRSF_ADDRESS,
+    HIGH,
+    LOW,
+    SBUS_SIZE,
+    pack,
+    position,
+    raw,
+    unpack,
+)
 from monstertruck_drivers.receiver.sbus import SbusParser
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import (
@@ -70,7 +81,7 @@ def test_a_published_frame_has_our_sum_and_channels():
     assert crsf.crc8(body) == PUBLISHED[-1]
     words = unpack(body[1:])
     assert set(words[8:]) == {CENTRE}
-    assert crsf.channels_frame(words) == bytes((crsf.ADDRESS,)) + PUBLISHED[1:]
+    assert crsf.channels_frame(words) == bytes((CRSF_ADDRESS,)) + PUBLISHED[1:]
 
 
 def test_a_foreign_parser_reads_our_frames_and_ours_reads_its_layout():
@@ -103,7 +114,7 @@ def test_sbus_byte_by_byte():
 @given(st.lists(channels, min_size=1, max_size=4), st.integers(1, 60))
 def test_chunks_of_any_size_give_the_frames(words, size):
     for build, parser, skipped in ((crsf.channels_frame, CrsfParser(), 0), (sbus.frame, SbusParser(), 1)):
-        data = b"".join(map(build, words)) + bytes(sbus.SIZE)
+        data = b"".join(map(build, words)) + bytes(SBUS_SIZE)
         found = [frame for i in range(0, len(data), size) for frame in parser.feed(data[i : i + size])]
         assert [frame.channels for frame in found][: len(words) - skipped] == words[skipped:][: len(found)]
 

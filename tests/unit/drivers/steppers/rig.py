@@ -9,7 +9,7 @@ from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_drivers.steppers.driver import StepperDriver
 from monstertruck_drivers.steppers.emulator import StepperEmulator
-from monstertruck_drivers.steppers.protocol import BAUD
+from monstertruck_drivers.steppers.protocol import STEPPERS_BAUD
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.cmd import DriveAction, DriveCommand
@@ -20,7 +20,7 @@ from tests.unit.drivers.kit import DriverRig, Kept, background
 class Rig(DriverRig):
     def __init__(self, clock: Clock, port: EmulatedPort | None, config: StepperConfig, **emulator: Any) -> None:
         super().__init__(clock, port)
-        self.port.device.baud = BAUD
+        self.port.device.baud = STEPPERS_BAUD
         self.rotors = [FreeMotor() for _ in range(4)]
         self.emulator = StepperEmulator(clock, self.rotors, **emulator)
         self.commands: list[Mailbox[DriveCommand]] = [Mailbox(latest(), lambda _: None) for _ in range(4)]

@@ -9,7 +9,7 @@ from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.vesc.config import RAD_S_PER_RPM, VescConfig
 from monstertruck_drivers.vesc.driver import VescDriver
 from monstertruck_drivers.vesc.emulator import VescEmulator
-from monstertruck_drivers.vesc.protocol import BAUD
+from monstertruck_drivers.vesc.protocol import VESC_BAUD
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.cmd import DriveAction, DriveCommand, SteeringCommand
@@ -35,7 +35,7 @@ class Servos:
 class Rig(DriverRig):
     def __init__(self, clock: Clock, port: EmulatedPort | None, config: VescConfig) -> None:
         super().__init__(clock, port)
-        self.port.device.baud = BAUD
+        self.port.device.baud = VESC_BAUD
         self.config = config
         self.rotors = [FreeMotor() for _ in config.motors]
         self.servos = Servos()

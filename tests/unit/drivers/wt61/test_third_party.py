@@ -13,7 +13,7 @@ import witmotion
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.emulation import ImuReading
 from monstertruck_drivers.wt61.emulator import Wt61Emulator
-from monstertruck_drivers.wt61.protocol import BAUD
+from monstertruck_drivers.wt61.protocol import WT61_BAUD
 from monstertruck_runtime.clock import WallClock
 
 pytestmark = pytest.mark.wall
@@ -31,7 +31,7 @@ async def test_rates_and_specific_force_are_the_worlds(tmp_path):
     running = asyncio.create_task(emulator.run(port.device))
     await asyncio.sleep(0)
     port.plug()
-    client = witmotion.IMU(port.name, baudrate=BAUD)
+    client = witmotion.IMU(port.name, baudrate=WT61_BAUD)
     try:
         async with asyncio.timeout(10):
             while client.last_a is None or client.last_w is None:

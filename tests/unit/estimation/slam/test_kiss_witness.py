@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.slam.config import SlamConfig
-from monstertruck_estimation.slam.kiss_witness import KissWitness
+from monstertruck_estimation.slam.kiss import KissWitness
 from monstertruck_estimation.slam.worker import SlamWorker
 from monstertruck_estimation.slam.worker_io import ScanInput, SlamEstimate, Start, WorkerInput
 from monstertruck_runtime.clock import SECOND

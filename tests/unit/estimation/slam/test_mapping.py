@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.kiss_matcher import KissMatcher
+from monstertruck_estimation.slam.kiss import KissMatcher
 from monstertruck_estimation.slam.mapping import Mapper, MappingEvent
 from monstertruck_estimation.slam.scans import ScanGeometry, prepare
 from monstertruck_kinematics.se2 import between, compose

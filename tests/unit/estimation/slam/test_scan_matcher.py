@@ -12,7 +12,7 @@ from monstertruck_estimation.slam.correlation import (
     correlation,
     merged,
 )
-from monstertruck_estimation.slam.kiss_matcher import KissMatcher
+from monstertruck_estimation.slam.kiss import KissMatcher
 from monstertruck_estimation.slam.registration import Cloud, Fit, register
 from monstertruck_estimation.slam.scan_matcher import (
     GATE,

@@ -10,7 +10,7 @@ from monstertruck_planners.collision import Footprint
 from monstertruck_planners.route import departure as departure_module
 from monstertruck_planners.route.api import Budget, RouteMap, Vehicle
 from monstertruck_planners.route.config import GridAstarConfig, HybridConfig, LatticeConfig
-from monstertruck_planners.route.departure import SPARE, departures
+from monstertruck_planners.route.departure import SPARE_MARGIN, departures
 from monstertruck_planners.route.grid_astar import GridAstarPlanner
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.lattice import LatticePlanner
@@ -186,7 +186,7 @@ def test_a_departure_ends_where_a_search_can_set_off_and_is_short():
         order = [(not d.turns, d.cost) for d in found]
         assert order == sorted(order)
         ends = np.array([d.end for d in found])
-        assert where.field.free(Footprint(), ends, MARGIN + SPARE).all()
+        assert where.field.free(Footprint(), ends, MARGIN + SPARE_MARGIN).all()
         assert start[1] < found[0].end[1] < start[1] + MARGIN - gap + 0.02
         assert np.abs(found[0].segments[:, 0]).min() >= 0.02
 

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from monstertruck_sim.world.config import SimTruckConfig, SkidModelConfig
-from monstertruck_sim.world.skid import SkidEffects
+from monstertruck_sim.world.truck_plant import SkidEffects
 
 DT = 0.005
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monstertruck_drivers.os4000.attitude import GRAVITY, level_field
+from monstertruck_drivers.os4000.attitude import level_field
 from monstertruck_drivers.os4000.config import IronConfig
 from monstertruck_kinematics.chassis import Dimensions
 from monstertruck_kinematics.truck import DriveTrain
@@ -16,7 +16,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.cmd import SteeringCommand
-from monstertruck_schemas.sensor import Attitude, DriveFeedback, DriveMode, Vector3
+from monstertruck_schemas.sensor import STANDARD_GRAVITY, Attitude, DriveFeedback, DriveMode, Vector3
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 from monstertruckd.tools.calibrate.weave import ANGLE, HALF_FRAME, SPEED, WEAVE, estimates, response, weaves
 
@@ -54,7 +54,7 @@ def record(dead_time, lag, direction=1, gain=0.9, seconds=12.0, noise=0.002, see
             )
         if k % 50 == 0:
             heading = (-yaw + noise * rng.standard_normal()) % math.tau
-            roll = direction * SPEED * rate / GRAVITY
+            roll = direction * SPEED * rate / STANDARD_GRAVITY
             found.attitude.append(
                 felt(header, heading, roll) if field else Attitude(**header, heading=heading, roll=roll, pitch=0.0)
             )

@@ -19,7 +19,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
 from monstertruck_schemas.topics import BEHAVIOUR, GATE
 from monstertruckd.tools.cli.main import app
-from monstertruckd.tools.tune.recipe import CALM, MOST, OVERSHOOTS, RunVerdict, judged, recipe
+from monstertruckd.tools.tune.recipe import CALM, MOST_RUNS, OVERSHOOTS, RunVerdict, judged, recipe
 from monstertruckd.tools.tune.runs import draw, tune
 from tests.bus_kit import gate_state
 from tests.unit.planners.behave.wall_kit import Robot, drive
@@ -178,7 +178,7 @@ def test_it_gives_up_after_some_runs_without_calm_gains():
             tried.append(trials.send(RunVerdict(1.0, 0.02)))
     except StopIteration as end:
         best = end.value
-    assert len(tried) == MOST
+    assert len(tried) == MOST_RUNS
     assert tried[-1].k_d > 0.0
     assert best is None
 

@@ -1,4 +1,4 @@
-"""Sixteen channels of 11 bits, packed alike in CRSF and in SBUS frames.
+"""What CRSF and SBUS receivers share, sixteen channels of 11 bits, and the facts of both frames.
 
 Source: TBS, "CRSF protocol" (frame 0x16): channels follow each other, the lowest bit first; 172, 992 and 1811 are the
 pulses 988, 1500 and 2012 us. SBUS packs its channels the same way.
@@ -15,6 +15,22 @@ CENTRE: Final = 992
 HIGH: Final = 1811
 _MASK: Final = (1 << BITS) - 1
 _HALF: Final = (HIGH - LOW) / 2
+
+# CRSF; source: TBS, "CRSF protocol" (github.com/tbs-fpv/tbs-crsf-spec).
+CRSF_BAUD: Final = 420_000
+CRSF_ADDRESS: Final = 0xC8
+CHANNELS_TYPE: Final = 0x16
+LINK_TYPE: Final = 0x14
+LINK_SIZE: Final = 10
+
+# SBUS; source: the decoder of PX4 (``src/lib/rc/sbus.cpp``).
+SBUS_BAUD: Final = 100_000
+SBUS_SIZE: Final = 25
+SBUS_HEADER: Final = 0x0F
+SBUS_LOST: Final = 0x04
+SBUS_FAILSAFE: Final = 0x08
+SBUS_PERIOD: Final = 0.014
+"""Seconds between two frames."""
 
 ChannelWords = tuple[int, ...]
 """Sixteen raw values, 0 to 2047."""

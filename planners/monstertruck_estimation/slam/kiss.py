@@ -1,0 +1,140 @@
+"""kiss-icp (Vizzo et al. 2023) for planar scans: its map and registration, a scan matcher, and a second opinion.
+
+All points are kept: the package's own second downsampling leaves too few of a planar scan. The matcher returns neither
+a score nor a failure, so every result is measured as ours are (overlap, residual, information) and passes the same
+gate. The second opinion is scan odometry on a map of its own. It shares nothing with the estimate but the points of the
+scans: no wheels, no submaps, no pose graph. Each guess is the motion before. It drifts, so only motions over some
+seconds are compared.
+"""
+
+import math
+from collections import deque
+from typing import Final
+
+import numpy as np
+from kiss_icp.config import KISSConfig
+from kiss_icp.mapping import VoxelHashMap
+from kiss_icp.registration import get_registration
+
+from monstertruck_estimation.slam.correlation import Submap
+from monstertruck_estimation.slam.registration import measure
+from monstertruck_estimation.slam.scan_matcher import MIN_PAIRS, MatchStatus, ScanMatch, gated, rejected
+from monstertruck_estimation.slam.scans import Scan
+from monstertruck_estimation.slam.worker_io import SlamEstimate
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import between, compose
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.health import LocalisationStatus
+
+
+class KissMap:
+    """Points in one frame, to which scans are registered."""
+
+    def __init__(self) -> None:
+        config = KISSConfig()
+        config.registration.max_num_threads = 1
+        self._registration = get_registration(config)
+        voxel = 0.1  # edge of the voxels of its map, m
+        max_distance = 100.0  # points of the map farther away are forgotten by the package, m
+        per_voxel = 20
+        self._map = VoxelHashMap(voxel, max_distance, per_voxel)
+
+    def clear(self) -> None:
+        """Forget all points."""
+        self._map.clear()
+
+    def add(self, points: Array) -> None:
+        """Take points, (n, 2), m."""
+        self._map.add_points(_spatial(points))
+
+    def update(self, points: Array, pose: Array) -> None:
+        """Take the points, (n, 2), of a scan at ``pose``, (3,), and forget those that are far from it."""
+        self._map.update(_spatial(points), _matrix(pose))
+
+    def align(self, points: Array, guess: Array) -> Array:
+        """Pose, (3,), of a scan; the guess where the map is empty. Not finite where the registration failed."""
+        if self._map.empty():
+            return guess
+        reach = 0.5  # greatest distance of a pair, m
+        found = self._registration.align_points_to_map(
+            points=_spatial(points),
+            voxel_map=self._map,
+            initial_guess=_matrix(guess),
+            max_correspondance_distance=reach,
+            kernel=0.1,  # distance at which a pair's influence drops, m
+        )
+        return np.array((found[0, 3], found[1, 3], math.atan2(found[1, 0], found[0, 0])))
+
+
+def _spatial(points: Array) -> Array:
+    """Points (n, 2) as points (n, 3) at height 0, m."""
+    return np.column_stack((points, np.zeros(len(points))))
+
+
+def _matrix(pose: Array) -> Array:
+    """A planar pose (3,), m and rad, as a homogeneous matrix (4, 4)."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    result = np.eye(4)
+    result[:2, :2] = (c, -s), (s, c)
+    result[:2, 3] = pose[:2]
+    return result
+
+
+class KissMatcher:
+    """See ``ScanMatcher``; the map it registers to is the mapper's submap, so that loop closures move it too."""
+
+    def __init__(self) -> None:
+        self._map = KissMap()
+        self._submap: Submap | None = None
+
+    def match(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
+        """See ``ScanMatcher``."""
+        if len(scan) < MIN_PAIRS or len(submap.cloud) < MIN_PAIRS:
+            return rejected(guess, covariance, MatchStatus.EMPTY)
+        if submap is not self._submap:
+            self._submap = submap
+            self._map.clear()
+            self._map.add(submap.cloud.points)
+        pose = self._map.align(scan.points, guess)
+        if not np.isfinite(pose).all():
+            return rejected(guess, covariance, MatchStatus.FAR)
+        return gated(measure(scan, submap.cloud, pose), guess, covariance)
+
+
+JUMPS: Final = frozenset({"closed", "joined", "found", "refuted"})
+"""Events after which the estimate's next motion does not follow its last pose."""
+COMPARABLE: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED})
+"""Elsewhere the estimate says itself that it is in doubt, or in a corridor, where scans do not constrain the motion."""
+
+
+class KissWitness:
+    """Compares the estimate's motion with that by kiss-icp alone."""
+
+    def __init__(self) -> None:
+        self._map = KissMap()
+        self._pose, self._motion = np.zeros(3), np.zeros(3)
+        self._poses: deque[tuple[int, Array, Array]] = deque()
+        """Stamp, pose by kiss-icp, pose of the estimate."""
+
+    def compare(self, scan: Scan, estimate: SlamEstimate) -> float | None:
+        """Take a scan with the estimate of its pose; how far both motions are apart, m, if that is too much."""
+        guess = compose(self._pose, self._motion)
+        pose = self._map.align(scan.points, guess)
+        if not np.isfinite(pose).all():
+            pose = guess
+        self._map.update(scan.points, pose)
+        self._motion, self._pose = between(self._pose, pose), pose
+        if estimate.status not in COMPARABLE or JUMPS.intersection(estimate.events):
+            self._poses.clear()
+            return None
+        self._poses.append((estimate.stamp, pose, np.array(estimate.pose)))
+        compared = 5 * SECOND  # time over which motions are compared, ns
+        while estimate.stamp - self._poses[0][0] > compared:
+            self._poses.popleft()
+        _, by_kiss, by_estimate = self._poses[0]
+        off = between(between(by_kiss, pose), between(by_estimate, np.array(estimate.pose)))
+        distance = math.hypot(off[0], off[1])
+        if distance <= 0.2:  # difference of those that is reported, m
+            return None
+        self._poses.clear()
+        return distance
