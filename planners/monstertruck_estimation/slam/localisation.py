@@ -89,6 +89,8 @@ class LocalisationEstimator:
         self._stamp: int | None = None
         self._misfits = 0
         """Matches in a row that do not count."""
+        self._blind = False
+        """Whether the last match left a direction open."""
         self._published = False
         self._offset = ClockOffsetEstimator()
         self._scan_odometry = ScanOdometry()
@@ -131,7 +133,10 @@ class LocalisationEstimator:
                 self._scan_odometry.forget()
         else:
             match, status = self._track(scan, delta, (guess, covariance, published), mount)
-            self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
+            # By scans alone the first match behind a corridor makes up for an error there: that is no velocity.
+            blind, self._blind = self._blind, match.degenerate
+            if not blind or match.degenerate or self.odometry is OdometryUse.USED:
+                self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
             events = () if match.accepted else ("rejected",)
             if self._global is not None and self._refuted(match.pose, found, delta):
                 match, status = self._unknown(guess, covariance)
@@ -208,7 +213,9 @@ class LocalisationEstimator:
         """Match all beams, for the motion is known too badly to say which end on mapped ground."""
         match = self._front.match(scan, delta, *predicted[:2], self._submap)
         contradiction = self._evidence.judge(match.pose, scan.points, np.array(mount[:2])).contradiction
-        return match, fits(match) and contradiction <= MAX_CONTRADICTION
+        if not (fits(match) and contradiction <= MAX_CONTRADICTION):
+            return match, False
+        return _without_weak_direction(match, predicted[0], predicted[2]), True
 
     def _matched(self, scan: Scan, delta: Array, predicted: Predicted, mount: Pose2) -> tuple[ScanMatch, bool]:
         """Match the beams that end on mapped ground; whether the match counts."""

@@ -16,6 +16,7 @@ from monstertruck_estimation.slam.storage import SavedMap
 from monstertruck_estimation.slam.worker_io import ScanInput, SlamEstimate
 from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap
 from monstertruck_schemas.health import LocalisationStatus
 from tests.unit.estimation.slam.kit import LIDAR, ROOM, box, ranges, rounds
 from tests.unit.estimation.slam.test_map_evidence import ORIGIN, drawn
@@ -290,3 +291,23 @@ def test_a_robot_with_wheels_that_leaves_the_map_along_a_corridor_is_not_moved_b
             assert math.hypot(*off[:2]) < 0.5
             assert (np.abs(off[:2]) < 6.0 * deviation[:2] + 0.05).all()
     assert estimates[-1].status not in PLACED
+
+
+def test_by_scans_alone_the_velocity_lasts_in_a_corridor():
+    """The ends of the visible walls move along with the robot: a velocity taken from them runs away."""
+    length = 20.0
+    walls = [*box(0.0, -1.0, length, 1.0), *box(1.6, 0.6, 2.0, 1.0), *box(2.6, -1.0, 3.0, -0.7)]
+    cells = np.full((80, round((length + 2.0) / 0.05)), UNKNOWN, np.int8)
+    cells[20:60, 20:-20] = FREE
+    for (x0, y0), (x1, y1) in walls:
+        share = np.linspace(0.0, 1.0, 2000)
+        rows, columns = (y0 + share * (y1 - y0) + 2.0) / 0.05, (x0 + share * (x1 - x0) + 1.0) / 0.05
+        cells[rows.astype(int), columns.astype(int)] = OCCUPIED
+    truth = np.column_stack((np.arange(1.0, 12.0, 0.05), np.zeros((220, 2))))
+    saved = SavedMap(WorldMap(cells, 0.05, (-1.0, -2.0)), None)
+    estimates = followed(saved, walls, truth, odom=False, start=tuple(truth[0].tolist()))
+    along = np.array([estimate.pose[0] for estimate in estimates])
+    deviation = np.sqrt([estimate.covariance[0] for estimate in estimates])
+    assert estimates[-1].status is LocalisationStatus.DEGENERATE
+    assert (np.abs(along - truth[:, 0]) < 2.0 * deviation + 0.1).all()
+    assert np.abs(np.diff(along)).max() < 0.2
