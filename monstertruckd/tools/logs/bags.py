@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -162,11 +163,22 @@ def _json(_: str, data: bytes) -> Any:
 
 def _ros(encoding: str) -> Callable[[str, bytes], Any]:
     def parse(schema: str, data: bytes) -> Any:
-        from monstertruckd.tools.logs.ros_types import parsed  # noqa: PLC0415 - comes with an extra
-
-        return parsed(encoding, schema, data)
+        ros1, ros2 = _ros_types()
+        if encoding == "ros1":
+            return ros1.deserialize_ros1(data, "tf2_msgs/msg/TFMessage" if schema == "tf/msg/tfMessage" else schema)
+        return ros2.deserialize_cdr(data, schema)
 
     return parse
+
+
+@cache
+def _ros_types() -> tuple[Any, Any]:
+    """Layouts of messages of ROS 1 and 2: the same in all versions, so the definitions in a bag are not needed."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415 - comes with an extra
+
+    ros1 = get_typestore(Stores.ROS1_NOETIC)
+    ros1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    return ros1, get_typestore(Stores.ROS2_JAZZY)
 
 
 _PARSERS: Final[dict[str, Callable[[str, bytes], Any]]] = {
