@@ -49,6 +49,7 @@ from monstertruckd.ros2.rmw import Attachment, data_key
 from monstertruckd.ros2.zenoh_node import session_settings
 from monstertruckd.tools.demo.runs import free_endpoint, write_overlay
 from tests.bus_kit import gate_state, running_robot
+from tests.daemon.wall_kit import kept_armed, planner_ready
 from tests.ros2_kit import ServiceClient
 
 ROOT = Path(__file__).parents[1]
@@ -470,7 +471,7 @@ async def measure(clock: WallClock, folder: Path, options: argparse.Namespace) -
         await stack.enter_async_context(process(*program, "run", "--config", str(config)))
         client = await connected(endpoint, clock)
         stack.push_async_callback(client.__aexit__, None, None, None)
-        await asyncio.sleep(20.0)  # until planner and mapper are there
+        await planner_ready(client)
         face = await stack.enter_async_context(
             process(*program, "ros2", "--robot", f"truck@{endpoint}", "--listen", ros)
         )
@@ -481,7 +482,8 @@ async def measure(clock: WallClock, folder: Path, options: argparse.Namespace) -
         figures["late_joiner_ms"] = round(await asyncio.to_thread(late_joiner, ros), 1)
         figures |= await driven_by_pyzeros(client, port)
         print(json.dumps(figures), file=sys.stderr)
-        figures |= await goals(client, ros)
+        async with kept_armed(client):
+            figures |= await goals(client, ros)
         print(json.dumps(figures), file=sys.stderr)
         if options.rclpy is not None:
             figures["rclpy"] = await judged_by_rclpy(client, endpoint, options.rclpy, folder)
