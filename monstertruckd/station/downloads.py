@@ -18,6 +18,8 @@ from monstertruckd.station.address import RobotAddress
 
 log = logging.getLogger(__name__)
 
+LARGEST_RECORDING: Final = 2_000_000_000
+"""Size of a recording that is fetched to be shown at most: it is kept in the station's temporary folder."""
 RANGE: Final = re.compile(r"bytes=(\d{1,15})-")
 
 
@@ -68,13 +70,11 @@ async def fetch(
     """Fetch a recording into a file, going on with what is there of it already; ``progress`` gets the share.
 
     Raises:
-        InputError: it is larger than 2 GB.
+        InputError: it is larger than ``LARGEST_RECORDING``.
         TruckError: the robot refuses, or is not there.
     """
     async with _session(address, user, clock) as truck:
-        # Size of a recording that is fetched to be shown at most: it is kept in the station's temporary folder.
-        largest_recording = 2_000_000_000
-        await fetch_recording(truck, name, to, progress, largest_recording)
+        await fetch_recording(truck, name, to, progress, LARGEST_RECORDING)
 
 
 def _session(address: RobotAddress, user: str, clock: Clock) -> TruckClient:
