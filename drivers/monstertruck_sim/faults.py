@@ -19,6 +19,7 @@ from monstertruck_drivers.config import Devices
 from monstertruck_drivers.emulation import signals_of
 from monstertruck_drivers.epos.exchange import BRIEF_SILENCES
 from monstertruck_drivers.signals import Signals
+from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.clock import Clock, VirtualClock
 from monstertruck_runtime.errors import InputError
@@ -319,7 +320,8 @@ class FaultCatalog:
         self._drives = tuple(role for role in DRIVES if role in self._roles)
         self._vital = frozenset(VITAL) - ({"sonar"} if "lidar" in self._roles else frozenset())
         self._sonars = () if devices.sonar is None else tuple(devices.sonar.driver.sonars)
-        self._motors = 0 if devices.wheels is None else devices.wheels.driver.motors
+        settings = None if devices.wheels is None else devices.wheels.driver
+        self._motors = settings.motors if isinstance(settings, StepperConfig) else 0
         self._hubs = hubs_of(devices, unguarded)
         self._all_hubs = self._hubs == hubs_of(devices)
         """Whether all of them may be lost at once."""

@@ -59,6 +59,13 @@ def test_without_sonars_that_guard_it_a_robot_stops_and_with_a_lidar_it_need_not
         assert {one.must_stop for one in unplugged if one.name == "unplug: imu"} == {False}
 
 
+@pytest.mark.parametrize("name", ["turtle", "truck_today", "f1tenth"])
+def test_robots_of_todays_devices_have_no_faults_of_steppers(name):
+    kinds = FaultCatalog(loaded(name).devices, records=False).kinds
+    assert FaultKind.UNPLUG in kinds
+    assert not WHEELS & set(kinds) - {FaultKind.LATE_ANSWERS}
+
+
 def test_cross_talk_is_an_echo_from_where_nothing_is():
     config = loaded("sonar")
 
