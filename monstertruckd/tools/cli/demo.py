@@ -44,16 +44,28 @@ def demo(
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """The emulated truck drives a lap: real drivers, real bytes, real log."""
+    """The emulated truck drives a lap: real drivers, real bytes, real log.
+
+    A configuration without a path but with an explorer explores: `demo --config points --fast` maps unknown rooms,
+    finds a tag, drives home, and ends in the report of its log.
+    """
     from monstertruck_runtime.clock import run_wall
     from monstertruck_schemas.reasons import Reason
-    from monstertruckd.tools.demo.runs import run_fast_demo, run_wall_demo
+    from monstertruckd.tools.demo.exploring import DONE, ExplorationSummary
+    from monstertruckd.tools.demo.runs import (
+        run_fast_demo,
+        run_fast_exploration,
+        run_wall_demo,
+        run_wall_exploration,
+    )
+    from monstertruckd.tools.demo.summary import Summary
     from monstertruckd.tools.simulation.config import load_simulated
 
     simulated = load_simulated(config)
-    if simulated.path is None:
+    explores = simulated.path is None and simulated.explorer is not None
+    if simulated.path is None and not explores:
         raise ConfigError(
-            f"{config}: path: expected the path to drive, there is none; "
+            f"{config}: path: expected the path to drive, or an explorer, there is neither; "
             f"`monstertruckd simulate --run --config {config}` starts this robot"
         )
     if film is not None and (not fast or simulated.sim.world.engine != "mujoco" or film.suffix.lower() != ".gif"):
@@ -65,8 +77,13 @@ def demo(
     screen = on_terminal(sys.stdout) and not json_output
     if not fast and (waiting := busy()):
         remark(f"{waiting}: late control ticks may stop the robot; `monstertruckd demo --fast` waits for none")
+    summary: Summary | ExplorationSummary
     try:
-        if fast:
+        if explores and fast:
+            summary = run_fast_exploration(config, folder, seed, remark)
+        elif explores:
+            summary = run_wall(lambda clock: run_wall_exploration(clock, config, folder, seed, remark))
+        elif fast:
             summary = run_fast_demo(config, folder, seed, film)
         else:
             summary = run_wall(lambda clock: run_wall_demo(clock, config, folder, seed, screen=screen))
@@ -77,8 +94,8 @@ def demo(
         print_json(summary.as_json())
     else:
         _print(summary.rows(), summary.messages)
-    if summary.lap.outcome is not Reason.GOAL_REACHED:
-        finish(summary.lap.outcome, summary.lap.text)
+    if summary.outcome not in DONE:
+        finish(summary.outcome, summary.text)
         finish(Reason.INTERNAL)
 
 

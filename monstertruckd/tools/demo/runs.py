@@ -20,9 +20,13 @@ from rich.live import Live
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, WallClock, run_virtual
+from monstertruck_runtime.drives import TaskEnd
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError
+from monstertruck_runtime.threads import in_thread
 from monstertruck_runtime.yaml_files import yaml_text
+from monstertruck_schemas.plan import ExplorationState
 from monstertruckd.config.load import FILE_VERSION, load_config, load_tree
+from monstertruckd.tools.demo.exploring import ExplorationSummary, Report, explore_home, summarised
 from monstertruckd.tools.demo.summary import Summary, log_figures
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.operator import Lap, LocalOperator, drive_lap
@@ -128,6 +132,55 @@ async def _filmed(rig: VirtualRig, clock: VirtualClock, file: Path | None) -> As
                 await task
 
 
+def run_fast_exploration(config_file: Path, folder: Path, seed: int | None, report: Report) -> ExplorationSummary:
+    """Explore on the virtual clock, find a tag where there are tags, and drive home.
+
+    Args:
+        config_file: configuration of a simulated robot with an explorer.
+        folder: for log, map, report and outputs.
+        seed: of the world; None = the configuration's.
+        report: gets lines of progress.
+
+    Raises:
+        RequestRefusedError: the exploration does not start.
+    """
+    overlay = write_overlay(config_file, folder, "tcp/127.0.0.1:0", seed)
+    config, tree = load_config(overlay, SimulatedTruckConfig)
+
+    async def main(clock: VirtualClock) -> tuple[VirtualRig, TaskEnd[ExplorationState]]:
+        rig = VirtualRig(config, clock, tree)
+        async with rig.running():
+            operator = LocalOperator(rig.daemon, clock)
+            end = await explore_home(operator, clock, tags=seeks(config), report=report)
+            await clock.sleep(1.0)
+        return rig, end
+
+    rig, end = run_virtual(main, start=SECOND)
+    return summarised(end, rig.truth.array(), folder)
+
+
+def seeks(config: SimulatedTruckConfig) -> bool:
+    """Whether the robot looks for a tag: its world has some, and it keeps points of interest."""
+    return config.points is not None and bool(config.sim.world.tags)
+
+
+async def run_wall_exploration(
+    clock: Clock, config_file: Path, folder: Path, seed: int | None, report: Report
+) -> ExplorationSummary:
+    """Do the same over ptys, in real time; arguments and errors are those of ``run_fast_exploration``.
+
+    Raises:
+        NoAnswerError: a process did not come up.
+    """
+    config = load_config(config_file, SimulatedTruckConfig)[0]
+    async with _served(clock, config_file, folder, seed) as client:
+        end = await explore_home(client, clock, tags=seeks(config), report=report)
+        await clock.sleep(1.0)
+    with np.load(folder / "truth.npz") as archive:
+        truth = archive["truth"]
+    return await in_thread(lambda: summarised(end, truth, folder))
+
+
 async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | None, *, screen: bool) -> Summary:
     """Drive a lap over ptys.
 
@@ -141,17 +194,8 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
     Raises:
         NoAnswerError: a process did not come up, or the lap was not finished.
     """
-    endpoint = free_endpoint()
     given = load_tree(config).data
-    overlay = write_overlay(config, folder, endpoint, seed)
-    truth = folder / "truth.npz"
-    simulate = ("simulate", "--config", str(overlay), "--truth", str(truth))
-    async with (
-        program(folder / "simulate.txt", *simulate),
-        _ready((folder / "simulate.txt").read_bytes, clock),
-        program(folder / "daemon.txt", "run", "--config", str(overlay)),
-        await connect(clock, given.get("robot", "truck"), endpoint) as client,
-    ):
+    async with _served(clock, config, folder, seed) as client:
         follower = Follower(client, clock)
         watching = asyncio.create_task(_show(follower, clock, screen=screen))
         try:
@@ -163,7 +207,7 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
             watching.cancel()
             await asyncio.wait([watching])
         loop = follower.state.loop
-    with np.load(truth) as archive:
+    with np.load(folder / "truth.npz") as archive:
         rows = archive["truth"]
     return Summary(
         lap,
@@ -173,6 +217,21 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
         *log_figures(folder),
         closed=(given.get("path") or {}).get("closed", False),
     )
+
+
+@asynccontextmanager
+async def _served(clock: Clock, config: Path, folder: Path, seed: int | None) -> AsyncIterator[TruckClient]:
+    """Emulated robot and daemon as processes of their own, and a client; the truth is written at the end."""
+    endpoint = free_endpoint()
+    overlay = write_overlay(config, folder, endpoint, seed)
+    simulate = ("simulate", "--config", str(overlay), "--truth", str(folder / "truth.npz"))
+    async with (
+        program(folder / "simulate.txt", *simulate),
+        _ready((folder / "simulate.txt").read_bytes, clock),
+        program(folder / "daemon.txt", "run", "--config", str(overlay)),
+        await connect(clock, load_tree(config).data.get("robot", "truck"), endpoint) as client,
+    ):
+        yield client
 
 
 @asynccontextmanager
@@ -206,6 +265,9 @@ def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = 
         "recorder": {"directory": str(here / "logs")},
         "state_directory": str(here / "state"),
     }
+    slam = given.get("slam") or {}
+    if slam.get("mode") == "mapping" and not Path(slam.get("save") or "").is_absolute():
+        overlay["slam"] = {"save": str(here / "explored")}
     if given.get("map"):
         overlay["map"] = {"picture": str(here / "map.png")}
     if seed is not None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.logs.summary import info
 from monstertruckd.tools.simulation.operator import Lap
 
@@ -47,6 +48,16 @@ class Summary:
     """Simulated seconds per real second; virtual clock only."""
     closed: bool = True
     """The path is a lap: its true closing error counts."""
+
+    @property
+    def outcome(self) -> Reason:
+        """How the lap ended."""
+        return self.lap.outcome
+
+    @property
+    def text(self) -> str:
+        """Why the lap was given up; empty if it was driven."""
+        return self.lap.text
 
     def _driven(self) -> Array:
         times = self.truth[:, 0]

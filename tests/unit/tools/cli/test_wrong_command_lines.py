@@ -57,7 +57,7 @@ WRONG = (
     (
         "demo --fast -c configs/goals.yaml",
         2,
-        "configs/goals.yaml: path: expected the path to drive, there is none; `mons",
+        "configs/goals.yaml: path: expected the path to drive, or an explorer, there is",
     ),
     ("demo --seed x", 2, "Error: Invalid value for '--seed': expected a whole number"),
     ("demo --seed -1 --fast -c /nonexistent", 2, "/nonexistent: cannot be read: No such file or directory"),
