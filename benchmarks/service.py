@@ -48,10 +48,10 @@ path: { file: paths/loop.csv, closed: true }
 tracker: { kind: pure_pursuit }
 odometry: { start: { x: 0.0, y: -1.7, yaw: 0.0 } }
 """
-EMULATED_UNIT = f"""
+EMULATED_UNIT = """
 [Service]
-ExecStart={PROGRAM}/.venv/bin/python -P {PROGRAM}/benchmarks/service_parts/emulated.py \\
-  {PROGRAM}/configs/truck-of-the-benchmark.yaml /var/lib/wire.jsonl
+ExecStart={folder}/.venv/bin/python -P {folder}/benchmarks/service_parts/emulated.py \\
+  {folder}/configs/truck-of-the-benchmark.yaml /var/lib/wire.jsonl
 [Install]
 WantedBy=multi-user.target
 """
@@ -117,6 +117,9 @@ class Wire:
 class Bench:
     """The machine, the wire, and what was found."""
 
+    command = f"{PROGRAM}/.venv/bin/monstertruckd"
+    """The installed program, inside the machine."""
+
     def __init__(self, machine: Machine) -> None:
         self.machine = machine
         self.wire = WireLog(machine.root / "var/lib/wire.jsonl")
@@ -164,7 +167,7 @@ class Bench:
         self.machine.run("systemctl", "start", SERVICE)
         until(lambda: self.program("arm").returncode == 0, 20, every=0.5)
         # To the daemon the ports are real: arming alone does not start the path.
-        self.machine.run("systemd-run", "--quiet", f"{PROGRAM}/.venv/bin/monstertruckd", "path", "loop", "--arm")
+        self.machine.run("systemd-run", "--quiet", self.command, "path", "loop", "--arm")
         return until(self.moves, 20)
 
     def moves(self) -> bool:
@@ -325,7 +328,7 @@ def never_ticks(root: Path) -> None:
 
 def dies(root: Path) -> None:
     """Make the third version one that ends at once."""
-    _edit(root, "monstertruckd/run.py", "    config, tree =", "    raise SystemExit(1)\n    config, tree =")
+    _edit(root, "monstertruckd/run.py", "    faulthandler.enable()", "    raise SystemExit(1)")
 
 
 def _edit(root: Path, name: str, before: str, after: str) -> None:
@@ -369,33 +372,49 @@ def uninstall(bench: Bench) -> None:
 
 def versions(machine: Machine) -> None:
     """Put this tree's files into the machine, three times, each with its environment."""
+    for folder in (PROGRAM, NEXT, NEVER):
+        checkout(machine, folder)
+    place = machine.root / PROGRAM.relative_to("/")
+    freezable(place / ".venv")
+    emulated_truck(machine, PROGRAM)
+
+
+def checkout(machine: Machine, folder: Path) -> None:
+    """Put this tree's files into a folder of the machine, with their environment."""
     caches = {
         Path.home() / ".cache" / "uv": "/root/.cache/uv",
         Path(find_uv()).parent: "/root/.cache/monstertruckd",
     }
-    names = subprocess.run(
-        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT,
-        capture_output=True,
-        check=True,
-    ).stdout
-    for folder in (PROGRAM, NEXT, NEVER):
-        place = machine.root / folder.relative_to("/")
-        place.mkdir(parents=True, exist_ok=True)
-        archive = subprocess.run(
-            ["tar", "--create", "--null", "--files-from=-"], cwd=ROOT, input=names, capture_output=True, check=True
-        ).stdout
-        subprocess.run(["tar", "--extract", "--no-same-owner"], cwd=place, input=archive, check=True)
-        if not (place / ".venv").exists():
-            sync = "from monstertruckd.bootstrap import sync; sync(('robot', 'sim'))"
-            machine.prepare(folder, ["python3", "-c", sync], caches)
-    place = machine.root / PROGRAM.relative_to("/")
-    (place / "configs/truck-of-the-benchmark.yaml").write_text(TRUCK)
-    (packages,) = place.glob(".venv/lib/python3.*/site-packages")
+    place = machine.root / folder.relative_to("/")
+    copy_tree(place)
+    if not (place / ".venv").exists():
+        sync = "from monstertruckd.bootstrap import sync; sync(('robot', 'sim'))"
+        machine.prepare(folder, ["python3", "-c", sync], caches)
+
+
+def copy_tree(place: Path) -> None:
+    """Copy what git knows of this tree, uncommitted changes included."""
+    place.mkdir(parents=True, exist_ok=True)
+    listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    names = subprocess.run(listed, cwd=ROOT, capture_output=True, check=True).stdout
+    pack = ["tar", "--create", "--null", "--files-from=-"]
+    archive = subprocess.run(pack, cwd=ROOT, input=names, capture_output=True, check=True).stdout
+    subprocess.run(["tar", "--extract", "--no-same-owner"], cwd=place, input=archive, check=True)
+
+
+def freezable(environment: Path) -> None:
+    """Let signals freeze the programs of an environment."""
+    (packages,) = environment.glob("lib/python3.*/site-packages")
     (packages / "freezing.py").write_text((PARTS / "freezing.py").read_text())
     (packages / "freezing.pth").write_text("import freezing\n")
+
+
+def emulated_truck(machine: Machine, folder: Path) -> None:
+    """Start the truck behind /dev/truck with the machine, by the checkout in a folder of it."""
+    place = machine.root / folder.relative_to("/")
+    (place / "configs/truck-of-the-benchmark.yaml").write_text(TRUCK)
     unit = machine.root / "etc/systemd/system/emulated.service"
-    unit.write_text(EMULATED_UNIT)
+    unit.write_text(EMULATED_UNIT.format(folder=folder))
     (unit.parent / "multi-user.target.wants").mkdir(exist_ok=True)
     enabled = unit.parent / "multi-user.target.wants" / unit.name
     enabled.unlink(missing_ok=True)

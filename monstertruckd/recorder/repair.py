@@ -248,7 +248,7 @@ def _may_wait(path: Path) -> bool:
 def main(folder: Path) -> None:
     """Repair ``folder``; standard output has the outcome for each log, as a JSON string on a line."""
     os.nice(15)
-    logging.basicConfig(level=logging.INFO, format="%(levelname)-7s %(name)s: %(message)s")
+    logging.disable()  # the daemon reports the outcomes, with the journal's priorities
     for outcome in _repairs(folder):
         text = f"repaired {outcome}" if isinstance(outcome, Recovery) else f"not repaired: {outcome}"
         sys.stdout.write(json.dumps(text) + "\n")

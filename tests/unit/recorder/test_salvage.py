@@ -3,6 +3,8 @@
 import errno
 import os
 import random
+import subprocess
+import sys
 import zlib
 from dataclasses import replace
 from io import BytesIO
@@ -90,6 +92,13 @@ def test_the_case_of_the_hole(tmp_path):
     )
     assert Path(f"{file}.damaged").read_bytes() == ZEROS.read_bytes()
     assert recover(file, file) == replace(done, messages=240, lost=0, spans=(), damage=None, original=None)
+
+
+def test_the_process_of_the_daemon_reports_and_logs_nothing_itself(tmp_path):
+    (tmp_path / "log.mcap").write_bytes(ZEROS.read_bytes()[:-100])
+    command = [sys.executable, "-m", "monstertruckd.recorder.repair", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert (done.stdout.startswith('"repaired '), done.stderr) == (True, ""), "the journal would give it no priority"
 
 
 def test_an_original_is_kept_beside_those_of_earlier_repairs(tmp_path):
