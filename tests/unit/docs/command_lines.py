@@ -186,6 +186,7 @@ FOREIGN = {
     "python3 -m monstertruckd.bootstrap demo": "sets up .venv, then `monstertruckd demo`, which has its own tests",
     "python3 -m monstertruckd.bootstrap try": "sets up .venv, then `monstertruckd try`, which has its own tests",
     "python3 -m monstertruckd.bootstrap check": "runs this very test",
+    "python3 systemd/debian/build.py": "benchmarks/package.py builds the package and installs it in a Debian",
     "python3 -m monstertruckd.bootstrap sync": "sets up .venv; tests/unit/test_bootstrap.py checks what it runs",
     "python docs/site/build.py": "test_site.py builds it into another folder",
     "python -m benchmarks.thesis --only 5.1 5.5": "drives for minutes; slowness and scores have their tests",
