@@ -18,6 +18,9 @@ from typing import Final, Protocol
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.errors import BusyError, DeviceLostError, InputError, PortBusyError
 
+FRAME: Final = 0.001
+"""Duration of a USB frame: bytes that a device sends within one arrive together (s)."""
+
 
 class DeviceEnd:
     """The device's side of a port: what an emulator reads and writes, whoever has the host side open.
@@ -326,8 +329,7 @@ class PtyPort:
     def _send(self, data: bytes) -> None:
         self._frame += data
         if self._timer is None:
-            frame = 0.001  # seconds of a USB frame: what a device says within one reaches the host together
-            self._timer = asyncio.get_running_loop().call_later(frame, self._end_frame)
+            self._timer = asyncio.get_running_loop().call_later(FRAME, self._end_frame)
 
     def _end_frame(self) -> None:
         assert self._fds is not None

@@ -21,6 +21,8 @@ import zenoh
 from monstertruck_schemas.topics import owner_of
 from monstertruckd.bus.access import ANONYMOUS
 
+REPLY_QUEUE: Final = 4096
+"""Maximum number of queries that wait for their reply; the next is taken when one has left."""
 log = logging.getLogger(__name__)
 
 THREADS: Final = 8
@@ -44,9 +46,7 @@ class Replies:
     def wait_for_room(self) -> None:
         """Wait until there is room for one more reply; not for the event loop."""
         with self._change:
-            # Queries that may wait for their reply; beyond that no further query is taken until one has left.
-            reply_queue = 4096
-            self._change.wait_for(lambda: self._waiting < reply_queue)
+            self._change.wait_for(lambda: self._waiting < REPLY_QUEUE)
 
     def end(
         self, query: zenoh.Query, reply: Reply | None = None, source: str | None = None, *, order: bool = False

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Mapping
 from contextlib import ExitStack
-from typing import Any
+from typing import Any, Final
 
 from monstertruck_runtime.client import TruckClient, Watched
 from monstertruck_runtime.clock import SECOND, Clock
@@ -14,6 +14,9 @@ from monstertruck_schemas.state import Odometry
 from monstertruckd.station import frames
 from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.viewer import Viewer
+
+FLEET_PERIOD: Final = 0.5
+"""Time between checks of all robots (s)."""
 
 
 class RobotSnapshot:
@@ -93,7 +96,7 @@ class FleetBoard:
                 frame = self._look()
                 for viewer in self._viewers:
                     viewer.show("fleet", frame)
-                await self._clock.sleep(0.5)  # seconds between two checks of all robots
+                await self._clock.sleep(FLEET_PERIOD)
                 if not self._viewers:
                     self._leave()
         finally:

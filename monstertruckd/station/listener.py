@@ -6,9 +6,14 @@ import ssl
 from collections import Counter
 from collections.abc import Callable, Coroutine
 from contextlib import ExitStack
-from typing import Any
+from typing import Any, Final
 
 from monstertruckd.station.users import network_of
+
+HANDSHAKE_LIMIT: Final = 5.0
+"""Maximum duration of a TLS handshake (s)."""
+MOST_OF_NETWORK: Final = 32
+"""Maximum number of connections of one network that are being set up; further ones are closed at once."""
 
 
 class WebListener:
@@ -81,17 +86,15 @@ class WebListener:
                 continue
             address = str(name[0])
             network = network_of(address)
-            # Connections of one network that are being set up; further connections are closed at once.
-            most_of_network = 32
-            if self._under_way[network] < most_of_network:
+            if self._under_way[network] < MOST_OF_NETWORK:
                 self._under_way[network] += 1
                 self._begin(self._greet(taken, address, network))
             else:
                 taken.close()
-                self._refused(address, f"{most_of_network} connections of {network} are being set up: no further one")
+                self._refused(address, f"{MOST_OF_NETWORK} connections of {network} are being set up: no further one")
 
     async def _greet(self, taken: socket.socket, address: str, network: str) -> None:
-        longest = None if self._tls is None else 5.0  # seconds that a handshake may take
+        longest = None if self._tls is None else HANDSHAKE_LIMIT
         try:
             await asyncio.get_running_loop().connect_accepted_socket(
                 self._inside, taken, ssl=self._tls, ssl_handshake_timeout=longest

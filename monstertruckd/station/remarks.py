@@ -5,6 +5,8 @@ import logging
 from collections import Counter
 from typing import Final
 
+COUNTING_WINDOW: Final = 60.0
+"""Time over which lines are counted (s)."""
 BURST: Final = 20
 """Lines of one address in that time; further ones are counted, and their number is reported at its end."""
 MOST_PEERS: Final = 32
@@ -41,7 +43,7 @@ class Remarks:
         if self._counts[known] <= BURST:
             self._log.log(level, "%s", printable(text))
         if self._timer is None:
-            self._timer = asyncio.get_running_loop().call_later(60.0, self.tell)  # seconds over which lines are counted
+            self._timer = asyncio.get_running_loop().call_later(COUNTING_WINDOW, self.tell)
 
     def tell(self) -> None:
         """Write how many lines were left out, and count again."""

@@ -50,6 +50,14 @@ from monstertruckd.station.replay import LogOpener, ReplayFeed
 from monstertruckd.station.users import LOCAL, StationUser, StationUsers, network_of
 from monstertruckd.station.viewer import Viewer
 
+CHECK_PERIOD: Final = 1.0
+"""Time between checks for new robots, revoked users and too many connections (s)."""
+MOST_BROWSERS: Final = 32
+"""Maximum number of browsers: each holds a session with a robot, which accepts a limited number."""
+MOST_OF_USER: Final = 8
+"""Maximum number of browsers of one user who logs in."""
+MOST_CONNECTIONS: Final = 256
+"""Maximum number of connections of one network, of which a browser keeps about six; later ones are closed."""
 log = logging.getLogger(__name__)
 
 PAGE: Final = Path(__file__).parent / "page"
@@ -196,12 +204,9 @@ class Station:
             except OSError as error:
                 raise BusyError(f"{place.url} cannot be served: {error.strerror or error}") from None
             ready()
-            # Seconds between two checks of robots that appeared, users that were revoked, and the number of
-            # connections.
-            check_period = 1.0
             while True:  # robots may come while others are followed, and users go
                 done, _ = await asyncio.wait(
-                    [*self._following.values(), *discovering], return_when=asyncio.FIRST_COMPLETED, timeout=check_period
+                    [*self._following.values(), *discovering], return_when=asyncio.FIRST_COMPLETED, timeout=CHECK_PERIOD
                 )
                 for task in done:
                     if not task.cancelled():  # of a recording that was dropped
@@ -235,16 +240,14 @@ class Station:
     def _close_crowds(self, server: web.Server) -> None:
         """Close what one network has too many of, before a login too, so that it does not take all file descriptors."""
         of_peer: dict[str, int] = {}
-        # Connections of one network at most: a browser keeps some six. The newest beyond that are closed.
-        most_connections = 256
         for connection in server.connections:  # the oldest first
             peer = _peer(connection)
             of_peer[peer] = of_peer.get(peer, 0) + 1
-            if of_peer[peer] > most_connections and connection.transport is not None:
+            if of_peer[peer] > MOST_CONNECTIONS and connection.transport is not None:
                 connection.transport.abort()
         for peer, count in of_peer.items():
-            if count > most_connections:
-                self._remarks.add(peer, f"{count} connections of {peer}, {count - most_connections} are closed")
+            if count > MOST_CONNECTIONS:
+                self._remarks.add(peer, f"{count} connections of {peer}, {count - MOST_CONNECTIONS} are closed")
 
     def _follow(self, feed: RobotFeed | ReplayFeed) -> None:
         """Follow it, and offer it in every browser."""
@@ -434,9 +437,7 @@ class Station:
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         user = request[USER]
         count, own = len(self._browsers), sum(each.user.name == user.name for each in self._browsers)
-        most_browsers = 32  # browsers at one time: each holds a session with a robot, which accepts a limited number
-        most_of_user = 8  # browsers of one user who logs in, so that nobody uses up all of them
-        if count >= most_browsers or (user is not LOCAL and own >= most_of_user):
+        if count >= MOST_BROWSERS or (user is not LOCAL and own >= MOST_OF_USER):
             self._refused(request, f"{count} browsers are connected, {own} of this user")
             raise web.HTTPServiceUnavailable(text="too many browsers", headers=HEADERS)
         name = f"{user.name}{'-' * bool(user.name)}{self._run}.{next(self._numbers)}"

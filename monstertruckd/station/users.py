@@ -24,6 +24,8 @@ from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import SOURCE_NAME
 
+WRONG_PASSWORD_PAUSE: Final = 1.0
+"""Delay after a wrong password, one attempt after the other (s)."""
 log = logging.getLogger(__name__)
 
 COST: Final = {"n": 2**14, "r": 8, "p": 1}
@@ -127,7 +129,7 @@ class StationUsers:
                 async with self._hashing:
                     right = await in_thread(lambda: _matches(password, kept))
                 if not right or not self.stands(user):
-                    await asyncio.sleep(1.0)  # seconds that a wrong password costs, one attempt after the other
+                    await asyncio.sleep(WRONG_PASSWORD_PAUSE)
                     return None
             self._known[mark] = user
             while len(self._known) > 256:

@@ -9,12 +9,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from mmap import mmap
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from monstertruck_drivers.webcam import v4l2
 from monstertruck_drivers.webcam.source import SET_FORMAT, CameraFrame, Mode, device_error
 from monstertruck_runtime.errors import DeviceError, DeviceLostError, DeviceMismatchError
 from monstertruck_runtime.threads import Offload, in_daemon_thread
+
+CAMERA_STOP_LIMIT: Final = 2.0
+"""Longest wait for the camera to stop at the end of a session (s)."""
 
 
 class V4l2Source:
@@ -191,8 +194,7 @@ class V4l2Stream:
         self._loop.remove_reader(self._camera.fd)
         stopping = asyncio.ensure_future(self._offload(self._camera.stop))
         try:
-            camera_stop_limit = 2.0  # longest wait for the camera to stop at the end of a session (s)
-            await asyncio.wait([stopping], timeout=camera_stop_limit)
+            await asyncio.wait([stopping], timeout=CAMERA_STOP_LIMIT)
         finally:
             stopping.cancel()
 

@@ -21,6 +21,8 @@ from monstertruck_runtime.outside import MEGABYTE, contents, reading
 from monstertruckd import __version__
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
+CONNECT: Final = 10.0
+"""Time in which the scheduler of a cluster must answer (s)."""
 T = TypeVar("T")
 U = TypeVar("U")
 Outcome = TypeVar("Outcome")
@@ -247,7 +249,7 @@ def on_cluster(address: str, step: Callable[[T], U], inputs: Sequence[T]) -> Ite
     except ImportError as error:
         raise not_installed("--cluster: dask.distributed", "cluster") from error
     try:
-        client = Client(address, timeout=10.0)  # seconds in which the scheduler of a cluster must answer
+        client = Client(address, timeout=CONNECT)
     except (OSError, ValueError) as error:
         raise NoAnswerError(f"{address}: no dask scheduler answers: {error}") from error
     with client:

@@ -17,6 +17,8 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.readable import when_readable
 from monstertruckd.tools.driving.gamepad import AXES, BUTTONS, EV_KEY, EVENT, Action, Pad, PadMapping
 
+GAMEPAD_LOOK_PERIOD: Final = 1.0
+"""Time between searches for a gamepad (s)."""
 FOLDER: Final = Path("/dev/input")
 STOPPING: Final = frozenset({"stop", "estop"})
 """Actions that count however late they are read."""
@@ -55,7 +57,7 @@ class PadLink:
             while True:
                 if self._file is None:
                     self._open()
-                await self._clock.sleep(1.0)  # seconds between two looks for a gamepad
+                await self._clock.sleep(GAMEPAD_LOOK_PERIOD)
         finally:
             self._close()
 

@@ -23,6 +23,7 @@ from monstertruckd.tools.logs.geometry import recorded_geometry
 from monstertruckd.tools.logs.messages import Progress
 from monstertruckd.tools.logs.report.scan_map import PlacedScans
 
+MOST_FRAMES: Final = 1500
 COLOURS: Final = (
     (255, 255, 255),
     (70, 70, 80),
@@ -125,10 +126,9 @@ def animate(
     scenes = _scenes(reader, round(speed / frames_per_second * SECOND), report)
     if not scenes:
         raise InputError(f"{reader.path}: no pose in it: nothing to draw")
-    most_frames = 1500
-    if len(scenes) > most_frames:
-        needed = speed * len(scenes) / most_frames
-        raise InputError(f"{len(scenes)} pictures, at most {most_frames}: expected --speed {math.ceil(needed)} or more")
+    if len(scenes) > MOST_FRAMES:
+        needed = speed * len(scenes) / MOST_FRAMES
+        raise InputError(f"{len(scenes)} pictures, at most {MOST_FRAMES}: expected --speed {math.ceil(needed)} or more")
     canvas = _AnimationCanvas(scenes, width, recorded_geometry(reader.path, reader.config()))
     rest = 1.5  # seconds for which the last picture stays
     try:

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from monstertruck_runtime.errors import InputError
 
+KEPT_BYTES: Final = 16_000_000
+"""Approximate limit of values in memory (bytes)."""
 PLAIN: Final = 64
 """Bytes of a value that is no array and no text."""
 
@@ -35,9 +37,9 @@ class Spool:
         return made
 
     def grow(self, size: int) -> None:
-        """A column has so many bytes more in memory; beyond 16 MB all go to the file."""
+        """A column has so many bytes more in memory; beyond ``KEPT_BYTES`` all go to the file."""
         self._size += size
-        if self._size > 16_000_000:  # bytes of values in memory, about
+        if self._size > KEPT_BYTES:
             for column in self._columns:
                 column.flush()
             self._size = 0
