@@ -101,9 +101,11 @@ class ObstacleLimits(Schema):
     lidar's range. A recorded URG-04LX has 0.95 to 1.0, and less than half in one of 800 sectors."""
     unseen_speed: LivePositive = 0.1
     """Speed limit while a sector of travel is not seen, m/s; one not seen for ``scan.stale_after`` stops the truck.
-    Also the limit for a body that moves sideways or turns on the spot onto ground that no scan has seen lately."""
+    Also the limit for a body that moves sideways, turns on the spot or swings its tail onto ground that no scan has
+    seen lately."""
     unseen: Literal["stop", "slow"] = "stop"
-    """What to do before ground that no scan has seen lately, in reverse; slow: ``unseen_speed``."""
+    """What to do before ground that no scan has seen lately, in reverse and with a tail that swings towards something;
+    slow: ``unseen_speed``."""
     confirmed_speed: Annotated[float, Field(gt=0, le=0.05), LIVE] = 0.05
     """Speed limit into such ground for an operator who holds the second control, m/s."""
     memory_time: Annotated[float, Field(gt=0, le=120)] = 30.0

@@ -1,4 +1,4 @@
-"""Obstacles by the lidar: the swept footprint against the newest scan, and what earlier scans saw behind the body."""
+"""Obstacles by the lidar: the swept footprint against the newest scan, and elsewhere against what earlier scans saw."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,6 +34,9 @@ from monstertruckd.gate.samples import age
 from monstertruckd.gate.scan_memory import DRIFT, ScanMemory
 from monstertruckd.gate.sonars import Place
 from monstertruckd.gate.visibility import Sectors, Visibility
+
+_Steps = tuple[int, int, int]
+"""A unit twist in steps of ``TWIST_STEP``."""
 
 POSES: Final = 20
 """Poses checked along the swept path, at least: a corner that turns faster than the base travels has more of them."""
@@ -119,10 +122,11 @@ class ObstacleGuard:
         self.unseen: float | None = 0.0
         """Age of the oldest view of a sector of travel at the newest scan, s; None = one was never seen."""
         self.known = math.inf
-        """Distance along the newest motions backwards to ground that no scan has seen, m; +inf = none within reach."""
-        self.known_aside = math.inf
-        """The same of motions sideways and on the spot."""
-        self._checked: frozenset[tuple[int, int, int]] | None = None
+        """Distance along the newest motions to ground that no scan has seen and that stops them, m; +inf = none within
+        reach."""
+        self.known_slowly = math.inf
+        """The same of ground that only slows them."""
+        self._checked: frozenset[_Steps] | None = None
         self._free = math.inf
         self._outline = footprint.edge_points(OUTLINE, OUTLINE)
         self._near = 0.0
@@ -194,16 +198,12 @@ class ObstacleGuard:
         if self._checked != rounded:
             self._checked = rounded
             self._update_unseen(rounded)
-            hidden = [twist for twist in rounded if twist[0] * TWIST_STEP < AHEAD]
-            behind = self.memory.points() if hidden else None
-            echoes = self.memory.echoes()
-            self._free = min(self._free_distance(*twist, behind, echoes) for twist in rounded)
-            self.known = self.known_aside = math.inf
-            if behind is not None:
-                self._check_ground(hidden, np.concatenate((self._points, behind)))
+            remembered, echoes = self.memory.points(), self.memory.echoes()
+            self._free = min(self._free_distance(*twist, remembered, echoes) for twist in rounded)
+            self._check_ground(rounded, np.concatenate((self._points, remembered)))
         return self._free
 
-    def _update_unseen(self, twists: frozenset[tuple[int, int, int]]) -> None:
+    def _update_unseen(self, twists: frozenset[_Steps]) -> None:
         """Update ``unseen`` from the sectors of travel within the lidar's field."""
         seen = np.concatenate([self._visibility.last_seen(self._sweep(*twist).sectors) for twist in twists])
         oldest = int(seen.min(initial=self._stamp))
@@ -219,55 +219,74 @@ class ObstacleGuard:
         ground = ground.reshape(-1, 2)
         return _Sweep(distances, poses, ground, before, self._visibility.travelled(ground))
 
-    def _free_distance(self, x: int, y: int, turn: int, remembered: Array | None, echoes: Array) -> float:
+    def _free_distance(self, x: int, y: int, turn: int, remembered: Array, echoes: Array) -> float:
         sweep = self._sweep(x, y, turn)
         clearance = self._limits.config.obstacle.side_clearance
         leaving = LEAVING * sweep.distances
-        contacts = [first_contact(self._footprint, sweep.poses, self._points, clearance, leaving)]
-        if remembered is not None:
+        contacts = [
+            first_contact(self._footprint, sweep.poses, self._points, clearance, leaving),
             # Without a clearance, as their places may be off by as much.
-            contacts.append(first_contact(self._footprint, sweep.poses, remembered, -self._footprint.padding))
+            first_contact(self._footprint, sweep.poses, remembered, -self._footprint.padding),
+        ]
         if x < 0 and not _on_the_spot(x, y):
             contacts.append(first_contact(self._footprint, sweep.poses, echoes, clearance, leaving))
         return min(
             (float(sweep.distances[contact - 1]) for contact in contacts if contact is not None), default=math.inf
         )
 
-    def _check_ground(self, twists: list[tuple[int, int, int]], measured: Array) -> None:
-        """Update ``known`` and ``known_aside``, and shorten the free distance of turns on the spot.
+    def _check_ground(self, twists: frozenset[_Steps], measured: Array) -> None:
+        """Update ``known`` and ``known_slowly``, and shorten the free distance of turns on the spot.
 
         Args:
-            twists: in steps of ``TWIST_STEP``.
+            twists: the motions.
             measured: points in base, shape (n, 2), m.
         """
-        sweeps = [self._sweep(*twist) for twist in twists]
-        ground = np.concatenate([sweep.ground for sweep in sweeps])
-        before = np.concatenate([sweep.before for sweep in sweeps])
-        turns = [_on_the_spot(*twist[:2]) for twist in twists]
-        turning = np.repeat(turns, [len(sweep.ground) for sweep in sweeps])
-        hidden = ~self.memory.seen(ground)
-        back = np.repeat([twist[0] < 0 for twist in twists], [len(sweep.ground) for sweep in sweeps]) & ~turning
-        self.known = float(before[hidden & back].min(initial=math.inf))
-        if math.isfinite(self.known):
-            reverse = [twist for twist in twists if twist[0] < 0]
-            self.known += min(map(self._further, reverse))
-        self.known_aside = float(before[hidden & ~back].min(initial=math.inf))
-        reached = hidden & turning & (before < self._free)
+        self.known = self.known_slowly = math.inf
         # Ground that no scan has seen, nearer than this to a measured point, is not turned onto, m: what stands there
         # is seen from one side only. Somebody who stands is about as deep.
         depth = 0.2
-        near = on_body(self._footprint, measured, self._reach + depth) & ~on_body(self._footprint, measured, 0.0)
-        apart = ((ground[reached][:, None] - measured[near]) ** 2).sum(axis=2).min(axis=1, initial=math.inf)
-        self._free = float(before[reached][apart < depth**2].min(initial=self._free))
+        # The tail does not swing onto it in a motion ahead if a point is no further before it and beside it, m: a wall
+        # along the body leaves the lidar's field so far before the tail.
+        before_it, beside = 0.3, 0.1
+        stretch = np.array((beside / before_it, 1.0))
+        near = on_body(self._footprint, measured, self._reach + before_it) & ~on_body(self._footprint, measured, 0.0)
+        for twist in twists:
+            sweep = self._sweep(*twist)
+            unknown = self._unknown(twist, sweep.ground)
+            ground, before = sweep.ground[unknown], sweep.before[unknown]
+            if _on_the_spot(*twist[:2]):
+                self._free = float(before[_near(ground, measured[near], depth)].min(initial=self._free))
+            elif twist[0] < 0:
+                self._stop_before(twist, before)
+                continue
+            elif _is_ahead(twist):
+                tail = _near(ground * stretch, measured[near] * stretch, beside)
+                self._stop_before(twist, before[tail])
+            self.known_slowly = float(before.min(initial=self.known_slowly))
 
-    def _further(self, twist: tuple[int, int, int]) -> float:
+    def _stop_before(self, twist: _Steps, before: Array) -> None:
+        """Shorten ``known`` to the least of the distances along a motion, as far as it leads over seen ground."""
+        known = float(before.min(initial=math.inf))
+        if known < self.known:
+            self.known = min(self.known, known + self._further(twist, known))
+
+    def _unknown(self, twist: _Steps, ground: Array) -> NDArray[np.bool_]:
+        """Which points (n, 2) of the ground along a motion no scan has seen.
+
+        A motion ahead leads to where the lidar looks: there its sectors and points count (``unseen``).
+        """
+        unknown = ~self._visibility.covers(ground) if _is_ahead(twist) else np.ones(len(ground), np.bool_)
+        unknown[unknown] = ~self.memory.seen(ground[unknown])
+        return unknown
+
+    def _further(self, twist: _Steps, known: float) -> float:
         """Distance beyond ``known`` for which a motion still stays on seen ground, below that between two poses, m."""
         x, y, turn = (part * TWIST_STEP for part in twist)
         finer = 4  # parts of the distance between two of these in which the edge of seen ground is found
         step = GROUND_STEP * float(self._sweep(*twist).distances[1]) / finer
-        poses = swept_poses((x, y, turn), self.known + np.linspace(0.0, (finer - 1) * step, finer))
+        poses = swept_poses((x, y, turn), known + np.linspace(0.0, (finer - 1) * step, finer))
         outline = at_poses(self._outline, poses[1:])
-        seen = self.memory.seen(outline.reshape(-1, 2)).reshape(finer - 1, -1).all(axis=1)
+        seen = ~self._unknown(twist, outline.reshape(-1, 2)).reshape(finer - 1, -1).any(axis=1)
         return step * (finer - 1 if seen.all() else int(np.argmin(seen)))
 
     def allowed_before_unseen(self, now: int) -> float:
@@ -356,9 +375,9 @@ class ObstacleCheck(Check):
             yield PaceLimit(Reason.LIDAR_BLIND, 0.0)
         elif unseen:
             yield PaceLimit(Reason.LIDAR_SLOW, slow)
-        aside = max(guard.allowed_speed(guard.known_aside, now), slow)
-        if aside < fastest:
-            yield PaceLimit(Reason.UNSEEN_SLOW, aside)
+        slowly = max(guard.allowed_speed(guard.known_slowly, now), slow)
+        if slowly < fastest:
+            yield PaceLimit(Reason.UNSEEN_SLOW, slowly)
         yield from self._into_unseen(guard.allowed_before_unseen(now), fastest)
         self._approach.judge(now, twists, lambda speed: guard.too_near(free, speed, now))
 
@@ -391,6 +410,17 @@ class ObstacleCheck(Check):
 def _on_the_spot(x: int, y: int) -> bool:
     """Whether a motion, in steps of ``TWIST_STEP``, is a turn on the spot."""
     return math.hypot(x, y) * TWIST_STEP < AHEAD
+
+
+def _near(points: Array, others: Array, within: float) -> NDArray[np.bool_]:
+    """Which of the points (n, 2) are nearer than ``within`` metres to one of the others (m, 2)."""
+    squares = (others**2).sum(axis=1) - 2 * points @ others.T
+    return np.asarray((points**2).sum(axis=1) + squares.min(axis=1, initial=math.inf) < within**2)
+
+
+def _is_ahead(twist: _Steps) -> bool:
+    """Whether a motion leads to where the lidar looks."""
+    return twist[0] * TWIST_STEP >= AHEAD
 
 
 def _finite(value: float) -> float | None:

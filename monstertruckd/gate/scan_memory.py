@@ -19,7 +19,8 @@ from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 
 DRIFT: Final = 0.03
 """Ground this near to where the body stood counts as free, m: the error of dead reckoning; less by as much as the
-pose's standard deviation has grown since, beyond the padding of the footprint."""
+pose's standard deviation has grown since, beyond the padding of the footprint. Of a moving body it does not: its tail
+would swing further with each scan."""
 STANDING: Final = 0.001
 """Distance travelled between two scans by a body that stands, m: rounding of its velocity."""
 MAP_SIZE: Final = 64
@@ -65,6 +66,8 @@ class _Taken(NamedTuple):
     """Free distance of every beam, m; padded with a 0 before the first and after the last."""
     variance: float
     """Of the pose in odometry when it was taken, m^2."""
+    beside: float = DRIFT
+    """Ground this near to the body counts as free, m."""
 
 
 class _Heard(NamedTuple):
@@ -120,6 +123,7 @@ class ScanMemory:
         self._taken: deque[_Taken] = deque(maxlen=20)
         self._views: deque[_Taken] = deque(maxlen=32)  # at 0.21 m/s the truck takes 21 in 30 s
         self._heard: dict[str, _Heard] = {}
+        self._points = np.empty((0, 2))
 
     def move(self, now: int, twist: Twist2, dt: float) -> None:
         """The body moved with ``twist``, m/s and rad/s, for the ``dt`` s until ``now``, ns."""
@@ -164,6 +168,7 @@ class ScanMemory:
         elif stood[-1:] == [True] or not stood or travelled - self._taken[-1].travelled >= memory_step:
             self._taken.append(self._newest)
         _keep(self._views, self._newest)
+        self._points = self._hidden(self._newest)
 
     def hear(self, sonar: str, mount: Pose2, beams: Beams, arc: Array) -> None:
         """Take an answer of a sonar.
@@ -198,9 +203,10 @@ class ScanMemory:
 
     def points(self) -> Array:
         """Remembered points where the newest scan does not look, in base as of that scan, shape (n, 2), m."""
-        newest = self._newest
-        if newest is None:
-            return np.empty((0, 2))
+        return self._points
+
+    def _hidden(self, newest: _Taken) -> Array:
+        """See ``points``."""
         taken = self._fresh(self._taken, newest)
         kept = [scan.points for scan in taken if newest.travelled - scan.travelled < self._distance]
         there = np.concatenate((newest.points[:0], *kept))
@@ -222,9 +228,13 @@ class ScanMemory:
         return points_relative(arcs, self._newest.pose)
 
     def _seeing(self, newest: _Taken) -> list[_Taken]:
-        """Scans and pings that count as views of the ground, the oldest first, ``newest`` last."""
+        """Scans and pings that count as views of the ground, the oldest first, ``newest`` last.
+
+        While the body stands the newest scan is one of those kept, too.
+        """
+        edge = 1e-6  # ground this near to a moving body is its edge, m
         views = (*self._views, *(view for heard in self._heard.values() for view in heard.views))
-        return [*sorted(self._fresh(views, newest), key=lambda view: view.beams.stamp), newest]
+        return [*sorted(self._fresh(views, newest), key=lambda view: view.beams.stamp), newest._replace(beside=edge)]
 
     def _fresh(self, kept: Iterable[_Taken], newest: _Taken) -> list[_Taken]:
         return [
@@ -235,10 +245,10 @@ class ScanMemory:
         ]
 
     def seen(self, points: Array) -> NDArray[np.bool_]:
-        """Which of the points (n, 2), in base as of the newest scan, m, lie on ground that was seen free."""
+        """Which of the points (n, 2), in base as of the newest scan, m, are seen free or under the body."""
         newest = self._newest
         if newest is None:
-            return np.zeros(len(points), np.bool_)
+            return on_body(self._footprint, points, DRIFT)
         there = placed(np.column_stack((points, np.zeros(len(points)))), newest.pose)[:, :2]
         return np.asarray(self._free(self._seeing(newest), there).any(axis=0))
 
@@ -267,7 +277,8 @@ class ScanMemory:
         newest = taken[0] if self._newest is None else self._newest
         gained = np.array([max(newest.variance - scan.variance, 0.0) for scan in taken])
         unsure = np.sqrt(gained)[:, None]
-        known = np.maximum(beyond_x, beyond_y) < DRIFT - np.maximum(unsure - self._footprint.padding, 0.0)
+        beside = np.array([scan.beside for scan in taken])[:, None]
+        known = np.maximum(beyond_x, beyond_y) < beside - np.maximum(unsure - self._footprint.padding, 0.0)
         return np.asarray((free > distances + unsure) | known)
 
 

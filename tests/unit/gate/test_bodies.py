@@ -9,7 +9,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import DriveMode
 from monstertruck_schemas.state import GateMode
-from tests.unit.gate.rig import DRIVETRAIN, Rig, attitude, feedback, health, make_gate, scan, show
+from tests.unit.gate.rig import ANY_GROUND, DRIVETRAIN, Rig, attitude, feedback, health, make_gate, scan, show
 
 DIFFERENTIAL = differential_chassis(Dimensions(DRIVETRAIN))
 
@@ -45,7 +45,7 @@ def test_a_turn_is_two_wheel_speeds_and_no_servo():
 
 
 def test_no_wheel_is_faster_than_allowed_and_the_curvature_stays():
-    rig = TwoWheels().driving(speed=0.3, front=0.4, ticks=80)
+    rig = TwoWheels(obstacle=ANY_GROUND).driving(speed=0.3, front=0.4, ticks=80)
     left, right = rig.out.speeds
     assert max(left, right) == pytest.approx(0.21)
     whole = DIFFERENTIAL.shaft_speeds(1.0, 0.4, 0.0)

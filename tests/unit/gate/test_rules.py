@@ -669,7 +669,7 @@ def test_speed_grows_and_falls_at_its_own_rates():
 
 
 def test_a_robot_of_two_shafts_is_shown_its_second_speed():
-    robot = Robot("differential")
+    robot = Robot("differential", obstacle=ANY_GROUND)
     robot.armed()
     robot.driver = {"vx": 0.1, "wz": 0.2}
     robot.tick(60)

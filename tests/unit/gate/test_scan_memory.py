@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint, ScanPoints, first_contact, swept_poses
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics
@@ -14,7 +15,7 @@ from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.sensor import DriveMode
 from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig, InForce
-from monstertruckd.gate.obstacles import ObstacleGuard
+from monstertruckd.gate.obstacles import ObstacleGuard, at_poses
 from monstertruckd.gate.scan_memory import DRIFT, MAP_CELL, MAP_SIZE, ScanMemory, elsewhere, spaced
 from tests.unit.gate.rig import TICK, Rig, scan
 
@@ -51,7 +52,7 @@ def see(remembered, now, *obstacles):
 
 def test_without_a_scan_nothing_is_known():
     assert memory().points().shape == (0, 2)
-    assert not seen(memory(), 0.0)
+    assert seen(memory(), 0.0, 0.6, -BACK - DRIFT + 0.01) == [True, False, True], "but what is under the body"
 
 
 def test_a_point_stays_where_it_was_seen_as_the_truck_passes_it():
@@ -311,18 +312,113 @@ def test_of_an_outline_points_are_remembered_that_are_two_centimetres_apart():
 # In the gate
 
 
-@pytest.mark.parametrize(("share", "known"), [(0.5, math.inf), (0.495, 0.0)])
-def test_ways_less_than_half_forwards_are_held_against_what_is_known(share, known):
+def guarding(*obstacles):
+    """A guard that has taken one scan."""
     guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
-    guard.free_distance(((share, math.sqrt(1.0 - share**2), 0.0),))
-    assert (guard.known, guard.known_aside) == (math.inf, known)
+    guard.observe(scan(SECOND, *obstacles))
+    return guard
 
 
-@pytest.mark.parametrize(("backwards", "known"), [(0.01, 0.0), (0.0, math.inf)])
-def test_what_goes_backwards_at_all_is_held_against_unseen_ground_behind(backwards, known):
-    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
-    guard.free_distance(((-backwards, math.sqrt(1.0 - backwards**2), 0.0),))
-    assert guard.known == known
+BESIDE = [(x, side * 0.24) for x in np.arange(0.02, 0.6, 0.005) for side in (1, -1)]
+"""Walls 5 cm from the body, as far back as the lidar looks."""
+
+
+@pytest.mark.parametrize("x", [1.0, 0.7, 0.0, -0.01, -0.7, -1.0])
+def test_unseen_ground_counts_whichever_way_the_motion_goes(x):
+    """It stops what goes backwards at all, and what goes ahead if something was measured near to it."""
+    for obstacles in ((), BESIDE):
+        guard = guarding(*obstacles)
+        guard.free_distance(((x, math.sqrt(1.0 - x**2), 0.0),))
+        if x == 1.0:
+            assert guard.known == guard.known_slowly == math.inf, "straight on leads to where the lidar looks"
+        else:
+            assert (guard.known < 0.1) is (x < 0 or (x == 0.7 and bool(obstacles)))
+            assert (guard.known_slowly < 0.1) is (x >= 0)
+
+
+def passing(*obstacles, metres=0.6):
+    """A guard that has driven straight on, past obstacles in the base where it began."""
+    guard, now = guarding(*obstacles), SECOND
+    for x in np.arange(0.0, metres + 0.001, 0.02):
+        there = [(ox - x, oy) for ox, oy in obstacles]
+        ahead = [(ox, oy) for ox, oy in there if abs(math.atan2(oy, ox - 0.14)) < math.radians(118)]
+        guard.observe(scan(now, *ahead))
+        now += TICK
+        guard.move(now, (1.0, 0.0, 0.0), 0.02)
+    guard.observe(scan(now))
+    return guard
+
+
+def ahead(front, rear):
+    """Unit twist of the truck with these axle angles."""
+    return FourWheelSteering().body_twist(1.0, front, rear)
+
+
+@pytest.mark.parametrize("rear", [0.4, -0.4])
+def test_ahead_the_tail_does_not_swing_onto_ground_that_no_scan_has_seen(rear):
+    guard = guarding(*BESIDE)
+    guard.free_distance((ahead(0.0, rear),))
+    poses = swept_poses(ahead(0.0, rear), np.array([guard.known, guard.known + 0.05]))
+    corner = np.array([(-FOOTPRINT.half_length, math.copysign(FOOTPRINT.half_width, rear))])
+    swung = [abs(y) - FOOTPRINT.half_width for y in at_poses(corner, poses)[:, 0, 1]]
+    assert 0.0 < swung[0] < DRIFT < swung[1]
+    passed = passing()
+    passed.free_distance((ahead(0.0, rear),))
+    assert passed.known == passed.known_slowly == math.inf, "the lidar has passed that ground"
+
+
+@pytest.mark.parametrize(
+    ("ahead_of_it", "beside_it", "stops"),
+    [(0.28, 0.02, True), (0.5, 0.02, False), (0.2, 0.06, True), (0.2, 0.2, False)],
+)
+def test_a_wall_along_the_body_stops_the_tail_and_one_further_off_slows_it(ahead_of_it, beside_it, stops):
+    """A corridor of 0.9 m leaves 0.2 m beside a tail that swings out."""
+    guard = guarding((-FOOTPRINT.half_length + ahead_of_it + 0.03, FOOTPRINT.half_width + 0.03 + beside_it))
+    guard.free_distance((ahead(0.0, 0.4),))
+    assert (guard.known < 0.1) is stops
+    assert guard.known_slowly < 0.1
+
+
+@pytest.mark.parametrize(
+    "motion", [(0.0, 0.4), (0.3, 0.3), (-0.4, 0.4), (0.2, 0.4)], ids=["rear", "parallel", "counter", "both"]
+)
+def test_a_body_does_not_creep_sideways_onto_unseen_ground(motion):
+    """Each scan would allow it as much again if ground beside a moving body counted as free."""
+    guard, now, twist, travelled = guarding(*BESIDE), SECOND, ahead(*motion), 0.0
+    for _ in range(300):
+        guard.free_distance((twist,))
+        if (pace := min(guard.allowed_before_unseen(now), 0.2)) < GateConfig().obstacle.crawl:
+            break
+        for _ in range(5):
+            now += TICK
+            guard.move(now, tuple(pace * part for part in twist), 0.02)
+            travelled += pace * 0.02
+        guard.observe(scan(now, *BESIDE))
+    before = FOOTPRINT.edge_points(9, 9)
+    (after,) = at_poses(before, swept_poses(twist, np.array([travelled])))
+    behind = before[:, 0] < 0
+    assert 0.0 < np.abs(after - before)[behind, 1].max() < DRIFT
+
+
+@pytest.mark.parametrize("front", [0.436, 0.2, 0.0, -0.436])
+def test_ahead_a_truck_that_has_seen_nothing_yet_may_steer_with_its_front_axle(front):
+    guard = guarding()
+    assert guard.free_distance((ahead(front, 0.0),)) == math.inf
+    assert guard.known == guard.known_slowly == math.inf
+
+
+@pytest.mark.parametrize(("rear", "free"), [(0.4, False), (-0.4, True)])
+def test_ahead_the_tail_does_not_swing_against_what_the_lidar_has_left_behind(rear, free):
+    post = (0.5, FOOTPRINT.half_width + 0.03)  # beside the tail at the end
+    assert (passing(post).free_distance((ahead(0.0, rear),)) == math.inf) is free
+
+
+@pytest.mark.parametrize("angles", [(0.436, 0.0), (0.0, 0.2)])
+def test_ground_under_the_body_is_known_though_it_is_not_known_how_it_moves(angles):
+    guard = guarding()
+    guard.move(2 * SECOND, None, 0.02)
+    guard.free_distance((ahead(*angles),))
+    assert guard.known_slowly > DRIFT
 
 
 @pytest.mark.parametrize(("beside", "behind"), [(0.5, 0.35), (0.35, 0.5)])
@@ -387,7 +483,7 @@ def test_a_turn_stops_before_the_side_of_somebody_that_the_lidar_does_not_see():
     assert guard.free_distance((turn,)) < contacts[0]
     for twist in ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0)):
         assert guard.free_distance((twist,)) == math.inf, "in reverse and sideways such ground is no obstacle"
-        assert min(guard.known, guard.known_aside) < DRIFT
+        assert min(guard.known, guard.known_slowly) < DRIFT
 
 
 @pytest.mark.parametrize(("apart", "stopped"), [(0.16, True), (0.2, False)])
@@ -447,6 +543,10 @@ def test_in_reverse_the_truck_drives_where_it_came_from_and_stops_before_ground_
     assert rig.out.reasons == (Reason.UNSEEN_DRIVE,)
     assert rig.out.speeds[0] == pytest.approx(-0.05), "the operator holds the second control"
     assert rig.x < 0.0
+
+
+def test_ahead_the_gate_slows_down_a_tail_that_swings_towards_unseen_ground():
+    assert Reason.UNSEEN_SLOW in surround(Rig()).driving(speed=0.15, rear=0.4, ticks=20).out.reasons
 
 
 def test_ground_may_only_slow_the_truck_where_that_is_configured():
