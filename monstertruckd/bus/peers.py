@@ -1,5 +1,7 @@
 """Other robots: their poses are received over their own Zenoh endpoints, and published on ``state/peers``."""
 
+from typing import Final
+
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock, Schedule
 from monstertruck_runtime.errors import NoAnswerError
@@ -9,6 +11,9 @@ from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import Odometry, Peer, Peers
 from monstertruck_schemas.topics import GATE, PEERS, POSE
 from monstertruckd.bus.zenoh_config import PeerConfig
+
+SILENT: Final = 5.0
+"""Time without a pose after which another robot is lost (s)."""
 
 
 class PeerService:
@@ -72,10 +77,9 @@ class PeerSubscriber:
         """
         endpoint = self._config.endpoint
         async with TruckClient(self._robot, endpoint, clock=self._clock) as client:
-            silent = 5.0  # seconds without a pose after which another robot counts as lost
             with client.subscribe(POSE, latest()) as poses:
-                while (pose := await poses.next_within(silent)) is not None:
+                while (pose := await poses.next_within(SILENT)) is not None:
                     ready()
                     self._peers.hear(self._robot, pose)
             await client.get_retained(GATE)  # says who is there instead
-            raise NoAnswerError(f"robot {self._robot!r} at {endpoint} has published no pose for {silent:g} s")
+            raise NoAnswerError(f"robot {self._robot!r} at {endpoint} has published no pose for {SILENT:g} s")

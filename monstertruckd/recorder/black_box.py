@@ -30,6 +30,10 @@ from monstertruckd.recorder.log_file import RUN_LOG, LogEntry, LogFile, log_offs
 from monstertruckd.recorder.repair import in_use
 from monstertruckd.recorder.ring import Retention, Ring, RingSnapshot
 
+BATCH: Final = 8
+"""Messages written without a pause: a fraction of a millisecond in which the control loop would have to wait."""
+LAST_SECONDS: Final = 5.0
+"""Longest time after the end for which writing goes on (s)."""
 log = logging.getLogger(__name__)
 
 PART: Final = ".part"
@@ -164,7 +168,7 @@ class BlackBox:
 
     Every trip is in some box: in one of its own, in that of a trip shortly before, or, if there was one of its reason
     less than ``interval`` ago, in one that is written later. A box that waits when the body ends is written before the
-    context is left, unless that takes longer than 5 s. A disk that is full, refuses or is too slow loses
+    context is left, unless that takes longer than ``LAST_SECONDS``. A disk that is full, refuses or is too slow loses
     the box, which is reported, and has no other effect.
 
     Args:
@@ -234,12 +238,11 @@ class BlackBox:
         self._closing = True
         self._wake.set()
         self._hurry.set()
-        last_seconds = 5.0  # what is not on the disk so long after the end is given up
         try:
-            async with self._clock.deadline(last_seconds):
+            async with self._clock.deadline(LAST_SECONDS):
                 await asyncio.shield(self._saving)
         except TimeoutError:
-            log.error("black box: the last box is lost, its disk takes longer than %g s", last_seconds)
+            log.error("black box: the last box is lost, its disk takes longer than %g s", LAST_SECONDS)
         finally:
             self._given_up.set()
             for task in (self._taking, self._saving):
@@ -371,10 +374,7 @@ class BlackBox:
                 for count, entry in enumerate(entries):
                     if self._given_up.is_set():
                         raise TimeoutError(errno.ETIMEDOUT, "given up")
-                    # Messages written without a pause: a fraction of a millisecond in which the control loop would have
-                    # to wait.
-                    batch = 8
-                    if offloaded and count % batch == 0:
+                    if offloaded and count % BATCH == 0:
                         self._hurry.wait(0.001)  # seconds between two batches, for the control loop
                     file.add(entry)
                 file.finish()

@@ -260,9 +260,8 @@ def test_a_wanderer_asks_a_body_for_nothing_impossible_and_for_all_that_it_can_d
         return twists
 
     sideways = {(False, True, False)} if name in {"mecanum", "omni", "independent"} else set()
-    turns = (
-        {(False, False, True)} if sideways or name in {"differential", "skid_steer", "skid_stand", "sonar"} else set()
-    )
+    on_the_spot = {"differential", "skid_steer", "skid_stand", "sonar", "turtle"}
+    turns = {(False, False, True)} if sideways or name in on_the_spot else set()
     assert run_virtual(main) == turns | sideways
 
 

@@ -24,6 +24,8 @@ from monstertruckd.tools.calibrate.steps import Confirm, MoveStep, Number
 from monstertruckd.tools.calibrate.weave import estimates, response, weaves
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
+FULL: Final = 0.12
+"""Speed of full circles (m/s)."""
 ROOM: Final = "2.5 m x 2.5 m, level, the robot in the middle; with --rough 1.5 m x 1.5 m"
 
 ROUGH: Final = (0.06, 0.1, 0.4)
@@ -194,7 +196,7 @@ class SteeringWizard:
                 front, rear = model.commands(servos, first, maps)
                 move = MoveStep(
                     f"a full circle by {wheels} wheels, {side}",
-                    0.12,  # speed of full circles
+                    FULL,
                     front,
                     rear,
                     2.6 * math.pi / abs(context.chassis.bicycle.curvature(front, rear)),

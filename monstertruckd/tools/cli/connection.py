@@ -3,11 +3,15 @@
 import json
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from monstertruck_runtime.endpoints import robot_on_host
 from monstertruck_runtime.errors import NotFoundError, TruckError
 from monstertruckd.tools.cli.output import remark
+
+SOON: Final = 0.7
+"""Time in which a present robot has answered; after it the command reports that it waits (s)."""
+
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
@@ -57,8 +61,7 @@ def with_robot(
 
 
 async def _say_waiting(robot: str, endpoint: str, clock: "Clock") -> None:
-    soon = 0.7  # seconds in which a robot that is there has answered; later the command says what it waits for
-    await clock.sleep(soon)
+    await clock.sleep(SOON)
     remark(f"waiting for robot {robot!r} at {endpoint} ...")
 
 

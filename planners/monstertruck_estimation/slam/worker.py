@@ -15,6 +15,7 @@ from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.localisation import LocalisationEstimator
 from monstertruck_estimation.slam.map_evidence import EvidenceGrid
 from monstertruck_estimation.slam.mapping import Estimator, MappingEstimator, MappingEvent
+from monstertruck_estimation.slam.movers import View, moved
 from monstertruck_estimation.slam.registration import Cloud, fitting
 from monstertruck_estimation.slam.scan_matcher import ScanMatcher
 from monstertruck_estimation.slam.scans import prepare_input, scans_in_a_room
@@ -176,6 +177,7 @@ def _warm_up() -> None:
     # What a few scans of a small room do not come to: loops that are closed, and a saved map.
     points = scans[0].points
     describe(points)
+    moved(View.of(points), View.of(scans[1].points), np.zeros(3))
     fitting(scans[0], Cloud.of(scans[1]), np.zeros(3))
     contradiction(scans, poses, scans, poses)
     in_view(scans, poses, points)

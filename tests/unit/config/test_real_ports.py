@@ -84,7 +84,8 @@ def test_no_shipped_configuration_is_a_mixture():
 @pytest.mark.parametrize("part", PARTS, ids=lambda part: part.stem)
 def test_a_part_has_no_simulation_no_path_and_no_place_to_start(part: Path):
     data = load_tree(part).data
-    assert not {"sim", "stand", "machine", "path"} & data.keys()
+    assert not {"sim", "stand", "machine"} & data.keys()
+    assert data.get("path") is None, "null takes away the path of what includes it"
     assert "start" not in data.get("odometry", {})
     assert not any("port" in device for device in data.get("devices", {}).values())
 
