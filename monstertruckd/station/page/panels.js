@@ -162,7 +162,8 @@ export class Panels {
     }
     this.showCause(gate);
     const mine = gate?.holder && gate.holder === this.source;
-    const hand = `holder${mine ? ".you" : ""}${moves(gate) ? "" : ".rests"}`;
+    const [driving, resting] = mine ? ["holder.you", "holder.you.rests"] : ["holder", "holder.rests"];
+    const hand = moves(gate) ? driving : resting;
     setText("holder-name", gate?.holder ? words(hand, { name: gate.holder })
       : gate?.waiting.length ? words("holder.waiting", { names: gate.waiting.join(", ") }) : gate ? words("holder.none") : "");
     byId("lease").hidden = !gate?.holder;
