@@ -384,6 +384,8 @@ def _reaction(scenario: Scenario, got: Reaction) -> Iterator[str]:
             yield from _late(got.standstill_after_s, STANDSTILL_BY_LINE, "standstill")
         case Expect.ENDURE if got.reason is not None:
             limit = STANDSTILL_AGAIN if scenario.device == DeviceRole.DRIVE else STOP_AFTER_SAMPLE + STANDSTILL
+            if got.moved_by_itself and got.stop_bytes_after_s is not None:  # driving went on until this stop
+                limit = max(limit, got.stop_bytes_after_s + STANDSTILL)
             yield from _late(got.standstill_after_s, limit, "standstill")
         case Expect.GO_ON | Expect.SLOW_DOWN if got.reason is not None or got.standstill_after_s is not None:
             yield f"stopped: {got.reason}"
