@@ -1,4 +1,4 @@
-"""How fast the robot may approach what is ahead: limits by the free distance, with a hysteresis, and the emergency."""
+"""Approach to obstacles: speed limits by the free distance, with hysteresis, and the emergency stop criterion."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -11,17 +11,17 @@ from monstertruckd.gate.config import GateConfig
 
 
 def comfortable_speed(room: float, delay: float, deceleration: float) -> float:
-    """Greatest speed from which a body that brakes after ``delay`` s stands within ``room`` metres, m/s."""
+    """Maximum speed of a body that brakes after ``delay`` s and stops within ``room`` metres, m/s."""
     return deceleration * (math.sqrt(delay**2 + 2 * max(room, 0.0) / deceleration) - delay)
 
 
 def stopping(speed: float, delay: float, deceleration: float) -> float:
-    """Distance in which a body stands that brakes from ``speed`` (m/s) after ``delay`` s, m."""
+    """Stopping distance of a body that brakes from ``speed`` (m/s) after ``delay`` s, m."""
     return speed * delay + speed**2 / (2 * deceleration)
 
 
 def reach(config: GateConfig, delay: float) -> float:
-    """Distance to be swept against obstacles seen ``delay`` s ago, m."""
+    """Length of the sweep against obstacles seen ``delay`` s ago, m."""
     return config.obstacle.ahead + stopping(config.speed, delay, config.obstacle.deceleration)
 
 
@@ -35,19 +35,19 @@ class Approach:
     def __init__(self, view: GateView) -> None:
         self._view = view
         self.blocked = False
-        """An obstacle ahead allows no motion."""
+        """Whether an obstacle ahead allows no motion."""
         self.emergency = False
-        """An obstacle is so near that only the quick stop avoids contact."""
+        """Whether an obstacle is so near that only the quick stop avoids contact."""
         self.free: float | None = None
-        """Distance the footprint can travel, m; None = no obstacle within the distance checked."""
+        """Distance the footprint can travel, m; None without an obstacle within the distance checked."""
 
     def forget(self) -> None:
-        """Nobody drives."""
+        """Reset, because no source drives."""
         self.blocked = self.emergency = False
         self.free = None
 
     def limits(self, free: float, allowed: float, fastest: float) -> Iterator[PaceLimit]:
-        """Limit for ``free`` metres ahead, which allow a pace of ``allowed`` m/s, for motions up to ``fastest`` m/s."""
+        """Limit for ``free`` metres ahead, given the allowed pace and the fastest motion (m/s)."""
         crawl = self._view.config.obstacle.crawl
         self.free = free if math.isfinite(free) else None
         self.blocked = allowed < (2 * crawl if self.blocked else crawl)
@@ -62,7 +62,7 @@ class Approach:
         Args:
             now: ns.
             twists: motions of the base per metre of pace.
-            too_near: whether an ordinary stop from a pace, m/s, needs more than the free distance.
+            too_near: whether an ordinary stop from a pace (m/s) needs more than the free distance.
         """
         view = self._view
         measured = view.samples.shaft_speeds(now)
@@ -71,7 +71,7 @@ class Approach:
         self.emergency = approaching and (self.emergency or (self.blocked and too_near(speed)))
 
     def free_distance(self, age: float | None) -> Measurement:
-        """The free distance as a figure; ``age`` (s) is that of what it was measured by."""
+        """Free distance as a measurement; ``age`` (s) is the age of its sample."""
         return Measurement(
             name="free distance", value=self.free, unit="m", limit=self._view.config.obstacle.ahead, age=age
         )

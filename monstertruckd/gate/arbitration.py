@@ -1,22 +1,23 @@
-"""Who may drive: sources of requests, their leases, the choice of the driver, and the gate's state machine.
+"""Arbitration: sources of requests, their leases, the choice of the driver, and the gate's state machine.
 
 Rules:
 
-- A request is valid only with this run's nonce and a sequence number above the newest one of its source and kind.
-- While the lease of a source runs, no other program takes over its name.
-- A request that may set the truck in motion must carry the stamp of a recent gate state: it cannot have waited long in
-  a queue then. The stamp is of the robot's own clock, so no other clock has to be trusted.
-- Operators send from outside, the tracker from inside; a tracker on another machine only if the configuration names it.
-- The source of the highest role with a valid lease drives; among equal roles the one that drives already, but of the
-  robot's own planners one that requests motion before one that requests standstill.
-- Control passes to a higher role at once, to a lower one only after a new ARM order: once a role has driven, or has
+- A valid request has this run's nonce and a sequence number above the latest number of its source and kind.
+- While the lease of a source runs, no other program can take over its name.
+- A request that may set the truck in motion must carry the stamp of a recent gate state, which proves that it has not
+  waited long in a queue. The stamp comes from the robot's clock, so no other clock has to be trusted.
+- Operators send from outside, the tracker from inside; a tracker on another machine must be listed in the
+  configuration.
+- The source of the highest role with a valid lease drives. Among equal roles the driving source keeps control, except
+  that a planner of the robot that requests motion precedes a planner that requests standstill.
+- Control passes to a higher role at once, to a lower role only after a new ARM order: once a role has driven, or has
   ordered a stop, lower roles are refused until the truck is armed again. So a tracker never continues by itself after
   an operator has released the stick.
-- After a STOP order every source must send a neutral request before it may drive again, until the truck is armed again;
-  for one that was driving, none for its lease is as good. A source that is new after the stop is no exception.
-- An ARM order with ``hold`` keeps planners out until one without.
-- An operator who drives may hand over to one who has asked. For a moment nobody else of their priority may drive, and
-  the former driver not before a neutral request.
+- After a STOP order every source, even a new source, must send a neutral request before it may drive again. For a
+  source that was driving, silence for its lease is equivalent. A new ARM order ends this rule.
+- An ARM order with ``hold`` blocks planners until an ARM order without it.
+- A driving operator may hand over to an operator who has asked. For a moment no other source of their priority may
+  drive; the former driver must first send a neutral request.
 """
 
 from collections.abc import Iterable, Mapping
@@ -33,50 +34,50 @@ from monstertruck_schemas.state import GateMode
 from monstertruckd.gate.config import GateConfig
 
 PRIORITY: Final = {role: rank for rank, role in enumerate(reversed(Role))}
-"""The greater number wins."""
+"""Priority of each role; the higher number wins."""
 
 Key = tuple[bool, str]
 
 
 ASKING: Final = 20 * SECOND
-"""An operator who asks for the drive is forgotten after this, ns."""
+"""Lifetime of an operator's request for the drive, ns."""
 
 MODE_REASONS: Final = {GateMode.ESTOPPED: (Reason.ESTOPPED,), GateMode.DISARMED: (Reason.DISARMED,)}
-"""Why the truck does not drive in these modes."""
+"""Reasons why the truck does not drive, by mode."""
 
 
 @dataclass(slots=True)
 class Source:
-    """Newest request of one source."""
+    """Latest request of one source."""
 
     request: DriveRequest
     deadline: int
     """End of its lease, ns."""
     arrived: int
-    """When the request came, ns."""
+    """Arrival of the request, ns."""
     inside: bool
-    """One of the robot's own planners."""
+    """Whether the source is a planner of the robot."""
     held: bool = False
-    """Must send a neutral request before it may drive."""
+    """Whether the source must send a neutral request before it may drive."""
 
     @property
     def key(self) -> Key:
-        """Unique key: a source outside cannot act for a planner by taking its name."""
+        """Unique key; an external source cannot impersonate a planner by using its name."""
         return self.inside, self.request.source
 
     @property
     def neutral(self) -> bool:
-        """Whether it requests standstill."""
+        """Whether the source requests standstill."""
         return self.request.neutral
 
     @property
     def requests_motion(self) -> bool:
-        """Whether it is a planner that requests motion."""
+        """Whether the source is a planner that requests motion."""
         return self.inside and not self.neutral
 
     @property
     def rank(self) -> int:
-        """Its priority."""
+        """Priority of the source."""
         return PRIORITY[self.request.role]
 
 
@@ -84,7 +85,7 @@ class Sources:
     """All requests of this run.
 
     Args:
-        nonce: of this run; requests must carry it.
+        nonce: nonce of this run; requests must carry it.
         config: leases, request age and remote trackers.
     """
 
@@ -97,19 +98,19 @@ class Sources:
         self._drive: dict[Key, Source] = {}
         self._min_rank = 0
         self._released: dict[Key, None] | None = None
-        """Sources that were live at the STOP order or have been neutral since, the least recent first; None = there
-        was none."""
+        """Sources that were live at the STOP order or have been neutral since, least recent first; None without a STOP
+        order."""
         self._stop = "", 0
-        """Source and time (ns) of the newest order that stops."""
+        """Source and time (ns) of the latest stopping order."""
         self._stop_of_others = "", 0
-        """Source and time (ns) of the newest such order of another source."""
+        """Source and time (ns) of the latest stopping order of another source."""
         self._asking: dict[str, int] = {}
-        """Operators who ask for the drive, and until when that counts, ns."""
+        """Operators who ask for the drive, with the expiry of their request, ns."""
         self._handed: tuple[str, int, int] | None = None
-        """Operator to whom the drive was handed over, until when (ns) and below which rank others wait for it."""
+        """Operator who received the drive, end of the wait of others (ns), and the highest rank that waits."""
 
     def accept_request(self, request: DriveRequest, now: int) -> Reason:
-        """OK, or why a drive request from outside is refused."""
+        """Return OK, or why an external drive request is refused."""
         if request.role not in OPERATORS and not (
             request.role is Role.TRACKER and request.source in self._config.remote_trackers
         ):
@@ -121,23 +122,23 @@ class Sources:
         return freshness(request, now, self._config.max_request_age) if reason is Reason.OK else reason
 
     def accept_planner_request(self, request: DriveRequest, now: int) -> Reason:
-        """OK, or why a drive request of the robot's own planners is refused."""
+        """Return OK, or why a drive request of the robot's planners is refused."""
         if request.role is not Role.TRACKER:
             return Reason.BAD_ROLE
         return self._planner_requests.accept(request, self.nonce, now)
 
     def accept_order(self, request: ControlRequest, now: int) -> Reason:
-        """OK, or why an order is refused."""
+        """Return OK, or why an order is refused."""
         reason = self._orders.accept(request, self.nonce, now)
         if reason is Reason.OK and request.order in STARTING:
             return freshness(request, now, self._config.max_request_age)
         return reason
 
     def stopped(self, source: str, now: int) -> None:
-        """A source ordered a stop: orders of others that start are refused if their sender did not know of it.
+        """Note a stop ordered by a source; refuse starting orders of other sources that did not know of it.
 
         Args:
-            source: empty = not authenticated, another than every source.
+            source: name of the source; empty if not authenticated, which differs from every source.
             now: ns.
         """
         if source != self._stop[0]:
@@ -145,9 +146,9 @@ class Sources:
         self._stop = source, now
 
     def overtaken(self, request: ControlRequest) -> str:
-        """Which other source has ordered a stop since the gate state that the sender of an order that starts knew.
+        """Return another source that ordered a stop after the gate state known to the sender of a starting order.
 
-        Empty if none has.
+        Empty if no other source has.
         """
         stopped_by, at = self._stop_of_others if request.source == self._stop[0] else self._stop
         if request.order not in STARTING or request.gate_stamp is None or request.gate_stamp >= at:
@@ -173,7 +174,7 @@ class Sources:
         return [source for source in self._drive.values() if now <= source.deadline]
 
     def driver(self, now: int, holder: Key | None) -> Source | None:
-        """The source that may drive now.
+        """Return the source that may drive now.
 
         Args:
             now: ns.
@@ -187,42 +188,42 @@ class Sources:
         return max(able, key=lambda source: (source.rank, source.requests_motion, source.key == holder), default=None)
 
     def ask(self, name: str, now: int) -> None:
-        """An operator asks for the drive."""
+        """Note that an operator asks for the drive."""
         self._asking = {other: until for other, until in self._asking.items() if now <= until and other != name}
-        while len(self._asking) >= 4:  # operators who ask at once; one more replaces the oldest
+        while len(self._asking) >= 4:  # maximum number of operators who ask at once; one more replaces the oldest
             del self._asking[next(iter(self._asking))]
         self._asking[name] = now + ASKING
 
     def asking(self, now: int) -> tuple[str, ...]:
-        """Operators who ask for the drive, the newest last."""
+        """Operators who ask for the drive, latest last."""
         return tuple(name for name, until in self._asking.items() if now <= until)
 
     def hand_over(self, holder: Source, to: str, now: int) -> None:
-        """``holder`` lets ``to`` drive; it must send a neutral request before it may drive itself."""
-        # Since the tick that made it the holder it may have sent a newer request.
+        """Hand the drive from ``holder`` to ``to``; ``holder`` must send a neutral request before driving again."""
+        # The holder may have sent a later request since the tick that made it the holder.
         self._drive.get(holder.key, holder).held = True
         self._asking.pop(to, None)
-        handed = 3 * SECOND  # others wait so long for the operator to whom the drive was handed over, ns
+        handed = 3 * SECOND  # time that others wait for the operator who received the drive, ns
         self._handed = to, now + handed, holder.rank
         self._min_rank = min(self._min_rank, PRIORITY[Role.STATION])
 
     def handed_to(self, now: int) -> str | None:
-        """Operator to whom the drive was handed over just now."""
+        """Operator who has just received the drive."""
         return self._handed[0] if self._handed is not None and now <= self._handed[1] else None
 
     def live_name(self, name: str, now: int) -> bool:
-        """Whether an operator of this name sends requests."""
+        """Whether an external source with this name has a valid lease."""
         return any(not source.inside and source.request.source == name for source in self.live(now))
 
     def _waits(self, source: Source, now: int) -> bool:
-        """Whether the drive was just handed over to another than this one."""
+        """Whether the source must wait because another operator has just received the drive."""
         to = self.handed_to(now)
         if to is None or (source.request.source == to and not source.inside):
             return False
         return self._handed is not None and source.rank <= self._handed[2]
 
     def priority(self, source: Source, now: int, holder: Key | None) -> Reason:
-        """OK if this source drives or would drive, or why not."""
+        """Return OK if this source drives or would drive, else the reason."""
         if source.held:
             return Reason.NOT_ARMED_SPEED
         driver = self.driver(now, holder)
@@ -233,25 +234,25 @@ class Sources:
         return Reason.LOWER_PRIORITY
 
     def requesting_motion(self, now: int) -> tuple[str, ...]:
-        """Names of the operators who have a valid lease and request motion; a planner may wait to be let drive."""
+        """Names of operators with a valid lease who request motion; planners may request it while they wait."""
         return tuple(s.request.source for s in self.live(now) if s.request.role in OPERATORS and not s.neutral)
 
     def claim(self, role: Role) -> None:
-        """``role`` has driven or stopped the truck: lower roles wait for the next ARM order."""
+        """Make lower roles wait for the next ARM order, because ``role`` has driven or stopped the truck."""
         self._min_rank = max(self._min_rank, PRIORITY[role])
 
     def hold(self, now: int) -> None:
-        """Every source must send a neutral request before it may drive."""
+        """Require a neutral request of every source before it may drive."""
         self._released = dict.fromkeys(source.key for source in self.live(now))
         for source in self._drive.values():
             source.held = True
 
     def _unheard(self, key: Key) -> bool:
-        """Whether a source was neither live at the STOP order nor has been neutral since."""
+        """Whether a source was not live at the STOP order and has not been neutral since."""
         return self._released is not None and key not in self._released
 
     def _remember_neutral(self, key: Key, released: dict[Key, None]) -> None:
-        """Add a source to the released ones; where there are too many, the least recent one without a lease goes."""
+        """Add a source to the released sources; if there are too many, drop the least recent source without a lease."""
         released.pop(key, None)
         others = [name for inside, name in released if not inside]
         if not key[0] and (crowd := crowded(others, key[1])):
@@ -262,10 +263,10 @@ class Sources:
         released[key] = None
 
     def release(self, *, planners: bool) -> None:
-        """End ``claim`` and ``hold``: the truck was armed again.
+        """End ``claim`` and ``hold``, because the truck was armed again.
 
         Args:
-            planners: may drive as well.
+            planners: whether planners may drive as well.
         """
         self._min_rank = 0 if planners else PRIORITY[Role.STATION]
         self._released = None
@@ -295,14 +296,14 @@ class EventLog:
     """Collects events between two ticks.
 
     Args:
-        interval: least seconds between two events of one reason and source; those in between are counted.
+        interval: minimum time between two events of one reason and source, s; suppressed events are counted.
     """
 
     def __init__(self, interval: float) -> None:
         self._interval = round(interval * SECOND)
         self._events: list[GateEvent] = []
         self._emitted: dict[tuple[Reason, str], tuple[int, int]] = {}
-        """When each was emitted last, ns, and how many were suppressed since."""
+        """Time of the last emission (ns) and number of suppressed events since, by reason and source."""
 
     def emit(
         self,
@@ -316,20 +317,20 @@ class EventLog:
         always: bool = False,
         lasting: bool = False,
     ) -> None:
-        """Add an event; repetitions within the interval only raise the next one's ``repeated``.
+        """Add an event; repetitions within the interval only increase ``repeated`` of the next event.
 
         Args:
             now: ns.
-            reason: what happened.
-            severity: how bad it is.
-            text: default: the reason's own.
-            values: measurements behind it.
-            source: program or person it is about.
-            always: never suppressed, as for transitions.
-            lasting: suppressed for as long as it repeats without a pause of the interval.
+            reason: reason of the event.
+            severity: severity of the event.
+            text: message; by default the text of the reason.
+            values: measurements behind the event.
+            source: program or person concerned.
+            always: whether the event is never suppressed, as for transitions.
+            lasting: whether to suppress the event as long as it repeats without a pause of the interval.
         """
         key = (reason, source)
-        # Different events (reason and source) within one interval: sources may invent any number of names.
+        # Maximum number of different events (reason and source) per interval: sources may invent any number of names.
         max_keys = 64
         if key not in self._emitted and len(self._emitted) >= max_keys:
             self._emitted = {other: at for other, at in self._emitted.items() if now - at[0] < self._interval}
@@ -348,31 +349,31 @@ class EventLog:
         self._events.append(GateEvent(reason, severity, text or reason.text, fields))
 
     def drain(self) -> tuple[GateEvent, ...]:
-        """Events since the last call."""
+        """Return the events since the last call."""
         events = tuple(self._events)
         self._events.clear()
         return events
 
 
 class GateStateMachine:
-    """Disarmed > armed > driving > stopping > (armed | disarmed); an emergency stop from any state latches.
+    """States: disarmed > armed > driving > stopping > (armed | disarmed); an emergency stop from any state latches.
 
     Args:
         events: receives the transitions.
-        latched: whether it begins with the emergency stop latched.
+        latched: whether the emergency stop is latched at the start.
     """
 
     def __init__(self, events: EventLog, *, latched: bool) -> None:
         self._events = events
         self.mode = GateMode.ESTOPPED if latched else GateMode.DISARMED
         self.since = 0
-        """When this mode was entered, ns."""
+        """Time of entry into this mode, ns."""
         self.holder: Source | None = None
-        """The driving source; None in every mode but driving."""
+        """Driving source; None in every mode except driving."""
         self.driven = 0
-        """When a source last drove, or the truck was armed, ns."""
+        """Time when a source last drove or the truck was armed, ns."""
         self.disarm_at_rest = False
-        """Disarm as soon as the truck is at rest."""
+        """Whether to disarm as soon as the truck is at rest."""
         self._stopped_by: tuple[Reason, ...] = ()
         self._calibrates = False
 
@@ -388,7 +389,7 @@ class GateStateMachine:
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Why the truck does not drive in the present mode."""
+        """Reasons why the truck does not drive in this mode."""
         return MODE_REASONS.get(self.mode, self._stopped_by)
 
     @property
@@ -402,7 +403,7 @@ class GateStateMachine:
         return None if self.holder is None else self.holder.request.source
 
     def arm(self, now: int, by: str, *, calibrates: bool = False) -> None:
-        """Arm; on an armed truck this restarts the time until it disarms by itself."""
+        """Arm the truck; if it is already armed, restart the timeout for automatic disarming."""
         self.driven = now
         self._calibrates = calibrates
         if self.mode is GateMode.DISARMED:
@@ -411,7 +412,7 @@ class GateStateMachine:
             self._events.emit(now, Reason.ARMED, Severity.INFO, source=by, always=True)
 
     def drive(self, now: int, driver: Source) -> None:
-        """``driver`` begins or continues to drive."""
+        """Let ``driver`` start or continue to drive."""
         if self.mode is not GateMode.DRIVING:
             self._enter(GateMode.DRIVING, now)
         if self.holder_key != driver.key:
@@ -426,18 +427,18 @@ class GateStateMachine:
         self._stopped_by = tuple(dict.fromkeys(reasons))
 
     def release(self, now: int) -> None:
-        """The driver ended its requests while the truck was at rest."""
+        """Release control: the driver ended its requests while the truck was at rest."""
         text = f"{self.holder_name} released control"
         self._enter(GateMode.ARMED, now)
         self._events.emit(now, Reason.STOPPED, Severity.INFO, text)
 
     def rest(self, now: int) -> None:
-        """The stopped truck is at rest."""
+        """Return to armed: the stopped truck is at rest."""
         self._enter(GateMode.ARMED, now)
         self._events.emit(now, Reason.STOPPED, Severity.INFO, always=True)
 
     def disarm(self, now: int, text: str) -> None:
-        """Disarm; ``text`` says why."""
+        """Disarm; ``text`` is the reason in words."""
         self._enter(GateMode.DISARMED, now)
         self.disarm_at_rest = False
         self._events.emit(now, Reason.DISARMED, Severity.INFO, text, always=True)

@@ -1,4 +1,4 @@
-"""Checks of the gate that a configuration adds by ``kind``, of this repository or of other distributions."""
+"""Catalog of gate checks that a configuration adds by ``kind``, from this repository or other distributions."""
 
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -24,22 +24,22 @@ class FenceConfig(CheckConfig):
 
 
 class FreshConfig(CheckConfig):
-    """A topic without which the robot must not move."""
+    """Topic that must be fresh for the robot to move."""
 
     kind: Literal["fresh"]
     topic: str
     """Name of the topic, such as sensor/imu."""
     within: Annotated[float, Field(gt=0, le=60)] | None = None
-    """Greatest age of its newest message, s; null: the staleness limit of the topic itself."""
+    """Maximum age of the latest message, s; null: staleness limit of the topic."""
 
     @property
     def row(self) -> Topic[Any]:
-        """The topic's row in the topic table."""
+        """Row of the topic in the topic table."""
         return BY_NAME[self.topic]
 
     @property
     def limit(self) -> float:
-        """Greatest age, s; +inf if neither the settings nor the topic has one."""
+        """Maximum age, s; +inf if neither the settings nor the topic has a limit."""
         return self.row.fresh_for() if self.within is None else self.within
 
     @model_validator(mode="after")
@@ -67,7 +67,7 @@ GATE_CHECKS: Final = Catalog(
     ),
     base=CheckConfig,
 )
-"""A check is a ``Check`` made from its settings and a ``GateView``; it can only make the gate stricter."""
+"""Checks by ``kind``, built from their settings and a ``GateView``; they can only make the gate stricter."""
 
 AnyCheck = Annotated[CheckConfig, GATE_CHECKS.section()]
-"""One of the configuration's section `checks`."""
+"""One check of section `checks` in the configuration."""

@@ -1,9 +1,9 @@
-"""What a check of the gate is: one rule that may slow the robot or keep it at rest, and never more than that.
+"""Interface of the gate's checks: a check is one rule that may slow the robot or keep it at rest, and nothing else.
 
-The gate keeps an ordered list of checks, worst reasons first. Every check sees all messages that the gate receives and
-every tick (``observe``). At each tick the gate asks it why the robot may not move at all (``reason``) and how fast it
-may go along the motions in question (``limit``); ``describe`` puts a reason into words with its figures. The gate takes
-the union of all reasons and the least of all limits, so that one more check can only make it stricter.
+The gate keeps an ordered list of checks, worst reasons first. Every check observes all messages received by the gate
+and every tick (``observe``). At each tick the gate asks it why the robot may not move at all (``reason``) and how fast
+it may go along the requested and commanded motions (``limit``); ``describe`` words a reason with its measurements. The
+gate combines the union of all reasons and the minimum of all limits, so an additional check can only make it stricter.
 """
 
 import math
@@ -25,14 +25,14 @@ from monstertruckd.gate.motion import Course, Motion
 from monstertruckd.gate.samples import Samples
 
 GATE: Final = ServiceName.GATE.value
-"""Source of causes that only the gate itself knows."""
+"""Source of causes known only to the gate."""
 
 
 class Tick(NamedTuple):
-    """A tick of the gate begins; checks observe it as they do messages."""
+    """Start of a tick of the gate, observed by checks like a message."""
 
     now: int
-    """Ns."""
+    """Time of the tick, ns."""
     elapsed: float
     """Time since the previous tick, ns."""
 
@@ -42,17 +42,17 @@ class PaceLimit(NamedTuple):
 
     reason: Reason
     pace: float
-    """Greatest pace (m/s); 0 = the robot stands, and its driver stays in control."""
+    """Maximum pace, m/s; 0: the robot stands while its driver stays in control."""
 
 
 class GateView:
-    """What a check may look at, and not change: limits, newest samples, commanded motion and mode of the gate.
+    """Read access for checks: limits, latest samples, commanded motion and mode of the gate.
 
     Args:
-        limits: in force.
+        limits: limits in force.
         chassis: kinematics of the body.
         footprint: the body's outline.
-        samples: newest valid sample of every sensor.
+        samples: latest valid sample of every sensor.
         motion: commanded motion.
         states: the gate's state machine.
     """
@@ -80,32 +80,32 @@ class GateView:
 
     @property
     def mode(self) -> GateMode:
-        """Present mode."""
+        """Current mode."""
         return self._states.mode
 
     @property
     def calibrates(self) -> bool:
-        """Whether an operator has armed the robot to calibrate sensors, on ground kept clear."""
+        """Whether an operator has armed the robot to calibrate sensors on ground kept clear."""
         return self._states.calibrates
 
     @property
     def confirmed(self) -> bool:
-        """Whether an operator drives who holds the second control, to drive into unseen ground."""
+        """Whether the driving operator holds the second control, to drive into unseen ground."""
         holder = self._states.holder
         return holder is not None and not holder.inside and holder.request.role in OPERATORS and holder.request.unseen
 
 
 class Check:
-    """One rule of the gate; a subclass overrides what it needs.
+    """One rule of the gate; a subclass overrides the methods it needs.
 
     Args:
-        view: what it may look at.
+        view: read access to the gate's state.
     """
 
     reasons: tuple[Reason, ...] = ()
-    """Reasons it may give."""
+    """Reasons that the check may give."""
     reads: tuple[Topic[Any], ...] = ()
-    """Topics it needs besides those that the gate reads anyway."""
+    """Topics needed in addition to the topics always read by the gate."""
 
     def __init__(self, view: GateView) -> None:
         self.view = view
@@ -117,7 +117,7 @@ class Check:
 
     @property
     def moves(self) -> bool:
-        """Whether a motor moves the robot, although the drives' velocities may not show it."""
+        """Whether a motor moves the robot, even if the drives' velocities do not show it."""
         return False
 
     @property
@@ -127,20 +127,20 @@ class Check:
 
     @property
     def power_off(self) -> bool:
-        """Whether only switching the power stages off helps."""
+        """Whether only switching off the power stages helps."""
         return False
 
     @property
     def port_off(self) -> bool:
-        """Whether only switching the drives' ports off helps."""
+        """Whether only switching off the drives' ports helps."""
         return False
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take a message, or the beginning of a tick; ``view.samples`` holds the message already if it is valid.
+        """Take a message or the start of a tick; ``view.samples`` already holds the message if it is valid.
 
         Args:
             seen: message or tick.
-            topic: of a message; None = a tick.
+            topic: topic of the message; None for a tick.
         """
 
     def reason(self, now: int) -> Iterable[Reason]:
@@ -152,12 +152,12 @@ class Check:
 
         Args:
             now: ns.
-            courses: motions asked for and commanded; empty = standstill, None = nobody drives.
+            courses: requested and commanded motions; empty at standstill, None if no source drives.
         """
         return ()
 
     def text(self, reason: Reason) -> str:
-        """A reason of this check in words, for its event."""
+        """Wording of a reason of this check, for its event."""
         return reason.text
 
     def figures(self, reason: Reason, now: int) -> Iterable[Measurement]:
@@ -170,7 +170,7 @@ class Check:
         Args:
             reason: one of ``reasons``.
             now: ns.
-            since: when the gate first saw it, ns.
+            since: time when the gate first saw the reason, ns.
         """
         yield Cause(
             reason=reason,
@@ -181,20 +181,20 @@ class Check:
         )
 
     def reset(self) -> None:
-        """Forget a finding that stays until the gate disarms."""
+        """Clear a finding that stays until the gate disarms."""
 
 
 class Checks:
-    """The gate's ordered list of checks: the union of their reasons, the least of their limits.
+    """Ordered list of the gate's checks: union of their reasons, minimum of their limits.
 
     Args:
-        checks: worst reasons first.
+        checks: checks, worst reasons first.
     """
 
     def __init__(self, checks: Iterable[Check]) -> None:
         self._checks = tuple(checks)
         self._givers: dict[Reason, Check] = {}
-        """The check that gave a reason most recently; before that, the first one that may."""
+        """Check that gave each reason most recently; initially the first check that may give it."""
         for check in self._checks:
             for reason in check.reasons:
                 self._givers.setdefault(reason, check)
@@ -203,12 +203,12 @@ class Checks:
         return iter(self._checks)
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Show every check a message or the beginning of a tick; see ``Check.observe``."""
+        """Pass a message or the start of a tick to every check; see ``Check.observe``."""
         for check in self._checks:
             check.observe(seen, topic)
 
     def blocks(self, now: int) -> tuple[Reason, ...]:
-        """Reasons to stand still at ``now`` (ns), worst first."""
+        """Reasons why the robot may not move at ``now`` (ns), worst first."""
         found: dict[Reason, Check] = {}
         for check in self._checks:
             for reason in check.reason(now):
@@ -217,11 +217,11 @@ class Checks:
         return tuple(found)
 
     def limits(self, now: int, courses: Sequence[Course] | None) -> dict[Reason, float]:
-        """Reasons to go slowly with the least pace for each, m/s; arguments as of ``Check.limit``."""
+        """Minimum pace limit for each reason, m/s; arguments as for ``Check.limit``."""
         found: dict[Reason, float] = {}
         for check in self._checks:
             for reason, pace in check.limit(now, courses):
-                allowed = pace if pace > 0 else 0.0  # also instead of a pace that is not a number
+                allowed = pace if pace > 0 else 0.0  # also replaces NaN
                 if allowed < found.get(reason, math.inf):
                     found[reason] = allowed
                     self._givers[reason] = check
@@ -229,7 +229,7 @@ class Checks:
 
     @property
     def reads(self) -> tuple[Topic[Any], ...]:
-        """Topics that the checks need besides those that the gate reads anyway."""
+        """Topics needed by the checks in addition to the topics always read by the gate."""
         return tuple(dict.fromkeys(topic for check in self._checks for topic in check.reads))
 
     @property
@@ -258,17 +258,17 @@ class Checks:
         return any(check.port_off for check in self._checks)
 
     def text(self, reason: Reason) -> str:
-        """A reason in words, for its event."""
+        """Wording of a reason, for its event."""
         giver = self._givers.get(reason)
         return reason.text if giver is None else giver.text(reason)
 
     def describe(self, reasons: Iterable[Reason], now: int, since: Mapping[Reason, int]) -> list[Cause]:
-        """Causes of a stop, in words with their figures.
+        """Causes of a stop, with wording and measurements.
 
         Args:
             reasons: worst first.
             now: ns.
-            since: when the gate first saw each of them, ns.
+            since: time when the gate first saw each reason, ns.
         """
         causes: list[Cause] = []
         for reason in reasons:
@@ -280,6 +280,6 @@ class Checks:
         return causes
 
     def reset(self) -> None:
-        """The gate disarms: findings that stay until then end."""
+        """Clear findings that stay until the gate disarms."""
         for check in self._checks:
             check.reset()

@@ -1,8 +1,8 @@
-"""Limits of the safety gate, and what a body can do at most, whatever its configuration says.
+"""Limits of the safety gate, and the physical limits of a body that no configuration may exceed.
 
-A speed is possible if the motor reaches it and the body can stop from it on ground that was seen. A time without
-samples is possible if the body travels no further than its own length meanwhile. A tilt is possible up to where the
-wheels slip. Lengths m, angles rad, times s, speeds m/s.
+A speed is possible if the motor reaches it and the body can stop from it on seen ground. A time without samples is
+possible if the body travels no further than its own length meanwhile. A tilt is possible up to the slope where the
+wheels slip. Units: lengths m, angles rad, times s, speeds m/s.
 """
 
 import math
@@ -24,21 +24,21 @@ LiveTilt = Annotated[float, Field(gt=0, lt=math.pi / 2), LIVE]
 
 
 class SensorLimit(Schema):
-    """When one sensor is stale, and what that means."""
+    """Staleness limit of one sensor, and its consequence."""
 
     stale_after: Annotated[float, Field(gt=0, le=60)]
-    """Age of the newest valid sample, s since the daemon received it, from which on the sensor is stale."""
+    """Age of the latest valid sample above which the sensor is stale, s since the daemon received it."""
     critical: bool = True
-    """A stale sensor stops the truck; otherwise only the limits derived from it lapse."""
+    """Whether the stale sensor stops the truck; otherwise only the limits derived from it lapse."""
 
 
 def _limit(topic: Topic[Any], *, critical: bool = True) -> SensorLimit:
-    """The topic table's limit, unless the configuration names another one."""
+    """Default limit from the topic table."""
     return SensorLimit(stale_after=topic.fresh_for(), critical=critical)
 
 
 class Leases(Schema):
-    """Longest lease granted to each role, s, whatever the request asks for."""
+    """Maximum lease granted to each role, s; longer requested leases are shortened."""
 
     hand: Annotated[float, Field(gt=0, le=1)] = 0.25
     gamepad: Annotated[float, Field(gt=0, le=1)] = 0.25
@@ -47,7 +47,7 @@ class Leases(Schema):
     tracker: Annotated[float, Field(gt=0, le=1)] = 0.25
 
     def of(self, role: Role) -> float:
-        """Cap of a driving role, s."""
+        """Maximum lease of a driving role, s."""
         cap: float = getattr(self, role.value)
         return cap
 
@@ -56,13 +56,13 @@ class TiltLimits(Schema):
     """Limits of the angle between the truck's z axis and the vertical."""
 
     slow: LiveTilt = 0.21
-    """From this tilt on the speed is limited to ``slow_speed``, rad."""
+    """Minimum tilt that limits the speed to ``slow_speed``, rad."""
     stop: LiveTilt = 0.35
-    """From this tilt on the truck stops, rad."""
+    """Minimum tilt that stops the truck, rad."""
     hysteresis: Annotated[float, Field(ge=0)] = 0.035
-    """A limit ends when the tilt is this much below where it began, rad."""
+    """Hysteresis of both limits: a limit ends when the tilt is this far below its threshold, rad."""
     slow_speed: LivePositive = 0.08
-    """Speed limit from there on, m/s."""
+    """Speed limit from the tilt ``slow`` on, m/s."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -73,16 +73,16 @@ class TiltLimits(Schema):
 
 
 class SteeringCheckConfig(Schema):
-    """When the measured yaw contradicts the steering."""
+    """Detection of a measured yaw that contradicts the steering."""
 
     window: Annotated[float, Field(gt=0, le=5)] = 2.0
-    """Seconds over which turns are compared."""
+    """Window for the comparison of turns, s."""
     tolerance: Annotated[float, Field(gt=0, le=math.pi / 2)] = 0.14
-    """Tolerated difference: compass errors and the servos' lag, rad."""
+    """Tolerated difference due to compass errors and servo lag, rad."""
     speed: Positive = 0.03
-    """Below this speed nothing is compared: the truck may be turned by hand, m/s."""
+    """Minimum speed for the comparison, m/s: a slower truck may be turned by hand."""
     share: Annotated[float, Field(ge=0, lt=1)] = 0.3
-    """Tolerated difference as a share of the larger turn: tyre slip and calibration."""
+    """Tolerated difference due to tyre slip and calibration, as a fraction of the larger turn."""
 
 
 class ObstacleLimits(Schema):
@@ -91,56 +91,57 @@ class ObstacleLimits(Schema):
     ahead: LiveNotNegative = 0.05
     """Distance between footprint and obstacle after the stop, m."""
     side_clearance: LiveNotNegative = 0.02
-    """Clearance to all sides while passing, m, added to the footprint's padding."""
+    """Clearance on all sides while passing, in addition to the footprint's padding, m."""
     deceleration: LivePositive = 0.15
-    """Comfortable deceleration towards an obstacle, m/s^2: decides how early the truck slows down."""
+    """Comfortable deceleration towards an obstacle, m/s^2: determines how early the truck slows down."""
     crawl: Positive = 0.02
-    """An allowed speed below this is a stop; driving on needs twice as much, m/s."""
+    """Allowed speed below which the truck stops, m/s; it continues when twice this speed is allowed."""
     seen: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Share of the beams in each sector of travel (10 degrees) that must measure a range, or meet nothing within the
-    lidar's range. A recorded URG-04LX has 0.95 to 1.0, and less than half in one of 800 sectors."""
+    """Minimum fraction of the beams in each sector of travel (10 degrees) that measure a range, or meet nothing within
+    the lidar's range. A recorded URG-04LX has 0.95 to 1.0, and less than half in one of 800 sectors."""
     unseen_speed: LivePositive = 0.1
-    """Speed limit while a sector of travel is not seen, m/s; one not seen for ``scan.stale_after`` stops the truck.
-    Also the limit for a body that moves sideways, turns on the spot or swings its tail onto ground that no scan has
-    seen lately."""
+    """Speed limit while a sector of travel is not seen, m/s; a sector not seen for ``scan.stale_after`` stops the
+    truck. Also the limit for a body that moves sideways, turns on the spot or swings its tail onto ground not seen
+    recently by any scan."""
     unseen: Literal["stop", "slow"] = "stop"
-    """What to do before ground that no scan has seen lately, in reverse and with a tail that swings towards something;
-    slow: ``unseen_speed``."""
+    """Reaction to ground not seen recently by any scan, in reverse and with a tail that swings towards something; slow:
+    limit to ``unseen_speed``."""
     confirmed_speed: Annotated[float, Field(gt=0, le=0.05), LIVE] = 0.05
-    """Speed limit into such ground for an operator who holds the second control, m/s."""
+    """Speed limit into unseen ground while the operator holds the second control, m/s."""
     memory_time: Annotated[float, Field(gt=0, le=120)] = 30.0
-    """Age up to which earlier scans count, s: people may step onto ground that was free."""
+    """Maximum age of remembered scans, s: people may step onto ground that was free."""
     memory_distance: NotNegative = 2.0
-    """Travelled distance for which the points of earlier scans guard the truck where its lidar does not look, m."""
+    """Distance travelled before points of earlier scans are forgotten, m; these points guard the truck outside the
+    lidar's field of view."""
     memory_deviation: Annotated[float, Field(gt=0, le=0.5)] = 0.1
-    """Growth of the odometry's standard deviation from which on earlier scans no longer count, m: their places are that
+    """Growth of the odometry's standard deviation above which earlier scans are ignored, m: their positions are that
     much less certain."""
     open_ground: bool = False
-    """Whether a scan without any range counts as free ground; otherwise it is not valid."""
+    """Whether a scan without any range means free ground; otherwise it is invalid."""
 
 
 class SonarLimits(Schema):
-    """Limits for the sonars of a robot without a lidar, and for those that look backwards on a robot with one."""
+    """Limits for the sonars of a robot without a lidar, and for rear sonars of a robot with a lidar."""
 
     stale_after: Annotated[float, Field(gt=0, le=1)] = topics.SONAR.fresh_for()
-    """Age from which on the newest round of pings, or the newest answer of a sonar, is stale, s."""
+    """Age above which the latest round of pings, or the latest answer of a sonar, is stale, s."""
     core: Annotated[float, Field(gt=0, le=1)] = 0.2
-    """Half angle of the cone of a sonar that does not look in the direction of travel, rad: where its echoes may be.
-    Without a lidar only."""
+    """Half angle of the cone that may contain the echoes of a sonar not facing the direction of travel, rad; without a
+    lidar only."""
     unseen_speed: Positive = 0.1
-    """Speed limit where a sonar does not answer, or no sonar looks in the direction of travel, m/s; without a lidar
+    """Speed limit while a sonar does not answer, or no sonar faces the direction of travel, m/s; without a lidar
     only."""
 
 
 class ShaftCheckConfig(Schema):
-    """When a driven shaft does not turn although it is commanded to."""
+    """Detection of a driven shaft that does not turn although commanded."""
 
     within: Positive = 0.6
-    """Seconds after which the truck stops."""
+    """Time without turning that stops the truck, s."""
     speed: Positive = 0.03
-    """Slower commands are not compared, m/s."""
+    """Minimum commanded speed for the comparison, m/s."""
     share: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """A shaft slower than this share of its command does not turn."""
+    """Fraction of the commanded speed below which a shaft does not turn."""
 
 
 class ContactConfig(Schema):
@@ -150,73 +151,73 @@ class ContactConfig(Schema):
     """Rise of a motor's current above the rolling current that shows a contact, A: less than half of its rise until the
     clutch slips."""
     rolling: Annotated[float, Field(gt=0, le=2)] = 0.25
-    """Rolling current until the robot has measured its own, A. Raise it for motors that draw more than ``rolling`` plus
-    ``current`` while they roll: such currents are taken for contact, and never learned."""
+    """Assumed rolling current until the robot has measured its own, A. Raise it for motors that draw more than
+    ``rolling`` plus ``current`` while they roll: such currents are taken for contact, and never learned."""
     share: Annotated[float, Field(gt=0, lt=1)] = 0.3
-    """Shafts, free wheels and turns below this fraction of the commanded speed are held."""
+    """Fraction of the commanded speed below which shafts, free wheels and turns are held."""
     within: Annotated[float, Field(gt=0, le=0.3)] = 0.15
-    """Time for which they must be that slow, s."""
+    """Minimum duration of such a low speed, s."""
     back_off: Annotated[float, Field(gt=0, le=0.2)] = 0.03
     """Distance backed off, m."""
 
 
 class RunawayConfig(Schema):
-    """When a motor turns as nobody commanded."""
+    """Detection of uncommanded motion of a motor."""
 
     distance: Annotated[float, Field(gt=0, le=0.05)] = 0.01
-    """Tolerated distance of a shaft beyond its orders and ramps, and of the body by proven motion of the scans, m."""
+    """Tolerated distance of a shaft beyond its orders and ramps, and of the body by motion proven by scans, m."""
     body_distance: Annotated[float, Field(gt=0, le=0.2)] = 0.03
-    """Distance that free wheels or the turning body may move after all drives were to rest, m: gears unwind."""
+    """Tolerated travel of free wheels or the turning body after all drives should be at rest, m: gears unwind."""
     idle_current: Annotated[float, Field(gt=0, le=0.5)] = 0.05
-    """Motor current below which a power stage that is off turns nothing, A: the robot is pushed, or it rolls."""
+    """Motor current below which a power stage that is off turns nothing, A: the robot is pushed or rolls."""
 
 
 class GateConfig(Schema):
     """Settings of the safety gate."""
 
     rate: Annotated[float, Field(ge=10, le=200)] = 50.0
-    """Control ticks per second."""
+    """Control rate, ticks per second."""
 
     speed: LivePositive = 0.21
-    """Greatest wheel speed over ground, forward, m/s."""
+    """Maximum wheel speed over ground, forward, m/s."""
     reverse_speed: LivePositive = 0.15
-    """Greatest wheel speed in other motions (reverse, sideways, on the spot): the lidar does not see it all, m/s."""
+    """Maximum wheel speed in other motions (reverse, sideways, on the spot), m/s: the lidar does not see it all."""
     angle: Annotated[float, Field(gt=0, lt=1.0), LIVE] = 0.436
-    """Greatest axle angle, rad; less where the servos' pulses reach less."""
+    """Maximum axle angle, rad; less if the servos' pulses reach less."""
     acceleration: LivePositive = 0.5
-    """Growth of the commanded speed of base and wheels, m/s^2."""
+    """Maximum increase of the commanded speed of base and wheels, m/s^2."""
     yaw_acceleration: Annotated[float, Field(gt=0, le=20), LIVE] = 6.0
-    """Growth of the commanded yaw rate, rad/s^2."""
+    """Maximum increase of the commanded yaw rate, rad/s^2."""
     deceleration: Positive = 1.0
-    """Least deceleration of the drive controller's profile after a command of speed 0, m/s^2."""
+    """Minimum deceleration of the drive controller's profile after a command of speed 0, m/s^2."""
     quick_deceleration: Positive = 1.2
-    """Least deceleration of its quick stop, m/s^2."""
+    """Minimum deceleration of the drive controller's quick stop, m/s^2."""
     steering_rate: Annotated[float, Field(gt=0, le=12), LIVE] = 1.0
-    """Greatest change of a steering angle, rad/s; the quickest servos turn by 60 degrees in 0.09 s."""
+    """Maximum steering rate, rad/s; the fastest servos turn by 60 degrees in 0.09 s."""
     reaction: NotNegative = 0.08
-    """Seconds from a command leaving the gate to the truck's response."""
+    """Time from a command of the gate to the truck's response, s."""
     standstill: Positive = 0.01
     """Measured speed below which the truck is at rest, m/s."""
 
     leases: Leases = Leases()
     max_request_age: Positive = 0.5
-    """A request that may set the truck in motion must carry the stamp of a gate state not older than this, s."""
+    """Maximum age of the gate state whose stamp every request that may set the truck in motion must carry, s."""
     remote_trackers: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    """Sources outside the robot that may drive as trackers."""
+    """External sources that may drive as trackers."""
     disarm_after: Annotated[float, Field(gt=0, le=10)] = 1.5
-    """Seconds without executable drive requests after which the truck disarms: people may come near it."""
+    """Time without executable drive requests that disarms the truck, s: people may come near it."""
 
     scan: SensorLimit = _limit(topics.SCAN)
     scan_tilt: Annotated[float, Field(gt=0, le=math.pi / 4)] = 0.35
-    """A scan whose plane was tilted more than this is not valid, rad: half a metre ahead, as far as the gate checks, it
-    passes 0.2 m above or below an obstacle."""
+    """Maximum tilt of the plane of a valid scan, rad: half a metre ahead, the distance checked by the gate, a more
+    tilted plane passes 0.2 m above or below an obstacle."""
     drive: SensorLimit = _limit(topics.DRIVE)
     steering: SensorLimit = _limit(topics.STEERING)
     attitude: SensorLimit | None = _limit(topics.COMPASS)
-    """Null for a robot without a compass or tilt sensor: no tilt limits, and no attitude is expected."""
+    """Attitude limit; null for a robot without a compass or tilt sensor: no tilt limits, no attitude expected."""
     battery: SensorLimit = _limit(topics.BATTERY, critical=False)
     max_latency: Positive = 0.4
-    """Greatest time between a sample's stamp and its arrival, s; a later sample is not valid."""
+    """Maximum time between a sample's stamp and its arrival, s; a later sample is invalid."""
     tolerated_failures: Annotated[tuple[str, ...], Field(strict=False)] = (
         ServiceName.RECORDER.value,
         DeviceRole.CAMERA.value,
@@ -228,31 +229,31 @@ class GateConfig(Schema):
     """Services whose failure does not stop the truck."""
 
     tick_stall: Positive = 0.15
-    """A longer pause between two ticks stops the truck, s."""
+    """Pause between two ticks above which the truck stops, s."""
     stall_dwell: Positive = 0.5
-    """Seconds of punctual ticks after which such a stop ends."""
+    """Time of punctual ticks that ends such a stop, s."""
 
     tilt: TiltLimits = TiltLimits()
     turning: SteeringCheckConfig | None = SteeringCheckConfig()
-    """Compass against steering, finds servos without supply; null = off."""
+    """Comparison of compass and steering, detects servos without supply; null disables it."""
     contact: ContactConfig | None = ContactConfig()
-    """Contact while an operator drives into unseen ground; null = off."""
+    """Detection of contact while an operator drives into unseen ground; null disables it."""
     blocked: ShaftCheckConfig | None = ShaftCheckConfig()
-    """Commanded against measured speed of each driven shaft, finds blocked ones; null = off."""
+    """Comparison of commanded and measured speed of each driven shaft, detects blocked shafts; null disables it."""
     runaway: RunawayConfig | None = RunawayConfig()
-    """Measured against commanded motion, finds motors that do not obey; null = off."""
+    """Comparison of measured and commanded motion, detects motors that do not obey; null disables it."""
     short_faults: Annotated[int, Field(ge=2, le=10)] = 4
-    """Stops for stale sensors within ``short_faults_within`` after which the truck disarms."""
+    """Number of stops for stale sensors within ``short_faults_within`` that disarms the truck."""
     short_faults_within: Positive = 10.0
-    """Seconds; at least one for each of ``short_faults``."""
+    """Time window for ``short_faults``, s; at least one second for each of them."""
     battery_low_speed: LivePositive = 0.1
     """Speed limit with a low battery, or a stale battery voltage, m/s."""
     obstacle: ObstacleLimits = ObstacleLimits()
     sonar: SonarLimits = SonarLimits()
     unwitnessed: Annotated[float, Field(gt=0, le=1), LIVE] = 0.5
-    """Share of the speed limits that holds while no second, independent sensor measures the robot's motion."""
+    """Fraction of the speed limits while no second, independent sensor measures the robot's motion."""
     event_interval: NotNegative = 1.0
-    """Least seconds between two equal events."""
+    """Minimum time between two equal events, s."""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -278,10 +279,10 @@ class GateConfig(Schema):
 
 
 class InForce:
-    """The limits in force: whoever may set them replaces ``config`` between two ticks.
+    """Limits in force; the owner replaces ``config`` between two ticks.
 
     Args:
-        config: the first ones.
+        config: initial limits.
     """
 
     def __init__(self, config: GateConfig) -> None:
@@ -289,40 +290,40 @@ class InForce:
 
 
 GRIP: Final = 0.6
-"""Friction of rubber wheels on a smooth floor, at most."""
+"""Maximum friction coefficient of rubber wheels on a smooth floor."""
 SLIPPING: Final = math.atan(GRIP)
 """Slope on which the wheels slip, rad."""
 
 
 @dataclass(frozen=True, slots=True)
 class BodyLimits:
-    """What bounds the motion of one body."""
+    """Physical limits of one body."""
 
     length: float
-    """M."""
+    """Length of the body, m."""
     mass: float
-    """Kg."""
+    """Mass of the body, kg."""
     pull: float
-    """Greatest force of all driven shafts together at the ground, N."""
+    """Maximum total force of all driven shafts at the ground, N."""
     motor_speed: float | None
-    """Wheel speed over ground at the greatest motor rate, m/s; None = not known."""
+    """Wheel speed over ground at the maximum motor rate, m/s; None if unknown."""
     sight: float | None
-    """Distance ahead of the body on which its lidar is sure to see an obstacle, m; None = no lidar."""
+    """Distance ahead of the body within which its lidar reliably sees an obstacle, m; None without a lidar."""
 
     @property
     def acceleration(self) -> float:
-        """Greatest change of speed that motors and wheels hold, m/s^2."""
+        """Maximum acceleration that motors and wheels can hold, m/s^2."""
         gravity = 9.81
         return min(self.pull / self.mass, GRIP * gravity)
 
 
 def impossible_settings(config: GateConfig, body: BodyLimits, times: Iterable[tuple[str, float]] = ()) -> Iterator[str]:
-    """Every setting that asks for more than the body can do, with what it can.
+    """Messages for settings that exceed the body's limits, each with the limit.
 
     Args:
-        config: the gate's.
-        body: which.
-        times: names and values (s) of other settings during which the truck may drive on unattended.
+        config: settings of the gate.
+        body: physical limits.
+        times: names and values (s) of other settings that let the truck continue unattended.
     """
     rounding = 1e-9
     for name in ("acceleration", "deceleration", "quick_deceleration"):
@@ -351,7 +352,7 @@ def impossible_settings(config: GateConfig, body: BodyLimits, times: Iterable[tu
 
 
 def _beyond_checks(config: GateConfig) -> Iterator[str]:
-    """Settings of checks that could never stop a truck."""
+    """Messages for settings of checks that could never stop a truck."""
     if config.obstacle.deceleration > config.deceleration:
         yield (
             f"gate.obstacle.deceleration {config.obstacle.deceleration:g} m/s^2: at most gate.deceleration, "
@@ -366,20 +367,20 @@ def _beyond_checks(config: GateConfig) -> Iterator[str]:
 
 
 def stopping_distance(config: GateConfig) -> float:
-    """Distance from where the newest scan was taken to standstill, at worst, m."""
+    """Worst-case distance from the place of the latest scan to standstill, m."""
     delay = config.scan.stale_after + config.max_latency + config.reaction
-    speed = config.speed  # a product of any numbers is one, while a power may raise OverflowError
+    speed = config.speed  # a product cannot raise OverflowError, a power can
     return config.obstacle.ahead + speed * delay + speed * speed / (2 * config.deceleration)
 
 
 def required_sensors(config: GateConfig) -> dict[str, SensorLimit]:
-    """Limits of the sensors that stop the truck by default when they are stale, by their key."""
+    """Limits, by key, of the sensors that by default stop the truck when stale."""
     limits = ((name, limit) for name, limit in config if isinstance(limit, SensorLimit))
     return {name: limit for name, limit in limits if GateConfig.model_fields[name].default.critical}
 
 
 def _times(config: GateConfig) -> Iterator[tuple[str, float]]:
-    """Settings during which the truck may drive on unattended, s."""
+    """Settings that let the truck continue unattended for that time, s."""
     for name, limit in required_sensors(config).items():
         yield f"gate.{name}.stale_after", limit.stale_after
     for name in ("max_latency", "reaction", "tick_stall", "max_request_age"):
@@ -440,7 +441,7 @@ WEAKER_ABOVE: Final = (
     "runaway.idle_current",
     "short_faults",
 )
-"""Settings of the gate that are weaker the greater they are."""
+"""Gate settings that weaken the gate when increased."""
 
 WEAKER_BELOW: Final = (
     "rate",
@@ -458,11 +459,11 @@ WEAKER_BELOW: Final = (
     "contact.back_off",
     "short_faults_within",
 )
-"""Settings of the gate that are weaker the less they are."""
+"""Gate settings that weaken the gate when decreased."""
 
 
 def weakened(config: GateConfig) -> tuple[str, ...]:
-    """Settings of the gate that are weaker than the defaults, each with its value and the default."""
+    """Messages for gate settings weaker than the defaults, each with its value and the default."""
     default = GateConfig()
     texts = [*weaker("gate", config, default, WEAKER_ABOVE, WEAKER_BELOW)]
     texts += [
@@ -492,14 +493,14 @@ def weakened(config: GateConfig) -> tuple[str, ...]:
 
 
 def weaker(section: str, config: Schema, usual: Schema, above: Iterable[str], below: Iterable[str]) -> Iterator[str]:
-    """Every setting that is weaker than usual, with its value and the usual one.
+    """Messages for settings weaker than usual, each with its value and the usual value.
 
     Args:
-        section: where they are, for the texts.
-        config: the settings.
-        usual: likewise.
-        above: dotted names of those that are weaker the greater they are; what is None is not compared.
-        below: the less they are.
+        section: section name for the messages.
+        config: settings.
+        usual: usual settings.
+        above: dotted names of settings that weaken when increased; a value of None is not compared.
+        below: dotted names of settings that weaken when decreased.
     """
     for names, sign in ((above, 1), (below, -1)):
         for name in names:

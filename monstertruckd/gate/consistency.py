@@ -1,4 +1,4 @@
-"""Sensors that cannot be right count as lost: what the comparison of the robot's measures of motion has found."""
+"""Check of sensor consistency: treats sensors contradicted by other measures of motion as lost."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
@@ -14,14 +14,14 @@ from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
 from monstertruckd.gate.motion import AHEAD, Course
 
 ENOUGH: Final = 2
-"""Independent measures of motion with which a sensor that lies shows."""
+"""Number of independent measures of motion that reveal a wrong sensor."""
 
 
 class ConsistencyCheck(Check):
-    """A sensor in doubt stops the robot where its silence would; without a second measure the robot goes slowly.
+    """Stops the robot on doubt about a sensor whose silence stops it; slows it without a second measure of motion.
 
-    A doubt about motion stops a robot that is armed, and must have come up since it was: who arms the robot again lets
-    it try again.
+    A doubt about motion stops only an armed robot, and only if the doubt arose since arming: arming the robot again
+    allows another try.
     """
 
     reasons = (Reason.SENSORS_DISAGREE, Reason.SENSOR_FROZEN, Reason.UNWITNESSED)
@@ -31,22 +31,22 @@ class ConsistencyCheck(Check):
         super().__init__(view)
         self._newest: Consistency | None = None
         self._settled = 0
-        """Doubts about motion from before are over, ns."""
+        """Time up to when doubts about motion are ignored, ns."""
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take the newest comparison; a robot that is not armed is not stopped for its motion."""
+        """Take the latest comparison; while the robot is disarmed, ignore doubts about its motion."""
         if isinstance(seen, Consistency):
             self._newest = seen
         elif isinstance(seen, Tick) and not self.view.mode.active:
             self._settled = seen.now
 
     def reason(self, now: int) -> Iterator[Reason]:
-        """Doubts about sensors whose silence stops the robot."""
+        """Report doubts about sensors whose silence stops the robot."""
         doubts = [doubt for doubt in self._doubts() if self._stops(doubt.sensor) and not self._is_expected(doubt)]
         yield from dict.fromkeys(_reason(doubt) for doubt in doubts)
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Limits of a frozen battery voltage, and of a robot whose motion a second measure does not confirm."""
+        """Limit the speed for a frozen battery voltage, and for motion not confirmed by a second measure."""
         config = self.view.config
         if any(doubt.sensor == DeviceRole.BATTERY for doubt in self._doubts()) and not config.battery.critical:
             yield PaceLimit(Reason.SENSOR_FROZEN, config.battery_low_speed)
@@ -59,7 +59,7 @@ class ConsistencyCheck(Check):
                 yield PaceLimit(Reason.SENSORS_DISAGREE, slow)
 
     def describe(self, reason: Reason, now: int, since: int) -> Iterator[Cause]:
-        """One cause for each doubt, which names both sensors and their difference."""
+        """One cause per doubt, with both sensors and their difference."""
         found = [doubt for doubt in self._doubts() if _reason(doubt) is reason]
         if not found:
             yield from super().describe(reason, now, since)
@@ -69,7 +69,7 @@ class ConsistencyCheck(Check):
             yield Cause(reason=reason, source=doubt.sensor, since=doubt.since, text=text, measurements=(figure,))
 
     def text(self, reason: Reason) -> str:
-        """Names both sensors and their difference, or what the robot lacks."""
+        """Both sensors and their difference, or the missing measure of motion."""
         if reason is Reason.UNWITNESSED:
             return self._lacking()
         texts = [f"{doubt.sensor}: {doubt.text}" for doubt in self._doubts() if _reason(doubt) is reason]
@@ -84,7 +84,7 @@ class ConsistencyCheck(Check):
                 yield doubt
 
     def _is_expected(self, doubt: Doubt) -> bool:
-        """Whether a robot that is armed to calibrate its sensors goes on slowly in spite of this doubt."""
+        """Whether a robot armed to calibrate its sensors continues slowly despite this doubt."""
         return self.view.calibrates and _reason(doubt) is Reason.SENSORS_DISAGREE
 
     def _lacking(self) -> str:

@@ -1,10 +1,10 @@
 """Detects contact while an operator drives into ground that no sensor has seen, and backs off.
 
-Three measures show that something holds the body while its wheels are driven: a motor draws more current than rolling
-needs, a shaft or a free wheel is slower than commanded, or the body turns less than commanded. They are compared only
-while the commanded motion is steady, because a motor that accelerates its gears draws as much as one that pushes. After
-a contact the gate reverses the last motion for a few centimetres, and stands until the operator releases the stick or
-asks for another direction.
+Three measures show that an obstacle holds the body while its wheels are driven: a motor draws more than its rolling
+current, a shaft or a free wheel is slower than commanded, or the body turns less than commanded. The gate compares them
+only while the commanded motion is steady, because a motor that accelerates its gears draws as much current as a motor
+that pushes. After a contact the gate reverses the last motion for a few centimetres. Then the robot stands until the
+operator releases the stick or requests another direction.
 """
 
 import math
@@ -27,11 +27,11 @@ from monstertruckd.gate.config import ContactConfig
 from monstertruckd.gate.motion import Course, scaled
 
 SETTLED: Final = SECOND // 10
-"""Time for which a shaft must have reached its commanded speed before measures are compared, ns."""
+"""Time a shaft must hold its commanded speed before measures are compared, ns."""
 
 
 class ContactFinding(NamedTuple):
-    """The measure that showed a contact."""
+    """Measure that revealed a contact."""
 
     name: str
     """Name of the measure."""
@@ -47,7 +47,7 @@ class Lasting:
         self._since: int | None = None
 
     def holds(self, now: int, within: float, *, true: bool) -> bool:
-        """Whether it has held for ``within`` s at ``now``, ns."""
+        """Update with ``true`` at ``now`` (ns); return whether the condition has held for ``within`` s."""
         if not true:
             self._since = None
             return False
@@ -56,11 +56,11 @@ class Lasting:
 
 
 class ContactCheck(Check):
-    """Something holds the body of a robot that an operator drives into unseen ground.
+    """Detects that an obstacle holds the body while an operator drives into unseen ground, and backs off.
 
     Args:
-        view: what it may look at.
-        config: limits, and how far it backs off.
+        view: read access to the gate's state.
+        config: limits, and the distance to back off.
     """
 
     reasons = (Reason.CONTACT,)
@@ -72,23 +72,23 @@ class ContactCheck(Check):
         self._steady: Twist2 = STILL
         """Commanded motion."""
         self._reached: dict[int, int] = {}
-        """When each shaft reached its commanded speed, ns."""
+        """Time when each shaft reached its commanded speed, ns."""
         self._rolling: dict[int, deque[float]] = {}
-        """Newest motor currents of each shaft while the robot rolled freely, positive along the motion, A."""
+        """Latest motor currents of each shaft while the robot rolled freely, positive along the motion, A."""
         self._slow: dict[str, Lasting] = {}
         self._encoders: WheelEncoders | None = None
         self._request: DriveRequest | None = None
-        """Newest request of the holder."""
+        """Latest request of the holder."""
         self._touched: DriveRequest | None = None
         """Request in force when the robot made contact; None without a contact."""
         self._finding: ContactFinding | None = None
         self._began = 0
-        """When it began to back off, ns."""
+        """Time when the robot began to back off, ns."""
         self._backed = 0.0
         """Distance backed off, m."""
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take the commanded motion of the newest tick, or a measure of the real one."""
+        """Take the commanded motion of a tick, or a measurement of the actual motion."""
         match seen:
             case Tick():
                 self._follow(seen)
@@ -100,7 +100,7 @@ class ContactCheck(Check):
                 self._take_gyro(seen)
 
     def instead(self, request: DriveRequest, now: int) -> DriveRequest:
-        """Return what the gate drives: the holder's request or, after a contact, its opposite."""
+        """Return the request to be driven: the holder's request or, after a contact, its opposite."""
         self._request = request
         touched = self._touched
         if touched is None:
@@ -118,7 +118,7 @@ class ContactCheck(Check):
             yield PaceLimit(Reason.CONTACT, self.view.config.obstacle.confirmed_speed if self._backing(now) else 0.0)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """The measure that showed the contact."""
+        """Measure that revealed the contact."""
         if (found := self._finding) is not None:
             yield Measurement(name=found.name, value=found.value, unit=found.unit, limit=found.limit)
 
@@ -126,7 +126,7 @@ class ContactCheck(Check):
 
     def _follow(self, tick: Tick) -> None:
         twist = self.view.motion.twist
-        steady = 1e-3  # commanded velocities that differ by less are the same motion, m/s and rad/s
+        steady = 1e-3  # maximum difference of equal commanded motions, m/s and rad/s
         if max(abs(new - old) for new, old in zip(twist, self._steady, strict=True)) > steady:
             self._steady = twist
             self._reached.clear()
@@ -145,7 +145,7 @@ class ContactCheck(Check):
     def _backing(self, now: int) -> bool:
         """Whether the robot still has to back off."""
         distance = self._config.back_off
-        # The robot stops backing off after this multiple of the time that the distance takes at ``confirmed_speed``.
+        # The robot stops backing off after this multiple of the travel time for the distance at ``confirmed_speed``.
         patience = 2.0
         longest = patience * distance / self.view.config.obstacle.confirmed_speed
         return self._backed < distance and now - self._began < longest * SECOND
@@ -154,7 +154,7 @@ class ContactCheck(Check):
         return self._leads(request, self.view.motion.target(other).twist)
 
     def _leads(self, request: DriveRequest, twist: Twist2) -> bool:
-        """Whether a request asks for the direction of a twist."""
+        """Whether a request has the direction of a twist."""
         asked = self.view.motion.target(request).twist
         return sum(a * b for a, b in zip(asked, twist, strict=True)) > 0.0
 
@@ -185,7 +185,7 @@ class ContactCheck(Check):
             return
         sign = math.copysign(1.0, commanded)
         measured = sign * self.view.chassis.drivetrain.speed(feedback.velocity)
-        # Share of the commanded speed at which a shaft has reached it; a drive that is switched on takes half a second.
+        # Fraction of the commanded speed taken as reached; a drive just switched on needs half a second for it.
         reached = 0.8
         if measured >= reached * abs(commanded):
             self._reached.setdefault(shaft, feedback.stamp)
@@ -229,7 +229,7 @@ class ContactCheck(Check):
             self._touch(ContactFinding(f"speed of {name}", measured, unit, least), seen.received)
 
     def _touch(self, found: ContactFinding, now: int) -> None:
-        """Begin to back off if an operator drives on into unseen ground, and not away already."""
+        """Begin to back off if an operator drives on into unseen ground and not already away from it."""
         if self.view.confirmed and self._request is not None and self._leads(self._request, self._steady):
             self._touched, self._finding, self._began, self._backed = self._request, found, now, 0.0
             self._reached.clear()

@@ -1,12 +1,12 @@
 """The safety gate as a pure state machine: requests and observations in, actuator commands out at every tick.
 
 States: disarmed > armed > driving > stopping > (armed | disarmed); an emergency stop from any state latches.
-A stop is one command, speed 0 or quick stop: the ramp is the drive controller's own, so it completes even if nothing is
-sent afterwards. ``arbitration`` holds who may drive and the transitions, ``sensors`` what stops or slows the truck,
-``limiter`` how a request becomes the commanded motion, ``stops`` the causes reported.
+A stop is a single command, speed 0 or quick stop. The drive controller runs the ramp, so the stop completes even if
+nothing is sent afterwards. ``arbitration`` selects the driver and holds the transitions, ``sensors`` holds checks that
+stop or slow the truck, ``limiter`` converts requests to the commanded motion, ``stops`` reports the causes.
 
 Every stop ends with standstill confirmed by the drive. After a short fault (a late scan, an expired lease) the same
-source may continue; a fault longer than ``disarm_after``, or one of ``DISARMING``, disarms.
+source may continue; a fault longer than ``disarm_after``, or a reason in ``DISARMING``, disarms.
 """
 
 import math
@@ -58,7 +58,7 @@ from monstertruckd.gate.stops import Outages, StopLog, lease_cause
 URGENT: Final = frozenset(
     {Reason.DRIVE_STALE, Reason.DRIVE_FAULT, Reason.TICK_STALLED, Reason.SERVICE_FAILED, Reason.SHUTDOWN}
 )
-"""These stop by quick stop, which overtakes queued commands; the others by the drive's ordinary ramp."""
+"""Reasons that stop by quick stop, which overtakes queued commands; other reasons stop by the drive's ordinary ramp."""
 
 DISARMING: Final = frozenset(
     {
@@ -71,7 +71,7 @@ DISARMING: Final = frozenset(
         Reason.SENSORS_DISAGREE,
     }
 )
-"""After these the truck must be armed again, even if they were short."""
+"""Reasons that disarm the truck even if they are short."""
 
 HALTS: Final = frozenset(
     {
@@ -84,16 +84,16 @@ HALTS: Final = frozenset(
         Reason.OWN_CHECK,
     }
 )
-"""Speed limits of zero: the truck stands, and its driver stays in control."""
+"""Speed limits of zero: the truck stands while its driver stays in control."""
 
 
 def sensor_checks(view: GateView, *, battery_measured: bool, compared: bool = False) -> Iterator[Check]:
     """Checks that do not depend on where the robot drives, worst reasons first.
 
     Args:
-        view: what they may look at.
-        battery_measured: something is there to measure the battery.
-        compared: the robot compares its measures of motion, or should.
+        view: read access to the gate's state.
+        battery_measured: whether a device measures the battery.
+        compared: whether the robot has to compare its measures of motion.
     """
     config = view.config
     if config.runaway is not None:
@@ -119,7 +119,7 @@ def obstacle_checks(
     rear_sonars: Mapping[str, Place] | None,
     peers: Mapping[str, Footprint] | None,
 ) -> Iterator[Check]:
-    """Checks of the way ahead; arguments as of ``Gate``."""
+    """Checks of the path ahead; arguments as for ``Gate``."""
     lidar = None if sonars else ObstacleCheck(view, points, rear_sonars)
     sonar = SonarCheck(view, sonars) if sonars else None
     yield from (check for check in (lidar, sonar) if check is not None)
@@ -128,10 +128,10 @@ def obstacle_checks(
 
 
 class Decision(NamedTuple):
-    """What the gate decided about an order."""
+    """Decision of the gate about an order."""
 
     reason: Reason
-    """OK, or why it was refused."""
+    """OK, or the reason for the refusal."""
     text: str
 
 
@@ -139,7 +139,7 @@ ACCEPTED: Final = Decision(Reason.OK, Reason.OK.text)
 
 
 class GateOutput(NamedTuple):
-    """Result of one tick: the fields of DriveCommand, SteeringCommand and GateState; events and stops."""
+    """Result of one tick: fields of DriveCommand, SteeringCommand and GateState, events and stops."""
 
     action: DriveAction
     speeds: tuple[float, ...]
@@ -147,57 +147,57 @@ class GateOutput(NamedTuple):
     motor_velocities: tuple[float, ...]
     """Motor rate of every driven shaft, as in ``DriveCommand``."""
     front: float
-    """Axle angle, rad."""
+    """Front axle angle, rad."""
     rear: float
-    """Axle angle, rad."""
+    """Rear axle angle, rad."""
     servos: tuple[float, ...]
     """Servo angles, rad: front and rear, or front left, front right, rear left and rear right."""
     form: DriveForm | None
-    """Of the newest request of the holder."""
+    """Form of the holder's latest request."""
     twist: tuple[float, float, float]
-    """Commanded, of the base: m/s, m/s, rad/s."""
+    """Commanded twist of the base, m/s, m/s, rad/s."""
     mode: GateMode
     holder: str | None
     role: Role | None
     lease_left: float | None
-    """S."""
+    """Remaining lease of the holder, s."""
     last_seq: int | None
     speed_limit: float
-    """M/s."""
+    """Speed limit in force, m/s."""
     reasons: tuple[Reason, ...]
     stopping_distance: float
-    """M."""
+    """Distance travelled if stopped now, m."""
     waiting: tuple[str, ...]
-    """Planners that request motion while nobody drives."""
+    """Planners that request motion while no source drives."""
     asking: tuple[str, ...]
-    """Operators who ask to drive."""
+    """Operators who ask for the drive."""
     handed_to: str | None
-    """Operator to whom the drive was handed over in this tick."""
+    """Operator who has just received the drive."""
     events: tuple[GateEvent, ...]
     trips: tuple[Stop, ...]
     stopping: bool
-    """The truck is to stand, and its standstill is not measured yet."""
+    """Whether the truck must stand and its standstill is not measured yet."""
     port_off: bool
-    """Only switching the drives' ports off stops the truck."""
+    """Whether only switching off the drives' ports stops the truck."""
 
 
 class Gate:
-    """The safety gate, without any input or output of its own.
+    """The safety gate, without input or output.
 
     Args:
         config: limits.
         chassis: kinematics of the body, its motors and servos.
         footprint: the truck's outline.
         points: converts scans to points in base.
-        services: the services of the sensors, with the reason their loss gives.
-        nonce: of this run; requests must carry it.
-        battery_measured: something is there to measure the battery.
+        services: reason given by the loss of each sensor service, by service name.
+        nonce: nonce of this run; requests must carry it.
+        battery_measured: whether a device measures the battery.
         latched: whether the emergency stop was latched when the daemon last ran.
-        sonars: pose (x, y, yaw) of every sonar in base by name, of a robot that has no lidar; m, m, rad.
-        rear_sonars: the same of those that look backwards on a robot with a lidar.
+        sonars: sonars of a robot without a lidar: pose (x, y, yaw) in base by name, m, m, rad.
+        rear_sonars: rear-facing sonars of a robot with a lidar, as ``sonars``.
         peers: outlines of other robots whose poses are received, by name.
         compared: whether the robot has to compare its measures of motion.
-        own: settings of the checks that the configuration adds, by name.
+        own: settings of checks added by the configuration, by name.
     """
 
     def __init__(
@@ -240,20 +240,20 @@ class Gate:
         self._outages = Outages(services)
         self._stops = StopLog(self._outages)
         self._known: dict[Reason, int] = {}
-        """What stops or slows the truck, and since when (ns)."""
+        """Reasons that stop or slow the truck, with their start (ns)."""
         self._short_faults: deque[int] = deque()
-        """When the truck stopped for stale sensors since it was armed, ns."""
+        """Times of stops for stale sensors since the truck was armed, ns."""
         self._ticked: int | None = None
         self._shut_down = False
         self._findings = 0
-        """Findings of the checks that have been acted on."""
+        """Number of findings already handled."""
         self._unconfirmed = False
-        """The truck may have moved since its standstill was measured last."""
+        """Whether the truck may have moved since the last measured standstill."""
 
     def configure(self, config: GateConfig) -> None:
-        """Take other limits between two ticks; of those that differ only settings marked live take effect at once.
+        """Replace the limits between two ticks; of the changed settings, only those marked live take effect at once.
 
-        A truck that drives slows down to lesser ones by its ramp.
+        A driving truck slows down to a lower limit by its ramp.
         """
         self._limits.config = config
 
@@ -267,7 +267,7 @@ class Gate:
 
     @property
     def mode(self) -> GateMode:
-        """Present mode."""
+        """Current mode."""
         return self._states.mode
 
     @property
@@ -277,20 +277,20 @@ class Gate:
 
     @property
     def reads(self) -> tuple[Topic[Any], ...]:
-        """Topics whose newest message is to be shown to it before every tick, in this order."""
+        """Topics whose latest message the gate must observe before every tick, in this order."""
         drives = DRIVES[: len(self._chassis.shafts)]
         return tuple(dict.fromkeys((SCAN, COMPASS, *drives, STEERING, BATTERY, *self._checks.reads)))
 
     def survey(self) -> Generator[None, None, GroundSurvey | None] | None:
-        """Ground around the robot that its lidar has seen, in short steps; None without a lidar that guards it."""
+        """Map the ground seen by the lidar, in short steps; None if no lidar guards the robot."""
         return None if self._obstacles is None else self._obstacles.guard.memory.survey()
 
     def observe(self, message: Message, topic: Topic[Any]) -> None:
-        """Take the newest message of a topic; of health tables every one, for a later one may hide a restart.
+        """Take the latest message of a topic; take every health table, because a later table may hide a restart.
 
         Args:
-            message: of a sensor, of other robots, of the services' health, or an event of any service.
-            topic: its topic.
+            message: message of a sensor or of other robots, a health table, or an event of any service.
+            topic: topic of the message.
         """
         self._samples.observe(message, topic)
         self._checks.observe(message, topic)
@@ -299,11 +299,11 @@ class Gate:
     # Requests
 
     def request(self, request: DriveRequest, now: int) -> Reason:
-        """Take a drive request from outside; returns OK, or why it does not move the truck."""
+        """Take an external drive request; return OK, or why it does not move the truck."""
         return self._consider(request, now, self._sources.accept_request(request, now), inside=False)
 
     def planner_request(self, request: DriveRequest, now: int) -> Reason:
-        """Take a drive request of the robot's own planners; returns as ``request`` does."""
+        """Take a drive request of the robot's planners; return as ``request`` does."""
         return self._consider(request, now, self._sources.accept_planner_request(request, now), inside=True)
 
     def _consider(self, request: DriveRequest, now: int, accepted: Reason, *, inside: bool) -> Reason:
@@ -325,13 +325,13 @@ class Gate:
             return self._refuse(now, Reason.DISARMED, request)
         reason = self._sources.priority(source, now, self._states.holder_key)
         if reason is Reason.BUSY and inside and source.neutral:
-            return reason  # Its turn comes when the driving planner ends.
+            return reason  # It drives when the driving planner ends.
         if reason is not Reason.OK:
             return self._refuse(now, reason, request)
         return next(iter(self._blocks(now)), Reason.OK)
 
     def _impossible(self, request: DriveRequest) -> str | None:
-        """Why the body cannot do this motion; None if it can, or nearly."""
+        """Why the body cannot perform this motion; None if it can do it or a similar motion."""
         forms = self._chassis.forms
         if request.form not in forms:
             return f"a request by {request.form}: this body takes {' or '.join(sorted(forms))}"
@@ -344,15 +344,15 @@ class Gate:
     def control(self, request: ControlRequest, now: int) -> Decision:
         """Carry out an order, or refuse it.
 
-        ESTOP and STOP are accepted from every source that the bus lets in, authenticated or not: stopping is always
+        ESTOP and STOP are accepted from every source admitted by the bus, authenticated or not: stopping is always
         safe. ARM and RESET need an operator's role, a truck at rest and no operator requesting motion. An authenticated
-        ESTOP or STOP uses its sequence number, so that an earlier order of its source that arrives later, over another
-        channel, is refused.
-        So is an ARM or RESET whose sender did not know yet of another's ESTOP, STOP or DISARM.
+        ESTOP or STOP consumes its sequence number, so the gate refuses an earlier order of the same source that arrives
+        later over another channel. The gate also refuses an ARM or RESET whose sender did not yet know of an ESTOP,
+        STOP or DISARM by another source.
         """
         reason, order = self._sources.accept_order(request, now), request.order
         if order is Order.ESTOP or order is Order.STOP:
-            # The second copy of an order that came by topic and by call has a used number.
+            # An order sent by topic and by call arrives twice; the second copy has a used number.
             authenticated = reason in (Reason.OK, Reason.BAD_SEQUENCE)
             self._sources.stopped(request.source if authenticated else "", now)
             return self._estop(request, now) if order is Order.ESTOP else self._stop_by(request, now)
@@ -381,7 +381,7 @@ class Gate:
         what = request.order.value if isinstance(request, ControlRequest) else "drive"
         text = text or self._worded(reason)
         values = {"role": request.role.value, "request": what}
-        lasting = reason is Reason.LOWER_PRIORITY  # a tracker goes on asking while somebody drives by hand
+        lasting = reason is Reason.LOWER_PRIORITY  # a tracker keeps asking while an operator drives
         self._events.emit(now, reason, Severity.WARNING, text, values, source=request.source, lasting=lasting)
         return reason
 
@@ -390,7 +390,7 @@ class Gate:
         return Decision(self._refuse(now, reason, request, text), text)
 
     def _worded(self, reason: Reason) -> str:
-        """A refusal in words: of a request that came late, that it did, not that its lease had passed."""
+        """Wording of a refusal; a late request is reported as late, not as an expired lease."""
         return late_text(self._config.max_request_age) if reason is Reason.LEASE_EXPIRED else reason.text
 
     def _refuse_blocked(self, now: int, blocks: tuple[Reason, ...], request: ControlRequest) -> Decision:
@@ -398,7 +398,7 @@ class Gate:
         return self._refuse_order(now, blocks[0], request, causes_text(causes, now))
 
     def _refuse_moving(self, now: int, request: ControlRequest) -> Decision | None:
-        """The refusal while the robot is not known to be at rest or an operator requests motion."""
+        """Refuse an order while the robot may move or an operator requests motion; None otherwise."""
         if not self._at_rest(now):
             speed = self._samples.speed(now)
             if speed is None:
@@ -495,7 +495,7 @@ class Gate:
     # Ticks
 
     def tick(self, now: int) -> GateOutput:
-        """Advance to ``now`` (ns) and decide what the actuators do."""
+        """Advance to ``now`` (ns) and compute the actuator commands."""
         period = SECOND / self._config.rate
         elapsed = period if self._ticked is None else now - self._ticked
         self._ticked = now
@@ -523,7 +523,7 @@ class Gate:
         return self._output(now, blocks, limits)
 
     def _stop_runaway(self, now: int) -> None:
-        """Latch the emergency stop for a motion that nobody commanded; every finding is reported, latched or not."""
+        """Latch the emergency stop for uncommanded motion; report every finding, even if already latched."""
         if self._checks.findings == self._findings:
             return
         self._findings = self._checks.findings
@@ -537,20 +537,20 @@ class Gate:
         self._events.emit(now, Reason.UNCOMMANDED_MOTION, Severity.ERROR, text, values, always=True)
 
     def _confirm(self, now: int) -> None:
-        """Note whether the truck may move, or does; forget it once its standstill is measured."""
+        """Note that the truck moves or may move, until its standstill is measured."""
         if self.mode.accepts_motion or self._checks.moves:
             self._unconfirmed = True
         elif self._at_rest(now, self._states.since):
             self._unconfirmed = False
 
     def _is_stopping(self, now: int) -> bool:
-        """Whether the truck is to stand, and its standstill has not been measured since."""
+        """Whether the truck must stand and its standstill has not been measured since."""
         if self.mode.accepts_motion:
             return self.mode is GateMode.ARMED and not self._at_rest(now)
         return self._unconfirmed
 
     def neutral(self, now: int) -> GateOutput:
-        """Last output before the daemon ends: quick stop. The gate never drives again after it."""
+        """Return the last output before the daemon ends: quick stop; the gate does not drive after it."""
         self._shut_down = True
         self._motion.halt()
         if self._states.active:
@@ -564,7 +564,7 @@ class Gate:
         return (*((Reason.SHUTDOWN,) if self._shut_down else ()), *self._checks.blocks(now))
 
     def _advance(self, now: int, blocks: tuple[Reason, ...]) -> None:
-        """At most one transition per tick."""
+        """Perform at most one transition per tick."""
         states = self._states
         if not states.active:
             return
@@ -575,7 +575,7 @@ class Gate:
         elif states.mode is GateMode.ARMED and states.disarm_at_rest:
             self._disarm(now, ", ".join(reason.text for reason in blocks))
         elif states.mode is not GateMode.STOPPING and driver is not None:
-            if driver.key != states.holder_key or not driver.neutral:  # it may have been armed under its hand
+            if driver.key != states.holder_key or not driver.neutral:  # an ARM order may have ended its claim
                 self._sources.claim(driver.request.role)
             states.drive(now, driver)
         elif states.holder is not None and not blocks and self._released(states.holder, now):
@@ -589,7 +589,7 @@ class Gate:
             self._disarm(now, f"no driver for {self._config.disarm_after:g} s")
 
     def _released(self, holder: Source, now: int) -> bool:
-        """Whether the holder's last request was standstill, and the truck has been at rest since."""
+        """Whether the holder's last request was standstill and the truck has been at rest since."""
         return holder.neutral and self._motion.standing and self._at_rest(now, holder.arrived)
 
     def _stop(self, now: int, causes: list[Cause], *, ordered: bool = False) -> None:
@@ -599,7 +599,7 @@ class Gate:
         self._states.stop(now, (cause.reason for cause in causes))
 
     def _count_short_fault(self, now: int) -> None:
-        """Disarm at rest if there were too many short faults, after each of which the driver may go on."""
+        """Count a short fault; the driver may continue, but too many faults disarm the truck at rest."""
         faults, config = self._short_faults, self._config
         faults.append(now)
         while now - faults[0] > config.short_faults_within * SECOND:
@@ -610,7 +610,7 @@ class Gate:
             self._states.disarm_at_rest = True
 
     def _trip(self, now: int, mode: GateMode, causes: list[Cause], *, ordered: bool = False) -> None:
-        """Log a stop; called before the state changes."""
+        """Log a stop; must be called before the state changes."""
         holder = self._states.holder
         reasons = tuple(cause.reason for cause in causes)
         self._stops.add(
@@ -647,7 +647,7 @@ class Gate:
         if self.mode is GateMode.ESTOPPED or self._checks.urgent or not URGENT.isdisjoint(reasons):
             return DriveAction.QUICK_STOP
         if self.mode is GateMode.DISARMED:
-            # A motor that still turns, as after a daemon that died, must not coast.
+            # A motor that still turns, for example after a crash of the daemon, must not coast.
             return DriveAction.DISABLE if self._at_rest(now) else DriveAction.QUICK_STOP
         return DriveAction.RUN
 
@@ -685,5 +685,5 @@ class Gate:
 
 
 def _order_cause(reason: Reason, text: str, request: ControlRequest, now: int) -> Cause:
-    """The cause of a stop by an order."""
+    """Cause of a stop by an order."""
     return Cause(reason=reason, source=request.source, since=now, text=text)

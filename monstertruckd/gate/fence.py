@@ -1,4 +1,4 @@
-"""Fence: the outline of the robot must stay inside a polygon of the map."""
+"""Fence check: keeps the outline of the robot inside a polygon of the map."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -24,11 +24,11 @@ from monstertruckd.gate.obstacles import OUTLINE, at_poses
 
 
 class FenceCheck(Check):
-    """Stops the robot before more of its outline leaves the fence; one that is outside may come back.
+    """Stops the robot before more of its outline leaves the fence; a robot outside may come back.
 
     Args:
         config: the fence.
-        view: what it may look at.
+        view: read access to the gate's state.
     """
 
     reasons = (Reason.OWN_CHECK,)
@@ -42,16 +42,16 @@ class FenceCheck(Check):
         self._free: float | None = None
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take the newest pose in map."""
+        """Take the latest pose in map."""
         if isinstance(seen, Odometry) and topic is POSE:
             self._pose = seen
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Slow down towards the fence; without a fresh pose the robot stands."""
+        """Slow down towards the fence; stand without a fresh pose."""
         if not courses:
             return
         age = math.inf if self._pose is None else (now - self._pose.stamp) / SECOND
-        if age > 0.5:  # age up to which a pose counts, s
+        if age > 0.5:  # maximum age of a pose, s
             self._free = None
             yield PaceLimit(Reason.OWN_CHECK, 0.0)
             return
@@ -64,7 +64,7 @@ class FenceCheck(Check):
             yield PaceLimit(Reason.OWN_CHECK, allowed if allowed >= config.obstacle.crawl else 0.0)
 
     def _distance(self, twist: UnitTwist, far: float) -> float:
-        """Distance along a motion up to where more of the outline is outside than now, m; +inf beyond ``far``."""
+        """Distance along a motion before more of the outline is outside than now, m; +inf beyond ``far``."""
         assert self._pose is not None
         pose = self._pose.pose
         step = 0.02  # distance between the poses of a sweep, m
@@ -75,7 +75,7 @@ class FenceCheck(Check):
         return float(distances[further[0] - 1]) if len(further) else math.inf
 
     def text(self, reason: Reason) -> str:
-        """Names the fence."""
+        """Fence ahead, or lack of a fresh pose."""
         return "the fence is ahead" if self._free is not None else "no fresh pose to keep inside the fence"
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
@@ -86,11 +86,11 @@ class FenceCheck(Check):
 
 
 def inside(points: Array, corners: Array) -> NDArray[np.bool_]:
-    """Which points lie inside a polygon, by the crossings of a ray (even-odd rule).
+    """Return which points lie inside a polygon, by the even-odd rule.
 
     Args:
-        points: shape (..., 2), m.
-        corners: shape (n, 2), m.
+        points: points, shape (..., 2), m.
+        corners: corners of the polygon, shape (n, 2), m.
 
     Returns:
         Shape (...,).

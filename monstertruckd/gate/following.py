@@ -1,8 +1,8 @@
-"""Checks that the body does what is commanded: steering by the compass, driven shafts by their feedback.
+"""Checks that the body follows its commands: steering by the compass, driven shafts by their feedback.
 
 ``SteeringCheck`` finds servos without supply. Hobby servos report nothing, and a servo controller on USB power keeps
-answering when the servos' own supply is lost; but then the compass heading departs from the one that follows from
-speed and commanded axle angles. ``ShaftCheck`` finds a shaft that is blocked.
+answering when the servos lose their separate supply. But then the compass heading departs from the heading computed
+from speed and commanded axle angles. ``ShaftCheck`` finds a blocked shaft.
 """
 
 import math
@@ -35,11 +35,11 @@ C = TypeVar("C", bound=Comparison)
 
 
 class FollowingCheck(Check, Generic[C]):
-    """One reason as long as a comparison contradicts.
+    """Gives one reason while a comparison contradicts.
 
     Args:
-        view: what it may look at.
-        comparison: of commands and measurements.
+        view: read access to the gate's state.
+        comparison: comparison of commands and measurements.
     """
 
     def __init__(self, view: GateView, comparison: C) -> None:
@@ -47,20 +47,20 @@ class FollowingCheck(Check, Generic[C]):
         self._comparison = comparison
 
     def reason(self, now: int) -> Iterator[Reason]:
-        """A contradiction since the robot was armed."""
+        """Report a contradiction found since the robot was armed."""
         if self._comparison.contradicts:
             yield from self.reasons
 
     def reset(self) -> None:
-        """Only driving can show whether it works again."""
+        """Clear the contradiction: only driving can show whether the hardware works again."""
         self._comparison.reset()
 
 
 class SteeringCheck(FollowingCheck["TurnComparison"]):
-    """The compass contradicts wheels and steering: the servos do not follow their commands.
+    """Detects servos that do not follow their commands: the compass contradicts wheels and steering.
 
     Args:
-        view: what it may look at.
+        view: read access to the gate's state.
         config: window and tolerance.
     """
 
@@ -70,7 +70,7 @@ class SteeringCheck(FollowingCheck["TurnComparison"]):
         super().__init__(view, TurnComparison(config))
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Compare a heading with what wheels and steering say at that time."""
+        """Compare a heading with wheels and steering at the same time."""
         if not isinstance(seen, Attitude):
             return
         now, samples = seen.received, self.view.samples
@@ -79,16 +79,16 @@ class SteeringCheck(FollowingCheck["TurnComparison"]):
         self._comparison.observe(seen.stamp, heading, samples.speed(now), samples.turn_rate(now))
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """Difference of the turns."""
+        """Difference between the turns."""
         turns = self._comparison
         yield Measurement(name="yaw difference", value=turns.difference, unit="rad", limit=turns.config.tolerance)
 
 
 class ShaftCheck(FollowingCheck["ShaftComparison"]):
-    """A driven shaft does not turn although it is commanded to.
+    """Detects a driven shaft that does not turn although commanded.
 
     Args:
-        view: what it may look at.
+        view: read access to the gate's state.
         config: time and tolerance.
     """
 
@@ -105,12 +105,12 @@ class ShaftCheck(FollowingCheck["ShaftComparison"]):
             self._comparison.observe(seen, shaft, self.view.motion.shaft_speeds[shaft], measured)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """Current of its motor."""
+        """Motor current of the blocked shaft."""
         yield Measurement(name="motor current", value=self._comparison.current, unit="A")
 
 
 class TurnComparison:
-    """Compares the turn commanded with the turn measured over a sliding window; ``contradicts`` stays until ``reset``.
+    """Compares commanded and measured turn over a sliding window; ``contradicts`` stays until ``reset``.
 
     Args:
         config: window and tolerance.
@@ -119,12 +119,12 @@ class TurnComparison:
     def __init__(self, config: SteeringCheckConfig) -> None:
         self.config = config
         self._window: deque[tuple[int, float, float]] = deque()
-        """(ns, turn by the commands, turn by the compass) since a common origin, rad, left positive."""
+        """Samples (stamp in ns, commanded turn, measured turn) since a common origin, rad, left positive."""
         self._heading = 0.0
         self.contradicts = False
-        """The steering does not follow its commands."""
+        """Whether the steering does not follow its commands."""
         self.difference = 0.0
-        """Turn measured less turn commanded over the window, rad."""
+        """Measured minus commanded turn over the window, rad."""
 
     def reset(self) -> None:
         """Start over."""
@@ -133,25 +133,25 @@ class TurnComparison:
         self.difference = 0.0
 
     def observe(self, stamp: int, heading: float | None, speed: float | None, rate: float) -> None:
-        """Take a heading, and what wheels and steering say at that time.
+        """Take a heading, with the state of wheels and steering at the same time.
 
         Args:
-            stamp: of the measurement, ns.
-            heading: clockwise, rad; None = the compass is disturbed.
-            speed: of the wheels over ground, m/s; None = not known.
-            rate: yaw rate that follows from the wheels' speeds and the commanded steering angles, rad/s, left positive.
+            stamp: stamp of the measurement, ns.
+            heading: compass heading, clockwise, rad; None if the compass is disturbed.
+            speed: wheel speed over ground, m/s; None if unknown.
+            rate: yaw rate computed from wheel speeds and commanded steering angles, rad/s, left positive.
         """
         if heading is None or speed is None or abs(speed) < self.config.speed:
             self._window.clear()
             return
-        gap = SECOND // 2  # headings further apart than this are not compared, ns
+        gap = SECOND // 2  # maximum time between compared headings, ns
         if not self._window or stamp - self._window[-1][0] > gap:
             self._begin(stamp, heading)
             return
         before, commanded, measured = self._window[-1]
         dt = (stamp - before) / SECOND
         turned = -math.remainder(heading - self._heading, 2 * math.pi)
-        jump = 1.5  # a heading that changes faster than this, rad/s, is a disturbed compass, not a turn
+        jump = 1.5  # a heading that changes faster than this is a compass disturbance, rad/s
         if abs(turned) > jump * dt:
             self._begin(stamp, heading)
             return
@@ -179,8 +179,8 @@ class TurnComparison:
 class ShaftComparison:
     """Compares each driven shaft's speed with its command; ``blocked`` stays until ``reset``.
 
-    A blocked shaft draws current up to the controller's limit and heats motor and clutch, and the controller reports
-    no fault.
+    A blocked shaft draws current up to the controller's limit and heats motor and clutch; the controller reports no
+    fault.
 
     Args:
         config: time and tolerance.
@@ -189,11 +189,11 @@ class ShaftComparison:
     def __init__(self, config: ShaftCheckConfig) -> None:
         self._config = config
         self._since: dict[tuple[int, bool], int] = {}
-        """Since when each shaft has not turned, and its controller been enabled or not, ns."""
+        """Time since when each shaft has not turned, by shaft and whether its controller is enabled, ns."""
         self._current: dict[int, float] = {}
-        """Newest measured current of each, A."""
+        """Latest measured current of each shaft, A."""
         self.blocked: int | None = None
-        """The shaft that does not turn."""
+        """Index of the shaft that does not turn; None if all turn."""
 
     @property
     def contradicts(self) -> bool:
@@ -209,10 +209,10 @@ class ShaftComparison:
         """Take feedback of a shaft.
 
         Args:
-            feedback: the message.
-            shaft: which.
-            commanded: wheel speed over ground, m/s.
-            measured: same.
+            feedback: feedback message.
+            shaft: index of the shaft.
+            commanded: commanded wheel speed over ground, m/s.
+            measured: measured wheel speed over ground, m/s.
         """
         if feedback.current is not None:
             self._current[shaft] = feedback.current
@@ -224,7 +224,7 @@ class ShaftComparison:
             self._since.pop((shaft, enabled), None)
             return
         since = self._since.setdefault((shaft, enabled), feedback.received)
-        # Seconds in which a drive controller that is commanded to turn its shaft is enabled: it takes 0.6.
+        # Maximum time for a drive controller to become enabled after a command to turn, s: it takes 0.6 s.
         enabled_within = 1.5
         within = limits.within if enabled else enabled_within
         if self.blocked is None and feedback.received - since >= within * SECOND:
@@ -232,5 +232,5 @@ class ShaftComparison:
 
     @property
     def current(self) -> float | None:
-        """Newest measured current of the blocked shaft, A."""
+        """Latest measured current of the blocked shaft, A."""
         return None if self.blocked is None else self._current.get(self.blocked)

@@ -1,4 +1,4 @@
-"""Freshness: the robot moves only while a topic that the configuration names is heard."""
+"""Freshness check: allows motion only while a configured topic is fresh."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,11 +13,11 @@ from monstertruckd.gate.checks import Check, GateView, Tick
 
 
 class FreshCheck(Check):
-    """Keeps the robot at rest while the newest message of a topic is too old, or there is none.
+    """Keeps the robot at rest while the latest message of a topic is too old or missing.
 
     Args:
-        config: which topic, and how old it may become.
-        view: what it may look at.
+        config: topic and maximum age.
+        view: read access to the gate's state.
     """
 
     reasons = (Reason.OWN_CHECK,)
@@ -29,20 +29,20 @@ class FreshCheck(Check):
         self._received: int | None = None
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Note when the topic was heard."""
+        """Note the arrival time of a message of the topic."""
         if isinstance(seen, Message) and topic is self._topic:
             self._received = seen.received
 
     def reason(self, now: int) -> Iterator[Reason]:
-        """The topic is stale."""
+        """Report a stale topic."""
         if self._received is None or now - self._received > self._limit * SECOND:
             yield Reason.OWN_CHECK
 
     def text(self, reason: Reason) -> str:
-        """Names the topic."""
+        """Reason with the name of the topic."""
         return f"{self._topic.name} is silent"
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """Age of its newest message."""
+        """Age of the latest message."""
         if self._received is not None:
             yield Measurement(name="age", value=(now - self._received) / SECOND, unit="s", limit=self._limit)

@@ -1,10 +1,10 @@
-"""The operator beside the robot, with a radio control: the highest role that drives.
+"""Radio control of the operator beside the robot: the driving role with the highest priority.
 
-- The arm switch of the transmitter is a key: while it is off nothing drives, whoever has armed the robot, and going
-  from off to on is the order to arm.
-- While it is on and the drive switch (where there is one) is on, the sticks drive.
-- Losing the transmitter stops and disarms the robot, whoever drives. Once it is back, the arm switch must be seen off
-  before it arms.
+- The arm switch of the transmitter is a key: while it is off, the robot does not drive, even if another operator has
+  armed it. Switching it from off to on is the order to arm.
+- While the arm switch and the drive switch (if fitted) are on, the sticks drive.
+- Loss of the transmitter stops and disarms the robot, whichever source drives. After its return the arm switch must be
+  seen off before it can arm the robot.
 """
 
 import secrets
@@ -25,36 +25,36 @@ from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import Topic
 
 MOBILE: Final = frozenset({GateMode.ARMED, GateMode.DRIVING})
-"""Modes in which the robot moves, or may begin to."""
+"""Modes that allow motion."""
 
 
 class HandConfig(Schema):
-    """What the radio control of the operator beside the robot (`devices.hand`) does."""
+    """Radio control of the operator beside the robot (`devices.hand`)."""
 
     speed: Annotated[float, Field(gt=0, le=10)] = 0.2
-    """Speed with the stick at its end, m/s"""
+    """Speed at full stick deflection, m/s"""
     angle: Annotated[float, Field(gt=0, le=0.8)] = 0.35
-    """Angle of the front axle with the stick at its end, rad"""
+    """Front axle angle at full stick deflection, rad"""
     turn: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """Yaw rate with the stick at its end, rad/s, of a body without steered axles"""
+    """Yaw rate at full stick deflection for a body without steered axles, rad/s"""
     lost_after: Annotated[float, Field(gt=0, le=1)] = 0.25
-    """Age of the newest message of the receiver at which the radio control counts as lost, s"""
+    """Age of the latest receiver message above which the radio control is lost, s"""
     quality: Annotated[float, Field(ge=0, le=1)] = 0.3
-    """Share of the radio's packets below which the radio control counts as lost"""
+    """Fraction of received radio packets below which the radio control is lost"""
 
 
 class HandActions(NamedTuple):
-    """What the hand wants at one moment."""
+    """Actions derived from the radio control at one moment."""
 
     orders: tuple[Order, ...] = ()
     drives: bool = False
-    """The sticks ask for a motion, or for standstill."""
+    """Whether the sticks request a motion or standstill."""
     lost: str | None = None
-    """Why the radio control counts as lost; None if it does not."""
+    """Why the radio control is lost; None if it is not."""
 
 
 class HandPolicy:
-    """From what the receiver says to orders. Pure.
+    """Converts receiver messages to orders; pure, without input or output.
 
     Args:
         config: limits.
@@ -63,16 +63,16 @@ class HandPolicy:
     def __init__(self, config: HandConfig) -> None:
         self._config = config
         self._seen_off = False
-        """The arm switch was off since the transmitter was lost, or since the last order to arm."""
+        """Whether the arm switch has been off since the loss of the transmitter, or since the last order to arm."""
         self._estop = False
         self._stopped_at: int | None = None
 
     def step(self, controls: HandControls | None, mode: GateMode | None, now: int) -> HandActions:
-        """Return what the hand wants.
+        """Return the actions for the latest receiver message.
 
         Args:
-            controls: newest message of the receiver, if any.
-            mode: of the gate, if it is known.
+            controls: latest message of the receiver, if any.
+            mode: mode of the gate, if known.
             now: time, ns.
         """
         lost = self._lost(controls, now)
@@ -105,8 +105,8 @@ class HandPolicy:
         return None
 
     def _stop(self, mode: GateMode | None, now: int) -> tuple[Order, ...]:
-        """Orders that bring a mobile robot to rest; repeated until it is."""
-        repeat = SECOND // 5  # between two orders to stop a robot that has not stopped yet, ns
+        """Orders that bring a mobile robot to rest, repeated until it is at rest."""
+        repeat = SECOND // 5  # time between two orders to stop a robot that still moves, ns
         if mode not in MOBILE or (self._stopped_at is not None and now - self._stopped_at < repeat):
             return ()
         self._stopped_at = now
@@ -114,22 +114,22 @@ class HandPolicy:
 
 
 class Inject(Protocol):
-    """Takes in a request; ``Bus.inject``."""
+    """Injects a request; ``Bus.inject``."""
 
     def __call__(self, topic: Topic[Any], message: Any) -> object:
         """See ``Bus.inject``."""
 
 
 class HandService:
-    """Drives by the radio control, and stops the robot when it is lost.
+    """Drives the robot by radio control, and stops it when the radio control is lost.
 
     Args:
         config: limits.
         clock: time.
-        hand: newest message of the receiver.
-        gate: newest state of the gate.
-        inject: where the requests go.
-        events: loss and return of the radio control.
+        hand: latest message of the receiver.
+        gate: latest state of the gate.
+        inject: sink of the requests.
+        events: sink of events: loss and return of the radio control.
         steered: whether the body has steered axles; without them the steering stick turns the body.
     """
 
@@ -160,7 +160,7 @@ class HandService:
         """Why the radio control was lost, as reported; None if it was reported to be there."""
 
     async def run(self, ready: Ready) -> None:
-        """Ask for what the hand wants until cancelled."""
+        """Turn receiver messages into requests until cancelled."""
         schedule = Schedule(self._clock, 20.0)  # requests per second
         while True:
             await schedule.next()
@@ -173,7 +173,7 @@ class HandService:
 
     def _send(self, actions: HandActions, controls: HandControls | None, gate: GateState, now: int) -> None:
         if actions.drives and controls is not None:
-            # Before an order to arm, so that the gate knows whether the stick is at rest.
+            # Send before an order to arm, so that the gate knows whether the stick is at rest.
             self._inject(topics.REQ_DRIVE, DriveRequest(**self._header(gate, now), **self._motion(controls)))
         for order in actions.orders:
             self._inject(topics.REQ_CONTROL, ControlRequest(**self._header(gate, now), order=order))
@@ -194,14 +194,14 @@ class HandService:
             "seq": self._seq,
             "source": DeviceRole.HAND.value,
             "role": Role.HAND,
-            "lease": 0.25,  # seconds a request stands
+            "lease": 0.25,  # validity of a request, s
             "nonce": gate.nonce,
             "gate_stamp": gate.stamp,
             "instance": self._instance,
         }
 
     def _report(self, lost: str | None) -> None:
-        """Report loss and return, once each."""
+        """Report each loss and each return once."""
         if (lost is None) is (self._lost is None):
             return
         self._lost = lost

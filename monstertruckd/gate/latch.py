@@ -1,7 +1,7 @@
-"""Persistent latch of the emergency stop: a file that exists while the stop is latched, and a mark in memory before it.
+"""Persistent latch of the emergency stop: a file that exists while the stop is latched, preceded by a mark in memory.
 
-Storing a file so that it outlasts a loss of power takes the disk's time. Meanwhile the mark holds the stop: one byte of
-a file on a tmpfs, which outlasts the process but not the computer.
+Writing a file so that it survives a loss of power takes time. Meanwhile the mark holds the stop: one byte of a file on
+a tmpfs, which survives the process but not a restart of the computer.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ class Latch(Protocol):
         """Whether the emergency stop is latched, by the file or by the mark."""
 
     def stored(self) -> bool | None:
-        """Whether the file says so, which outlasts a loss of power; None = it cannot be read."""
+        """Whether the file, which survives a loss of power, exists; None if that cannot be read."""
 
     def mark(self, engaged: bool) -> None:
         """Set or clear the mark; never blocks.
@@ -42,7 +42,7 @@ class Latch(Protocol):
         """
 
     def close(self) -> None:
-        """Remove the mark: the disk agrees, and nothing changes any more."""
+        """Remove the mark: the disk holds the final state."""
 
 
 class MemoryLatch:
@@ -56,28 +56,28 @@ class MemoryLatch:
         return self._engaged
 
     def stored(self) -> bool:
-        """The same: there is no disk."""
+        """Whether the emergency stop is latched; equal to ``engaged``, because there is no disk."""
         return self._engaged
 
     def mark(self, engaged: bool) -> None:
-        """Nothing: memory needs no mark."""
+        """Do nothing: memory needs no mark."""
 
     def store(self, engaged: bool) -> None:
         """Set the flag."""
         self._engaged = engaged
 
     def close(self) -> None:
-        """Nothing to remove."""
+        """Do nothing: there is no mark to remove."""
 
 
 class Mark:
-    """One byte of a file that is kept open: writing it needs neither a name, nor space, nor the disk.
+    """One byte of an open file: writing it needs no file name, no free space and no disk.
 
     Args:
-        path: the file, on a tmpfs. Damaged contents count as marked.
+        path: the file, on a tmpfs; damaged contents mean marked.
 
     Raises:
-        OSError: it cannot be opened, or is not a file of this user alone.
+        OSError: the file cannot be opened, or is not a regular file of this user alone.
     """
 
     def __init__(self, path: Path) -> None:
@@ -88,7 +88,7 @@ class Mark:
             os.close(self._file)
             raise PermissionError(f"{path} is not a file of this user alone")
         if status.st_size == 0:
-            self.set(marked=False)  # from here on there is space for the byte
+            self.set(marked=False)  # reserves space for the byte
 
     def engaged(self) -> bool:
         """Whether the mark is set."""
@@ -109,11 +109,11 @@ class Mark:
 
 
 class EstopLatch:
-    """Latch in a file. An existing file means latched, so a damaged or empty one counts as latched.
+    """Latch in a file; an existing file means latched, even if damaged or empty.
 
     Args:
         path: the file.
-        marks: folder of the mark, on a tmpfs; the mark's name follows from ``path``.
+        marks: folder of the mark, on a tmpfs; the name of the mark is derived from ``path``.
     """
 
     def __init__(self, path: Path, marks: Path) -> None:
@@ -127,7 +127,7 @@ class EstopLatch:
         """Check that the latch can be stored later, and open the mark.
 
         Raises:
-            OSError: the file could not be created, or the mark not be opened.
+            OSError: the file cannot be created, or the mark cannot be opened.
         """
         make_folder(self._path.parent)
         require_place(self._path)
@@ -148,7 +148,7 @@ class EstopLatch:
         return True
 
     def mark(self, engaged: bool) -> None:
-        """Set or clear the mark, once it is open.
+        """Set or clear the mark if it is open.
 
         Raises:
             OSError: it could not be written.
@@ -160,7 +160,7 @@ class EstopLatch:
         """Create or remove the file, atomically and synced to the disk.
 
         Raises:
-            OSError: it could not be stored. The file may have changed all the same: ``stored`` says so.
+            OSError: it could not be stored. The file may still have changed: check ``stored``.
         """
         with self._storing:
             if engaged:
@@ -177,12 +177,12 @@ class EstopLatch:
 
 
 def marks_folder(configured: Path | None, environment: Mapping[str, str], system: Path = Path("/")) -> Path:
-    """Folder for marks: the configured one, or the first usable one of systemd's, the user's and the computer's.
+    """Folder for marks: configured folder, or the first usable runtime folder of systemd, the user and the computer.
 
     Args:
         configured: ``runtime_directory`` of the configuration.
-        environment: ``RUNTIME_DIRECTORY`` of a service of systemd.
-        system: root of the computer's files.
+        environment: variables, with ``RUNTIME_DIRECTORY`` in a systemd service.
+        system: root of the file system.
     """
     if configured is not None:
         return configured

@@ -1,4 +1,4 @@
-"""Moves the commanded motion towards the request of each tick, within the least of all limits."""
+"""Moves the commanded motion towards the request at each tick, within the minimum of all limits."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -13,23 +13,23 @@ from monstertruckd.gate.motion import ROUNDING, Course, Target, scaled
 
 
 class Aim(NamedTuple):
-    """The motion that is asked for at a tick, as far as the steering allows it by now."""
+    """Motion requested at a tick, as far as the steering allows it so far."""
 
     target: Target
     wanted: Twist2
-    """Of the base."""
+    """Twist of the base."""
     shafts: Speeds | None
-    """Open loop: the speeds of the driven shafts, m/s."""
+    """Open-loop speeds of the driven shafts, m/s; None otherwise."""
     passing: bool
-    """A change of direction passes through standstill first."""
+    """Whether a change of direction must first pass through standstill."""
     pace: float
-    """Of ``wanted``, m/s."""
+    """Pace of ``wanted``, m/s."""
     max_pace: float
-    """Greatest pace allowed in its direction, m/s."""
+    """Maximum pace allowed in the direction of ``wanted``, m/s."""
 
 
 class CommandLimiter(Check):
-    """Advances the commanded motion; as a check it gives the limits of body and configuration.
+    """Advances the commanded motion; as a check, gives the limits of body and configuration.
 
     Args:
         view: limits, samples and commanded motion, which it changes.
@@ -42,9 +42,9 @@ class CommandLimiter(Check):
         self._aim: Aim | None = None
 
     def aim(self, now: int, dt: float, request: DriveRequest | None) -> tuple[Course, ...] | None:
-        """Turn the wheels for ``dt`` s towards what ``request`` needs; returns the motions to be checked.
+        """Steer for ``dt`` s towards the angles of ``request``; return the motions to be checked.
 
-        They are the one asked for and the commanded one, without those that stand still; None without a request.
+        These are the requested and the commanded motion, unless they are at standstill; None without a request.
         """
         motion = self.view.motion
         if request is None:
@@ -66,11 +66,11 @@ class CommandLimiter(Check):
         if pace == 0 and motion.standing:
             return ()
         courses = ((wanted, pace), (motion.twist, motion.present_pace))
-        least = 1e-6  # a smaller pace counts as standstill, m/s: the direction of such a twist is rounding error
+        least = 1e-6  # pace below which a motion is standstill, m/s: the direction of such a twist is rounding error
         return tuple((scaled(twist, 1.0 / pace), pace) for twist, pace in courses if twist != STILL and pace >= least)
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Servos that do not reach as far, and requests beyond the configured limits."""
+        """Limits for requests beyond the range of the servos or the configured limits."""
         if (aim := self._aim) is None:
             return
         if aim.target.saturated:
@@ -79,7 +79,7 @@ class CommandLimiter(Check):
             yield PaceLimit(Reason.CLIPPED, aim.max_pace)
 
     def advance(self, dt: float, limits: dict[Reason, float]) -> None:
-        """Change the commanded motion for ``dt`` s towards the aim, within ``limits``, m/s."""
+        """Change the commanded motion towards the aim for ``dt`` s, within ``limits`` (m/s)."""
         if (aim := self._aim) is None:
             return
         motion = self.view.motion
@@ -95,8 +95,8 @@ class CommandLimiter(Check):
             motion.accelerate(scaled(aim.wanted, factor), dt)
 
     def stopping_distance(self, now: int) -> float:
-        """Distance travelled if stopped now, m, by the greater of measured and commanded speed."""
+        """Distance travelled if stopped now, m, from the greater of measured and commanded speed."""
         config = self.view.config
         speed = max(abs(self.view.samples.speed(now) or 0.0), *map(abs, self.view.motion.shaft_speeds))
-        fastest = 1e6  # measured speeds are clamped to this, m/s, so that their squares stay finite
+        fastest = 1e6  # limit of measured speeds, m/s, so that their squares stay finite
         return stopping(min(speed, fastest), config.reaction, config.deceleration)

@@ -1,9 +1,9 @@
-"""Commanded motion: what a request of any form means for the body, and the ramps towards it.
+"""Commanded motion: converts requests of any form to a motion of the body, and ramps towards it.
 
-Every form of request becomes a twist of the base and the steering angles it needs (``Motion.target``); from there on
-limits, ramps and the sweep know nothing of forms. The size of a twist is its **pace**: the greatest speed of the base
-and of the driven wheels, m/s. It is the speed of the base for a truck that drives straight on, and that of the wheels
-for a body that turns on the spot.
+``Motion.target`` converts every form of request to a twist of the base and the steering angles it needs; limits, ramps
+and the sweep are independent of the form. The size of a twist is its **pace**: the maximum speed of the base and of the
+driven wheels, m/s. For a truck that drives straight the pace is the speed of the base; for a body that turns on the
+spot it is the speed of the wheels.
 """
 
 import math
@@ -18,36 +18,38 @@ from monstertruck_schemas.req import DriveRequest, RequestedTwist
 from monstertruckd.gate.config import InForce
 
 AHEAD: Final = 0.5
-"""A motion whose forward speed is a smaller share of its pace has the speed limit of reverse: part of the footprint
-moves to where the lidar does not look. One whose base is slower than that share turns on the spot."""
+"""Minimum forward speed of a motion ahead, as a fraction of its pace. Other motions have the speed limit of reverse:
+part of the footprint moves out of the lidar's field of view. A motion whose base is slower than this fraction is a turn
+on the spot."""
 
 MAX_SPEED: Final = 1e3
-"""Requests are scaled down to this in every component before anything else, m/s and rad/s: sums of them stay finite."""
+"""Maximum of every component of a request, m/s and rad/s: larger requests are first scaled down so that sums stay
+finite."""
 
 ROUNDING: Final = 1e-6
-"""Relative difference up to which two motions are the same."""
+"""Maximum relative difference of two equal motions."""
 
 
 class Target(NamedTuple):
-    """The motion that a request means for this body."""
+    """Motion of this body for a request."""
 
     twist: Twist2
-    """Of the base."""
+    """Twist of the base."""
     angles: Angles
-    """Steering angles it needs."""
+    """Steering angles needed for the twist, rad."""
     clipped: bool
-    """It differs from the request: the nearest motion that the body can do."""
+    """Whether the motion differs from the request: it is the nearest motion that the body can perform."""
     saturated: bool
-    """It differs because of the servos' range."""
+    """Whether the motion differs because of the servos' range."""
     shafts: Speeds | None = None
-    """Open loop: the shaft speeds themselves, of which the twist is only the prediction, m/s."""
+    """Open-loop shaft speeds, m/s; the twist is only predicted from them."""
 
 
 class Motion:
-    """Commanded motion: the twist of the base and the steering angles, rad.
+    """Commanded motion: twist of the base and steering angles (rad).
 
     Args:
-        limits: in force.
+        limits: limits in force.
         chassis: kinematics of the body.
     """
 
@@ -57,7 +59,7 @@ class Motion:
         self.twist: Twist2 = STILL
         self.angles: Angles = chassis.straight
         self._open: Speeds | None = None
-        """Shaft speeds that are commanded open loop, m/s; None = they follow from the twist."""
+        """Shaft speeds commanded open loop, m/s; None if they follow from the twist."""
         self._servos = self.angles, chassis.servos(*self.angles)
         self._shafts = (STILL, self.angles), chassis.shafts_along(STILL, *self.angles)
 
@@ -68,14 +70,14 @@ class Motion:
 
     @property
     def servos(self) -> Angles:
-        """Servo angles that give the steering angles, rad."""
+        """Servo angles for the steering angles, rad."""
         if self._servos[0] != self.angles:
             self._servos = self.angles, self._chassis.servos(*self.angles)
         return self._servos[1]
 
     @property
     def axle_angles(self) -> tuple[float, float]:
-        """Axle angles of the bicycle that moves alike, rad; 0 where none does."""
+        """Axle angles of the bicycle with the same motion, rad; 0 if there is none."""
         return self._chassis.axle_angles(self.twist, self.angles)
 
     @property
@@ -94,10 +96,10 @@ class Motion:
         return self._shafts[1]
 
     def target(self, request: DriveRequest) -> Target:
-        """What a request means for this body, within the limit of the axle angles.
+        """Convert a request to a motion of this body, within the limit of the axle angles.
 
         Raises:
-            KinematicsError: the body cannot move like that; the reason is named.
+            KinematicsError: the body cannot perform the motion; the message is the reason.
         """
         if request.shafts is not None:
             return self._target_of_shafts(request.shafts)
@@ -127,29 +129,29 @@ class Motion:
         return Target(twist, angles, clipped or saturated or not _same(twist, asked), saturated)
 
     def _target_of_shafts(self, rates: Sequence[float]) -> Target:
-        """The steering stays as it is."""
+        """Convert wheel rates to open-loop shaft speeds; the steering angles do not change."""
         radius = self._chassis.drivetrain.wheel_radius
         speeds = [min(max(rate, -MAX_SPEED), MAX_SPEED) * radius for rate in rates]
         shafts = tuple(speed * min(MAX_SPEED / max(*map(abs, speeds), MAX_SPEED), 1.0) for speed in speeds)
         return Target(self._chassis.predicted(shafts, *self.angles), self.angles, False, False, shafts)
 
     def _reached(self, angles: Angles) -> tuple[Angles, bool]:
-        """Steering angles that the servos reach, and whether these are others."""
+        """Steering angles within reach of the servos, and whether they differ from ``angles``."""
         reached = self._chassis.reached(angles)
-        # Difference between wanted and reachable steering angle from which on the gate reports it, rad.
+        # Minimum reported difference between requested and reachable steering angle, rad.
         saturated = 1e-4
         return reached, max(abs(asked - got) for asked, got in zip(angles, reached, strict=True)) > saturated
 
     def along(self, twist: Twist2, angles: Angles | None = None) -> Twist2:
-        """The part of a twist that the body can do at steering angles, by default the commanded ones."""
+        """Part of a twist that the body can perform at the given steering angles, by default the commanded angles."""
         return self._chassis.along(twist, *(self.angles if angles is None else angles))
 
     def pace(self, twist: Twist2, shafts: Speeds | None = None) -> float:
-        """Greatest speed of the base and of the driven wheels for a twist at the commanded steering angles, m/s.
+        """Maximum speed of the base and of the driven wheels for a twist at the commanded steering angles, m/s.
 
         Args:
-            twist: of the base.
-            shafts: speeds of the wheels that are driven open loop; None = they follow from the twist.
+            twist: twist of the base.
+            shafts: open-loop wheel speeds, m/s; None if they follow from the twist.
         """
         rolling = self._chassis.shafts_along(twist, *self.angles) if shafts is None else shafts
         return max(math.hypot(twist[0], twist[1]), *map(abs, rolling))
@@ -160,7 +162,7 @@ class Motion:
         return self.pace(self.twist, self._open)
 
     def max_pace(self, twist: Twist2, shafts: Speeds | None = None) -> float:
-        """Greatest pace allowed in the direction of ``twist``, m/s; arguments as of ``pace``."""
+        """Maximum pace allowed in the direction of ``twist``, m/s; arguments as for ``pace``."""
         ahead = twist[0] >= AHEAD * self.pace(twist, shafts)
         return self._limits.config.speed if ahead else self._limits.config.reverse_speed
 
@@ -170,7 +172,7 @@ class Motion:
         return _dot(measured, shafts) / (_dot(shafts, shafts) or 1.0)
 
     def steer(self, target: Angles, dt: float) -> None:
-        """Turn all steered wheels towards ``target``, rad, within the steering rate, all by the same share."""
+        """Turn all steered wheels towards ``target`` (rad) by the same fraction, within the steering rate."""
         step = max(abs(to - at) for at, to in zip(self.angles, target, strict=True))
         if step > 0:
             share = min(self._limits.config.steering_rate * dt / step, 1.0)
@@ -182,9 +184,9 @@ class Motion:
         return self._chassis.aligned(self.angles, target)
 
     def reverses(self, target: Twist2, shafts: Speeds | None = None) -> bool:
-        """Whether wheels that turn for the present motion turn the other way for ``target``, on the whole.
+        """Whether ``target`` reverses the wheels of the commanded motion on the whole.
 
-        A motion from open loop to the other forms, or back, counts as one: it passes through standstill.
+        A change between open loop and the other forms is treated as a reversal: it passes through standstill.
         """
         if (shafts is None) is not (self._open is None) and not self.standing:
             return True
@@ -192,7 +194,7 @@ class Motion:
         return _dot(self.shaft_speeds, rolling) < 0
 
     def turn_shafts(self, target: Speeds, dt: float) -> None:
-        """Change the shaft speeds, open loop, towards ``target``, m/s, as ``accelerate`` does the twist."""
+        """Change the open-loop shaft speeds towards ``target`` (m/s), as ``accelerate`` changes the twist."""
         now = self.shaft_speeds
         change = tuple(to - at for to, at in zip(target, now, strict=True))
         step = self.pace(self._forecast(change), change)
@@ -213,14 +215,14 @@ class Motion:
             self.turn_shafts((0.0,) * len(self._open), dt)
 
     def _forecast(self, shafts: Speeds) -> Twist2:
-        """Twist of the base at shaft speeds, even if they contradict each other while they change."""
+        """Predict the twist of the base at shaft speeds, even if they are inconsistent while they change."""
         return self._chassis.twist(self._chassis.input_speeds(shafts, *self.angles), *self.angles)
 
     def accelerate(self, target: Twist2, dt: float) -> None:
-        """Change the twist towards ``target``: no wheel, nor the base, changes its speed faster than allowed."""
+        """Change the twist towards ``target``; neither the wheels nor the base exceed the allowed acceleration."""
         self._open = None
         change = (target[0] - self.twist[0], target[1] - self.twist[1], target[2] - self.twist[2])
-        # A difference of two motions need not be one that the body can do.
+        # The body may be unable to perform the difference of two motions.
         rolling = zip(self._chassis.shafts_along(target, *self.angles), self.shaft_speeds, strict=True)
         step = max(math.hypot(change[0], change[1]), *(abs(to - at) for to, at in rolling))
         if step == 0:
@@ -241,7 +243,7 @@ class Motion:
 
 
 def scaled(twist: Twist2, factor: float) -> Twist2:
-    """A twist times a factor."""
+    """Multiply a twist by a factor."""
     return twist[0] * factor, twist[1] * factor, twist[2] * factor
 
 
@@ -254,4 +256,4 @@ def _same(one: Twist2, other: Twist2) -> bool:
 
 
 Course = tuple[UnitTwist, float]
-"""A motion of the base: its twist per metre of pace, and its pace, m/s."""
+"""Motion of the base: twist per metre of pace, and pace (m/s)."""

@@ -1,4 +1,4 @@
-"""Obstacles by the lidar: the swept footprint against the newest scan, and elsewhere against what earlier scans saw."""
+"""Lidar obstacle check: the swept footprint against the latest scan and, outside its view, against earlier scans."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,71 +39,71 @@ _Steps = tuple[int, int, int]
 """A unit twist in steps of ``TWIST_STEP``."""
 
 POSES: Final = 20
-"""Poses checked along the swept path, at least: a corner that turns faster than the base travels has more of them."""
+"""Minimum number of poses along the swept path; more if a corner moves faster than the base."""
 
 TWIST_STEP: Final = 0.005
-"""Rounding of unit twists before the sweep, m/m and rad/m: most sweeps are cached, with an error of 2 mm at the end."""
+"""Rounding of unit twists before the sweep, m/m and rad/m: most sweeps are cached; the error at the end is 2 mm."""
 
 GROUND_STEP: Final = 2
-"""The ground is checked at every second pose."""
+"""Interval of ground checks along the swept path, in poses."""
 
 
 LEAVING: Final = 0.1
-"""A body nearer to an obstacle than the side clearance may only drive motions that take it this much further away per
-metre, m/m: a translation of 0.33 rad away from a wall does (0.34 m/m), a straight line along it does not."""
+"""Minimum gain in distance per metre for a body nearer to an obstacle than the side clearance, m/m: a translation at
+0.33 rad away from a wall (0.34 m/m) is allowed, a straight line along it is not."""
 
 
 OUTLINE: Final = 12
-"""Points on each edge of the footprint from which the directions of travel are found."""
+"""Number of points on each edge of the footprint, used to find the directions of travel."""
 
 
 def ground_ahead(body: Footprint, edges: Array, poses: Array) -> Array:
-    """Points of the ground that a motion covers and that its pose before did not cover.
+    """Ground points that a motion newly covers at each pose.
 
     Args:
         body: the footprint.
-        edges: points on its edges, shape (k, 2), m.
-        poses: of base at equal steps of one twist, the present one first, shape (m, 3), m, m, rad.
+        edges: points on the edges of the footprint, shape (k, 2), m.
+        poses: poses of base at equal steps of one twist, current pose first, shape (m, 3), m, m, rad.
 
     Returns:
         Shape (m - 1, n, 2), m: the same points of the outline at all poses after the first.
     """
     (step,) = at_poses(edges, poses[1:2])
-    touch = 1e-6  # a point that enters the footprint by less is on its edge, m
+    touch = 1e-6  # a point less deep than this inside the footprint is on its edge, m
     return at_poses(edges[~on_body(body, step, touch)], poses[1:])
 
 
 def at_poses(points: Array, poses: Array) -> Array:
-    """Points (n, 2) of a body at every pose (m, 3), shape (m, n, 2)."""
+    """Transform points (n, 2) of a body to every pose (m, 3); shape (m, n, 2)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x, y = points.T
     return np.stack((poses[:, :1] + c * x - s * y, poses[:, 1:2] + s * x + c * y), axis=2)
 
 
 class _Sweep(NamedTuple):
-    """The poses and the ground that a motion covers."""
+    """Poses and ground covered by a motion."""
 
     distances: Array
-    """Of its poses, shape (m,), m."""
+    """Distance of each pose along the motion, shape (m,), m."""
     poses: Array
-    """Of base, shape (m, 3)."""
+    """Poses of base, shape (m, 3), m, m, rad."""
     ground: Array
-    """Points that the body does not stand on, shape (n, 2), m."""
+    """Ground points reached by the motion, not under the body, shape (n, 2), m."""
     before: Array
-    """Distance of the pose before the one that reaches each of them, shape (n,), m."""
+    """Distance of the last pose before the body reaches each ground point, shape (n,), m."""
     sectors: Sectors
-    """Around the lidar."""
+    """Sectors around the lidar that contain the ground."""
 
 
 class ObstacleGuard:
-    """Swept footprint against the newest scan.
+    """Checks the swept footprint against the latest scan.
 
-    The truck may have moved since the scan was taken: its age becomes a part of the stopping distance.
+    The truck may have moved since the scan was taken, so the stopping distance includes travel during the scan's age.
 
     Args:
-        limits: in force.
+        limits: limits in force.
         footprint: the body's outline.
-        points: of scans, in base.
+        points: converts scans to points in base.
         sonars: pose (x, y, yaw) of every sonar that looks backwards in base by name, m, m, rad.
     """
 
@@ -120,12 +120,11 @@ class ObstacleGuard:
         self._points = np.empty((0, 2))
         self._stamp = 0
         self.unseen: float | None = 0.0
-        """Age of the oldest view of a sector of travel at the newest scan, s; None = one was never seen."""
+        """Age of the oldest view of a sector of travel at the latest scan, s; None if a sector was never seen."""
         self.known = math.inf
-        """Distance along the newest motions to ground that no scan has seen and that stops them, m; +inf = none within
-        reach."""
+        """Distance to unseen ground that stops the latest checked motions, m; +inf if none is within reach."""
         self.known_slowly = math.inf
-        """The same of ground that only slows them."""
+        """Distance to unseen ground that only slows these motions, m; +inf if none is within reach."""
         self._checked: frozenset[_Steps] | None = None
         self._free = math.inf
         self._outline = footprint.edge_points(OUTLINE, OUTLINE)
@@ -134,7 +133,7 @@ class ObstacleGuard:
         self._follow_limits()
 
     def _follow_limits(self) -> None:
-        """Take the limits in force; points beyond the range kept so far count as not seen."""
+        """Adopt the limits in force; if the range of kept points grows, forget the memory."""
         config = self._limits.config
         if config is self._adopted:
             return
@@ -151,15 +150,15 @@ class ObstacleGuard:
 
     @property
     def reach(self) -> float:
-        """Distance swept, m."""
+        """Length of the sweep, m."""
         return self._reach
 
     def looks_at(self, points: Array) -> NDArray[np.bool_]:
-        """Which of the points (n, 2) in base, m, lie in the lidar's field."""
+        """Whether each point (n, 2) in base (m) lies in the lidar's field of view."""
         return self._visibility.covers(points)
 
     def move(self, now: int, twist: Twist2 | None, dt: float) -> None:
-        """The body moved with ``twist`` for the ``dt`` s until ``now``, ns; None = it is not known how."""
+        """Move the body with ``twist`` for the ``dt`` s before ``now`` (ns); None if the motion is unknown."""
         self._follow_limits()
         if twist is None:
             self.memory.forget()
@@ -181,17 +180,17 @@ class ObstacleGuard:
         self._visibility.observe(scan, points)
         near = points[np.hypot(points[:, 0], points[:, 1]) < self._near]
         age = self._visibility.age(self._points, scan.stamp)
-        # What was seen in a sector stays while the sector is not seen, until that is too old.
+        # Points of a sector are kept while the sector is not seen, until they are too old.
         self._points = np.concatenate((near, self._points[(age > 0) & (age <= self._keep)]))
         self.memory.observe(scan, near)
-        self._stamp = min(scan.stamp, scan.received)  # a sensor's clock may run ahead; nothing arrives before it is
+        self._stamp = min(scan.stamp, scan.received)  # a sensor's clock may run ahead: at latest the arrival
         self._checked = None
 
     def free_distance(self, twists: tuple[UnitTwist, ...]) -> float:
-        """Distance the footprint can travel from where the scan was taken, m; +inf if no obstacle is within reach.
+        """Distance the footprint can travel from the pose of the scan, m; +inf if no obstacle is within reach.
 
         Args:
-            twists: the shortest distance of all of them counts.
+            twists: motions of the base; the shortest distance of all is returned.
         """
         self._follow_limits()
         rounded = frozenset((round(x / TWIST_STEP), round(y / TWIST_STEP), round(a / TWIST_STEP)) for x, y, a in twists)
@@ -204,13 +203,13 @@ class ObstacleGuard:
         return self._free
 
     def _update_unseen(self, twists: frozenset[_Steps]) -> None:
-        """Update ``unseen`` from the sectors of travel within the lidar's field."""
+        """Update ``unseen`` from the sectors of travel within the lidar's field of view."""
         seen = np.concatenate([self._visibility.last_seen(self._sweep(*twist).sectors) for twist in twists])
         oldest = int(seen.min(initial=self._stamp))
         self.unseen = (self._stamp - oldest) / SECOND if oldest > 0 else None
 
     def _swept(self, x: int, y: int, turn: int) -> _Sweep:
-        """Sweep of a twist in steps of ``TWIST_STEP``; between two poses corners move no further than the base."""
+        """Sweep a twist in steps of ``TWIST_STEP``; between two poses corners move no further than the base."""
         twist = (x * TWIST_STEP, y * TWIST_STEP, turn * TWIST_STEP)
         distances = np.linspace(0.0, self._reach, math.ceil(POSES * max(self._footprint.corner_speed(twist), 1.0)))
         poses = swept_poses(twist, distances)
@@ -225,7 +224,7 @@ class ObstacleGuard:
         leaving = LEAVING * sweep.distances
         contacts = [
             first_contact(self._footprint, sweep.poses, self._points, clearance, leaving),
-            # Without a clearance, as their places may be off by as much.
+            # Without clearance: their positions may be off by as much.
             first_contact(self._footprint, sweep.poses, remembered, -self._footprint.padding),
         ]
         if x < 0 and not _on_the_spot(x, y):
@@ -238,15 +237,15 @@ class ObstacleGuard:
         """Update ``known`` and ``known_slowly``, and shorten the free distance of turns on the spot.
 
         Args:
-            twists: the motions.
-            measured: points in base, shape (n, 2), m.
+            twists: motions of the base.
+            measured: measured points in base, shape (n, 2), m.
         """
         self.known = self.known_slowly = math.inf
-        # Ground that no scan has seen, nearer than this to a measured point, is not turned onto, m: what stands there
-        # is seen from one side only. Somebody who stands is about as deep.
+        # A turn on the spot must not cover unseen ground nearer than this to a measured point, m: an obstacle there
+        # is seen from one side only. A standing person is about this deep.
         depth = 0.2
-        # The tail does not swing onto it in a motion ahead if a point is no further before it and beside it, m: a wall
-        # along the body leaves the lidar's field so far before the tail.
+        # In a motion ahead the tail must not swing onto unseen ground if a measured point is at most this far in front
+        # of it and to its side, m: a wall along the body leaves the field of view this far in front of the tail.
         before_it, beside = 0.3, 0.1
         stretch = np.array((beside / before_it, 1.0))
         near = on_body(self._footprint, measured, self._reach + before_it) & ~on_body(self._footprint, measured, 0.0)
@@ -265,24 +264,24 @@ class ObstacleGuard:
             self.known_slowly = float(before.min(initial=self.known_slowly))
 
     def _stop_before(self, twist: _Steps, before: Array) -> None:
-        """Shorten ``known`` to the least of the distances along a motion, as far as it leads over seen ground."""
+        """Shorten ``known`` to the minimum of the distances along a motion, refined to the edge of seen ground."""
         known = float(before.min(initial=math.inf))
         if known < self.known:
             self.known = min(self.known, known + self._further(twist, known))
 
     def _unknown(self, twist: _Steps, ground: Array) -> NDArray[np.bool_]:
-        """Which points (n, 2) of the ground along a motion no scan has seen.
+        """Whether each ground point (n, 2) along a motion is unseen by all scans.
 
-        A motion ahead leads to where the lidar looks: there its sectors and points count (``unseen``).
+        A motion ahead leads into the lidar's field of view, where sectors and points decide (``unseen``).
         """
         unknown = ~self._visibility.covers(ground) if _is_ahead(twist) else np.ones(len(ground), np.bool_)
         unknown[unknown] = ~self.memory.seen(ground[unknown])
         return unknown
 
     def _further(self, twist: _Steps, known: float) -> float:
-        """Distance beyond ``known`` for which a motion still stays on seen ground, below that between two poses, m."""
+        """Distance beyond ``known`` that stays on seen ground, m; less than the distance between two ground checks."""
         x, y, turn = (part * TWIST_STEP for part in twist)
-        finer = 4  # parts of the distance between two of these in which the edge of seen ground is found
+        finer = 4  # parts of the distance between two ground checks; resolution of the edge of seen ground
         step = GROUND_STEP * float(self._sweep(*twist).distances[1]) / finer
         poses = swept_poses((x, y, turn), known + np.linspace(0.0, (finer - 1) * step, finer))
         outline = at_poses(self._outline, poses[1:])
@@ -290,11 +289,11 @@ class ObstacleGuard:
         return step * (finer - 1 if seen.all() else int(np.argmin(seen)))
 
     def allowed_before_unseen(self, now: int) -> float:
-        """Greatest pace from which the body stops comfortably on ground that was seen, m/s."""
+        """Maximum pace that allows a comfortable stop on seen ground, m/s."""
         return comfortable_speed(self.known - DRIFT, self.delay(now), self._limits.config.obstacle.deceleration)
 
     def allowed_speed(self, free: float, now: int) -> float:
-        """Greatest pace from which the body stops comfortably within ``free`` metres, m/s."""
+        """Maximum pace that allows a comfortable stop within ``free`` metres, m/s."""
         limits = self._limits.config.obstacle
         return comfortable_speed(free - limits.ahead, self.delay(now), limits.deceleration)
 
@@ -303,16 +302,16 @@ class ObstacleGuard:
         return free < stopping(abs(speed), self.delay(now), self._limits.config.deceleration)
 
     def delay(self, now: int) -> float:
-        """Time from the newest view of the way to the reaction, s."""
+        """Time from the latest view of the path to the reaction, s."""
         return max(now - self._stamp, 0) / SECOND + (self.unseen or 0.0) + self._limits.config.reaction
 
 
 class ObstacleCheck(Check):
-    """The swept footprint must not meet what the lidar sees or has seen; nothing is limited without a fresh scan.
+    """Keeps the swept footprint clear of present and earlier lidar returns; gives no limit without a fresh scan.
 
     Args:
-        view: what it may look at.
-        points: of scans, in base.
+        view: read access to the gate's state.
+        points: converts scans to points in base.
         sonars: pose (x, y, yaw) of every sonar that looks backwards in base by name, m, m, rad.
     """
 
@@ -332,7 +331,7 @@ class ObstacleCheck(Check):
         self.guard = ObstacleGuard(view.limits, view.footprint, points, sonars)
         self._approach = Approach(view)
         self._before_unseen = False
-        """Stands before ground that was not seen."""
+        """Whether the robot is stopped in front of unseen ground."""
 
     @property
     def urgent(self) -> bool:
@@ -343,7 +342,7 @@ class ObstacleCheck(Check):
         """Take valid scans, rounds of pings, and the motion of the body at every tick."""
         view = self.view
         if isinstance(seen, Tick):
-            # A robot that is not armed may be pushed or carried; what it saw counts while its wheels stand.
+            # A disarmed robot may be pushed or carried; its memory stays valid while its wheels stand.
             known = view.mode.active or view.samples.at_rest(seen.now)
             self.guard.move(seen.now, view.samples.twist(seen.now) if known else None, seen.elapsed / SECOND)
         elif isinstance(seen, LaserScan) and seen is view.samples.scan:
@@ -355,7 +354,7 @@ class ObstacleCheck(Check):
             self.guard.hear(seen)
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Sweep along the motions, and along those of the measured steering angles."""
+        """Sweep along the motions, and along the motion at the measured steering angles."""
         if courses is None:
             self._approach.forget()
             self._before_unseen = False
@@ -382,7 +381,7 @@ class ObstacleCheck(Check):
         self._approach.judge(now, twists, lambda speed: guard.too_near(free, speed, now))
 
     def _into_unseen(self, allowed: float, fastest: float) -> Iterator[PaceLimit]:
-        """Limits before ground that was not seen, which allows a pace of ``allowed``, for motions up to ``fastest``."""
+        """Limits before unseen ground, which allows a pace of ``allowed``, for motions up to ``fastest`` (m/s)."""
         config = self.view.config.obstacle
         if config.unseen == "slow" or self.view.calibrates:
             allowed = max(allowed, config.unseen_speed)
@@ -397,7 +396,7 @@ class ObstacleCheck(Check):
             yield PaceLimit(Reason.UNSEEN_SLOW, allowed)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """Free distance, or how long the lidar has not seen the way."""
+        """Free distance, distance on seen ground, or how long the lidar has not seen the path."""
         config = self.view.config
         if reason is Reason.LIDAR_BLIND:
             yield Measurement(name="unseen", value=self.guard.unseen, unit="s", limit=config.scan.stale_after)
@@ -413,16 +412,16 @@ def _on_the_spot(x: int, y: int) -> bool:
 
 
 def _near(points: Array, others: Array, within: float) -> NDArray[np.bool_]:
-    """Which of the points (n, 2) are nearer than ``within`` metres to one of the others (m, 2)."""
+    """Whether each point (n, 2) is nearer than ``within`` metres to any of ``others`` (m, 2)."""
     squares = (others**2).sum(axis=1) - 2 * points @ others.T
     return np.asarray((points**2).sum(axis=1) + squares.min(axis=1, initial=math.inf) < within**2)
 
 
 def _is_ahead(twist: _Steps) -> bool:
-    """Whether a motion leads to where the lidar looks."""
+    """Whether a motion leads into the lidar's field of view."""
     return twist[0] * TWIST_STEP >= AHEAD
 
 
 def _finite(value: float) -> float | None:
-    """A number; None for an infinite one."""
+    """The value, or None if infinite."""
     return value if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Checks that a configuration adds: their faults stop the robot and never end the gate."""
+"""Checks added by a configuration: their faults stop the robot and never end the gate."""
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
@@ -18,15 +18,15 @@ T = TypeVar("T")
 
 
 class OwnCheck(Check):
-    """A check by ``kind``. Once it raises, it is asked no more, and the robot stands until the daemon is restarted.
+    """A check by ``kind``; once it raises, it is disabled and the robot stands until the daemon is restarted.
 
     Args:
-        view: what it may look at.
-        name: in the configuration.
-        config: its settings.
+        view: read access to the gate's state.
+        name: name of the check in the configuration.
+        config: settings of the check.
 
     Raises:
-        InputError: its implementation does not load.
+        InputError: the implementation does not load.
     """
 
     def __init__(self, view: GateView, name: str, config: CheckConfig) -> None:
@@ -47,7 +47,7 @@ class OwnCheck(Check):
         self._guarded(lambda: self._check.observe(seen, topic), default=None)
 
     def reason(self, now: int) -> Iterable[Reason]:
-        """See ``Check.reason``; also that it failed."""
+        """See ``Check.reason``; also reports that the check failed."""
         given: list[Reason] = self._guarded(lambda: list(map(_known, self._check.reason(now))), default=[])
         return given if self._error is None else [Reason.OWN_CHECK]
 
@@ -59,7 +59,7 @@ class OwnCheck(Check):
         )
 
     def text(self, reason: Reason) -> str:
-        """See ``Check.text``; with the check's name."""
+        """See ``Check.text``; adds the name of the check."""
         said = self._guarded(lambda: str(self._check.text(reason)), default=reason.text)
         return f"{self._name}: {said}" if self._error is None else f"{self._name} failed: {self._error}"
 
@@ -79,7 +79,7 @@ class OwnCheck(Check):
         self._guarded(self._check.reset, default=None)
 
     def _guarded(self, ask: Callable[[], T], *, default: T) -> T:
-        """The answer of the check; ``default`` once it has raised."""
+        """Return the answer of the check; ``default`` once it has raised."""
         if self._error is None:
             try:
                 return ask()
@@ -90,7 +90,7 @@ class OwnCheck(Check):
 
 
 def _known(reason: Reason) -> Reason:
-    """A reason of ours; refuses anything else."""
+    """Return ``reason`` if it is a ``Reason``; raise TypeError otherwise."""
     if not isinstance(reason, Reason):
         raise TypeError(f"reason {reason!r}: expected a Reason")
     return reason

@@ -1,10 +1,10 @@
-"""Other robots by the poses they publish: the swept footprint against their outlines.
+"""Check against other robots: the swept footprint against outlines at their published poses.
 
-A lidar does not look behind the robot, and what it saw there is old: another robot may have come since. The outlines of
-the robots in section ``peers`` are obstacles where the lidar does not look, or all around a robot without one. Each is
-predicted from its newest pose and twist to now and to the next second. The clearance grows with the standard
-deviation of both poses. An outline whose newest pose is older than ``FRESH`` stays where it was for 30 s; such a robot
-may be anywhere (``unknown``), and so may one whose pose is less certain than ``UNSURE``.
+A lidar does not look behind the robot, and its earlier view of that ground is old: another robot may have arrived
+since. The outlines of the robots in section ``peers`` are obstacles outside the lidar's field of view, or all around a
+robot without a lidar. Each outline is predicted from the latest pose and twist to now and over the next second. The
+clearance grows with the standard deviation of both poses. An outline whose latest pose is older than ``FRESH`` stays in
+place for 30 s. Such a robot may be anywhere (``unknown``), as may a robot whose pose is less certain than ``UNSURE``.
 """
 
 import math
@@ -31,22 +31,22 @@ from monstertruckd.gate.obstacles import ObstacleGuard
 from monstertruckd.gate.sonars import SonarGuard
 
 FRESH: Final = 0.5
-"""Age up to which a pose is used, s: at 0.2 m/s a robot travels 0.1 m meanwhile."""
+"""Maximum age of a pose, s: at 0.2 m/s a robot travels 0.1 m meanwhile."""
 UNSURE: Final = 0.3
-"""Standard deviation above which a relative position is not used, m; the clearance grows no further."""
+"""Standard deviation above which a relative position is unknown, m; the clearance grows no further."""
 
 Place = tuple[float, float, float]
 Seen = Callable[[Array], NDArray[np.bool_]]
-"""Which of the points (n, 2) in base, m, a sensor sees."""
+"""Function that returns whether a sensor sees each point (n, 2) in base (m)."""
 
 
 class PeerGuard:
     """Sweeps the footprint along a motion against other robots.
 
     Args:
-        limits: the gate's, in force.
+        limits: limits in force.
         footprint: the body's outline.
-        outlines: of the others by name.
+        outlines: outlines of the other robots by name.
     """
 
     def __init__(self, limits: InForce, footprint: Footprint, outlines: Mapping[str, Footprint]) -> None:
@@ -57,15 +57,15 @@ class PeerGuard:
         self._heard: dict[str, Peer] = {}
 
     def observe_pose(self, pose: Odometry) -> None:
-        """Take the robot's own newest pose in the map."""
+        """Take the latest pose of this robot in the map."""
         self._own = pose
 
     def observe(self, peers: Peers) -> None:
-        """Take the newest poses of the others."""
+        """Take the latest poses of the other robots."""
         self._heard = {peer.robot: peer for peer in peers.peers if peer.robot in self._edges}
 
     def unknown(self, now: int) -> bool:
-        """Whether another robot may be anywhere: no fresh pose of it or of this robot, or one that is too uncertain."""
+        """Whether another robot may be anywhere: its pose or this robot's pose is missing, stale or too uncertain."""
         if (own := self._fresh(now)) is None:
             return True
         return any(
@@ -77,16 +77,16 @@ class PeerGuard:
         """Distance the footprint can travel, m; +inf if no other robot is known to be within reach.
 
         Args:
-            twists: motions of the base; the shortest distance of all counts.
+            twists: motions of the base; the shortest distance of all is returned.
             reach: distance swept, m.
             now: ns.
-            seen: the lidar's field of view, in which outlines are left to the scan; None = no lidar.
+            seen: lidar's field of view, where the scan covers the outlines; None without a lidar.
         """
         free = math.inf
         if (own := self._fresh(now)) is None:
             return free
         twists, place = tuple(twists), _moved(own.pose, own.twist, _age(own.stamp, now))
-        deviations = 2.0  # standard deviations of the relative position that are added to the clearance
+        deviations = 2.0  # number of standard deviations of the relative position added to the clearance
         for peer in self._heard.values():
             unsure = deviations * min(_deviation(own, peer), UNSURE)
             clearance = self._limits.config.obstacle.side_clearance + unsure
@@ -100,19 +100,19 @@ class PeerGuard:
         return free
 
     def _fresh(self, now: int) -> Odometry | None:
-        """The robot's own pose, unless it is too old."""
+        """Pose of this robot; None if too old."""
         return None if self._own is None or _age(self._own.stamp, now) > FRESH else self._own
 
     def _outline(self, peer: Peer, own: Place, now: int, reach: float, clearance: float) -> Array:
-        """Points of another robot's present and predicted outlines in base, shape (n, 2), m; none if it is far away."""
+        """Current and predicted outlines of another robot in base, shape (n, 2), m; empty if it is far away."""
         edges, age = self._edges[peer.robot], _age(peer.heard, now)
         pose, twist = peer.pose, peer.twist
-        horizon = (0.0, 0.5, 1.0)  # times to which the motion of another robot is predicted, s
+        horizon = (0.0, 0.5, 1.0)  # prediction times for the motion of another robot, s
         times = (0.0,) if age > FRESH else tuple(age + later for later in horizon)
         radius, ahead = float(np.hypot(edges[:, 0], edges[:, 1]).max()), math.hypot(twist.vx, twist.vy) * times[-1]
         near = reach + self._footprint.circumscribed_radius + clearance
         found = [np.empty((0, 2))]
-        # Seconds for which the last outline of a silent robot is an obstacle, as points of earlier scans are.
+        # Time that the last outline of a silent robot stays an obstacle, as points of earlier scans do, s.
         kept = 30.0
         if age > kept or math.dist((pose.x, pose.y), own[:2]) > near + radius + ahead:
             return found[0]
@@ -121,19 +121,19 @@ class PeerGuard:
             outline = placed(np.column_stack((edges, np.zeros(len(edges)))), at)[:, :2]
             outline = points_relative(outline, own)
             if number and on_body(self._footprint, outline, clearance).any():
-                break  # predicted to reach this robot, which may have left by then
+                break  # predicted contact with this robot, which may have left by then
             found.append(outline)
         return np.concatenate(found)
 
 
 class PeerCheck(Check):
-    """The swept footprint must not meet another robot; where a lidar looks they are left to its scan.
+    """Keeps the swept footprint clear of other robots; in a lidar's field of view its scan covers them.
 
     Args:
-        view: what it may look at.
-        outlines: of the other robots by name.
-        lidar: the check of a lidar; None without one.
-        sonars: the check of sonars; None without them.
+        view: read access to the gate's state.
+        outlines: outlines of the other robots by name.
+        lidar: guard of the lidar; None without a lidar.
+        sonars: guard of the sonars; None without sonars.
     """
 
     reasons = (Reason.OBSTACLE_STOP, Reason.OBSTACLE_SLOW, Reason.PEER_UNKNOWN)
@@ -158,7 +158,7 @@ class PeerCheck(Check):
         return self._approach.emergency
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take the robot's own pose in the map, the frame of the others' poses, and theirs."""
+        """Take the pose of this robot in the map, the common frame of all poses, and the poses of the other robots."""
         if isinstance(seen, Odometry) and topic is POSE:
             self._guard.observe_pose(seen)
         elif isinstance(seen, Peers):
@@ -197,7 +197,7 @@ class PeerCheck(Check):
 
 
 def _age(stamp: int, now: int) -> float:
-    """S; 0 for a stamp in the future."""
+    """Age of a stamp, s; 0 for a stamp in the future."""
     return max(now - stamp, 0) / SECOND
 
 
@@ -207,12 +207,12 @@ def _deviation(own: Odometry, peer: Peer) -> float:
 
 
 def _moved(pose: Pose2D, twist: Twist2D, seconds: float) -> Place:
-    """Pose after ``seconds`` of a constant twist, m, m, rad."""
+    """Pose after ``seconds`` (s) of a constant twist, m, m, rad."""
     return integrate((pose.x, pose.y, pose.yaw), twist.vx, twist.vy, twist.wz, seconds)
 
 
 def _edges(body: Footprint) -> Array:
-    """Points along the outline of a body in its base, shape (n, 2), m."""
+    """Points along the outline of a body, in its base, shape (n, 2), m."""
     spacing = 0.03  # distance between the points of an outline, m
     along, across = (math.ceil(2 * half / spacing) + 1 for half in (body.half_length, body.half_width))
     return body.edge_points(along, across)

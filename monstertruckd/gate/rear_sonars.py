@@ -1,7 +1,7 @@
-"""Sonars that look backwards on a robot with a lidar: sight of the ground behind it.
+"""Rear-facing sonars of a robot with a lidar: view of the ground behind it.
 
-An echo shows that the ground within the cone is free up to its range, and that something stands on the arc at that
-range. A ping without an echo shows nothing: a surface may have reflected the sound elsewhere.
+An echo shows that the ground within the cone is free up to the measured range, and that an obstacle stands on the arc
+at that range. A ping without an echo shows nothing: a surface may have reflected the sound elsewhere.
 """
 
 import math
@@ -25,9 +25,9 @@ class MountedEcho(NamedTuple):
     mount: Place
     """Pose of the sonar in base, m, m, rad."""
     beams: Beams
-    """Two, each for half of the cone."""
+    """Two beams, one for each half of the cone."""
     arc: Array
-    """Possible places of the echo in base, shape (n, 2), m."""
+    """Possible origins of the echo in base, shape (n, 2), m."""
 
 
 def rear(mounts: Mapping[str, Place]) -> dict[str, Place]:
@@ -41,7 +41,7 @@ class RearSonars:
     """Splits rounds of pings and notes which sonars are silent.
 
     Args:
-        limits: the gate's, in force.
+        limits: limits in force.
         mounts: pose (x, y, yaw) of every sonar that looks backwards in base by name, m, m, rad.
     """
 
@@ -52,7 +52,7 @@ class RearSonars:
         """Time of the last answer of every sonar that is not silent, ns."""
 
     def pings(self, ranges: SonarRanges) -> Iterator[MountedEcho]:
-        """Answers in a round of pings; none in one that is too late."""
+        """Answers in a round of pings; none if the round is late."""
         if is_late(ranges, self._limits.config):
             return
         for echo in ranges.sonars:
@@ -61,7 +61,7 @@ class RearSonars:
                 yield _ping(ranges, echo, self._mounts[echo.name])
 
     def silenced(self, now: int) -> list[str]:
-        """Sonars that have become silent since the last call, at ``now`` (ns)."""
+        """Return sonars that have become silent since the last call, at ``now`` (ns)."""
         oldest = now - round(self._limits.config.sonar.stale_after * SECOND)
         names = [name for name, answered in self._answered.items() if answered < oldest]
         for name in names:
@@ -73,5 +73,5 @@ def _ping(ranges: SonarRanges, echo: SonarEcho, mount: Place) -> MountedEcho:
     half = ranges.field_of_view / 2
     if echo.range is None:
         return MountedEcho(echo.name, mount, Beams(echo.stamp, -half / 2, half, np.zeros(2)), np.empty((0, 2)))
-    free = echo.range if echo.range > ranges.range_min else 0.0  # what is nearer is reported as about range_min
+    free = echo.range if echo.range > ranges.range_min else 0.0  # nearer echoes are reported as about range_min
     return MountedEcho(echo.name, mount, Beams(echo.stamp, -half / 2, half, np.full(2, free)), arc(mount, free, half))

@@ -1,13 +1,13 @@
-"""Motion that nobody commanded: what the drives measure against what their orders let them do.
+"""Uncommanded motion: compares drive feedback with the speeds that the orders allow.
 
-An order bounds what a shaft can do: from the moment of the order it may turn at most as fast as the fastest order that
-is in force. An order is in force until the drive has been heard once more after the reaction time: a drive that does
-not answer may not have received anything either. From a faster speed the bound comes down by the least deceleration of
-the drive's own ramp. ``ShaftBounds`` holds these two speeds, forward and backward. What decides is the distance
-that a shaft turns beyond them: a short overshoot moves nothing, a slow creep that lasts does.
+A shaft may turn no faster than the fastest order in force. A superseded order stays in force until feedback arrives
+later than the reaction time after the new order: a drive that does not answer may not have received the new order
+either. If the shaft turns faster than its orders, the bound falls at the minimum deceleration of the drive's own ramp.
+``ShaftBounds`` holds both bounds, forward and backward. The criterion is the distance that a shaft turns beyond its
+bounds: a short overshoot moves nothing, a lasting slow creep does.
 
-Only a motor's motion counts. A power stage that is off and without current turns nothing: somebody pushes the robot,
-or it rolls. Of a drive that does not measure its current, every motion counts.
+Only motion caused by a motor is judged. A power stage that is off and draws no current turns nothing: the robot is
+pushed, or it rolls. If a drive does not measure its current, all its motion is judged.
 """
 
 import math
@@ -30,13 +30,13 @@ from monstertruckd.gate.config import RunawayConfig
 POWERED: Final = frozenset({DriveMode.ENABLED, DriveMode.QUICK_STOP})
 """Modes of a drive whose power stage is on."""
 MAX_ORDERS: Final = 64
-"""Orders that are kept apart; older ones are merged into their bounds."""
+"""Maximum number of separate orders; older ones are merged into their bounds."""
 LEAK: Final = 0.1
-"""Share of the standstill speed at which a shaft that is ordered to stand may drift for ever."""
+"""Tolerated permanent drift of a shaft ordered to stand, as a fraction of the standstill speed."""
 
 
 class RunawayKind(StrEnum):
-    """How a shaft departs from its orders; the value says so in words."""
+    """How a motion departs from the orders; the value is the wording for messages."""
 
     NO_ORDER = "turns without an order"
     DOES_NOT_STOP = "does not stop"
@@ -48,28 +48,28 @@ class RunawayKind(StrEnum):
 
 
 class Runaway(NamedTuple):
-    """A motion that nobody commanded."""
+    """An uncommanded motion."""
 
     kind: RunawayKind
     source: str
-    """Drive or other sensor that measured it."""
+    """Drive or other sensor that measured the motion."""
     measured: float
     """Speed over ground, m/s."""
     low: float
-    """Least speed that its orders allowed, m/s."""
+    """Minimum speed allowed by the orders, m/s."""
     high: float
-    """Greatest one, m/s."""
+    """Maximum speed allowed by the orders, m/s."""
 
     @property
     def text(self) -> str:
-        """In words."""
+        """Wording for messages."""
         if self.kind is RunawayKind.STRAYS:
             return f"{self.source} {self.kind}"
         return f"{self.source} {self.kind} at {self.measured:.3f} m/s"
 
 
 class _Order(NamedTuple):
-    """Speeds ordered from an instant on, m/s; one, or the bounds of several that were merged."""
+    """Speed ordered from ``since`` (ns) on, or the bounds of several merged orders, m/s."""
 
     since: int
     low: float
@@ -77,43 +77,43 @@ class _Order(NamedTuple):
 
 
 class _Beyond(NamedTuple):
-    """Distance beyond what the orders allow so far, m."""
+    """Accumulated distance beyond the allowed one, m."""
 
     velocity: float = 0.0
-    """By the velocity."""
+    """Integrated from the velocity."""
     position: float = 0.0
-    """By the position."""
+    """Measured by the position."""
     drift: float = 0.0
-    """By the position of a shaft that is ordered to stand; a slow drift does not count."""
+    """Measured by the position while the shaft is ordered to stand, less a tolerated slow drift."""
     unread: float = 0.0
-    """By the position, while the velocity reads 0."""
+    """Measured by the position while the velocity reads 0."""
 
 
 class ShaftBounds:
-    """Speeds that a shaft's orders allow, forward positive, m/s; ``low`` <= 0 <= ``high``."""
+    """Speeds allowed by the orders of a shaft, forward positive, m/s; ``low`` <= 0 <= ``high``."""
 
     def __init__(self) -> None:
         self.low = 0.0
         self.high = 0.0
         self.furthest = 0.0
-        """Greatest speed allowed at any time between the newest two measurements, m/s."""
+        """Maximum speed allowed at any time between the last two measurements, m/s."""
         self.rearmost = 0.0
-        """Least one, m/s."""
+        """Minimum speed allowed at any time between the last two measurements, m/s."""
         self._orders: deque[_Order] = deque([_Order(0, 0.0, 0.0)])
 
     @property
     def ordered(self) -> float:
-        """Newest order, m/s."""
+        """Latest order, m/s."""
         newest = self._orders[-1]
         return newest.high if newest.high > 0.0 else newest.low
 
     @property
     def steady(self) -> bool:
-        """Whether one order alone has been in force between the newest two measurements."""
+        """Whether a single order was in force between the last two measurements."""
         return len(self._orders) == 1
 
     def order(self, now: int, speed: float) -> None:
-        """Take the speed that is ordered at ``now`` (ns)."""
+        """Add an order for ``speed`` (m/s) at ``now`` (ns)."""
         newest, orders = self._orders[-1], self._orders
         if (newest.low, newest.high) == (speed, speed):
             return
@@ -123,13 +123,13 @@ class ShaftBounds:
             orders.appendleft(_Order(first.since, min(first.low, second.low), max(first.high, second.high)))
 
     def follow(self, before: int, stamp: int, reaction: float, deceleration: float) -> None:
-        """Move on from one measurement to the next.
+        """Update the bounds from one measurement to the next.
 
         Args:
-            before: stamp of the measurement before, ns.
-            stamp: of this one, ns.
+            before: stamp of the previous measurement, ns.
+            stamp: stamp of this measurement, ns.
             reaction: time from an order to its effect, s.
-            deceleration: least one of the drive's ramps, m/s^2.
+            deceleration: minimum deceleration of the drive's ramps, m/s^2.
         """
         heard = before - round(reaction * SECOND)
         while len(self._orders) > 1 and self._orders[1].since <= heard:
@@ -141,7 +141,7 @@ class ShaftBounds:
         self.furthest, self.rearmost = max(high, self.high), min(low, self.low)
 
     def begin(self, speed: float) -> None:
-        """Start from a measured speed, m/s: where it comes from does not matter."""
+        """Restart the bounds at a measured speed (m/s), whatever caused it."""
         self.high, self.low = max(speed, 0.0), min(speed, 0.0)
 
 
@@ -149,27 +149,27 @@ class ShaftWatch:
     """Compares one shaft's feedback with its orders.
 
     Args:
-        name: of the drive.
+        name: name of the drive.
     """
 
     def __init__(self, name: str) -> None:
         self.bounds = ShaftBounds()
         self.moves = False
-        """Whether velocity or position show motion, by the newest feedback."""
+        """Whether velocity or position of the latest feedback show motion."""
         self.still_since: int | None = None
-        """Stamp of the first feedback without motion, ns; None = the shaft moves."""
+        """Stamp of the first feedback without motion, ns; None while the shaft moves."""
         self.driven = False
-        """Whether the newest feedback shows a motor that may turn the shaft."""
+        """Whether the motor may turn the shaft, by the latest feedback."""
         self._name = name
         self._before: DriveFeedback | None = None
         self.measures_current = False
-        """Whether its current shows that the motor may turn the shaft."""
+        """Whether the drive measures its current, which shows if the motor may turn the shaft."""
         self._current: float | None = None
-        """Newest current in the present mode, A."""
+        """Latest current in this mode, A."""
         self._rested = False
-        """Whether the shaft has rested since it was last ordered to turn."""
+        """Whether the shaft has been at rest since the last order to turn."""
         self._over = 0.0
-        """How much faster than allowed the shaft turned at the newest feedback, m/s."""
+        """Excess over the allowed speed at the latest feedback, m/s."""
         self._beyond = _Beyond()
 
     def observe(
@@ -181,15 +181,15 @@ class ShaftWatch:
         deceleration: float,
         standstill: float,
     ) -> Runaway | None:
-        """Take feedback; returns what nobody commanded, once.
+        """Take feedback; return an uncommanded motion, once.
 
         Args:
-            feedback: of the shaft.
-            metres: distance over ground in one radian of the motor.
+            feedback: feedback of the shaft.
+            metres: distance over ground per radian of the motor, m.
             config: limits.
             reaction: time from an order to its effect, s.
-            deceleration: least one of the drive's ramps, m/s^2.
-            standstill: speed below which a shaft rests, m/s.
+            deceleration: minimum deceleration of the drive's ramps, m/s^2.
+            standstill: speed below which a shaft is at rest, m/s.
         """
         before, self._before = self._before, feedback
         velocity = feedback.velocity * metres
@@ -213,11 +213,11 @@ class ShaftWatch:
         return self._judge(velocity, before.velocity * metres, step, dt, config.distance, standstill)
 
     def pulls(self, config: RunawayConfig, *, fresh: bool) -> bool:
-        """Whether the motor may be what moves the body, even if the shaft reads standstill.
+        """Whether the motor may be moving the body, even if the shaft reads standstill.
 
         Args:
             config: limits.
-            fresh: the drive is heard.
+            fresh: whether the drive's feedback is fresh.
         """
         if not fresh or not self.measures_current:
             return self._before is not None and self._before.mode in POWERED
@@ -237,7 +237,7 @@ class ShaftWatch:
             self.measures_current, self._current = True, feedback.current
 
     def _is_driven(self, feedback: DriveFeedback, config: RunawayConfig) -> bool:
-        """Whether the motor may turn the shaft; a current that is not measured yet in this mode does not show it."""
+        """Whether the motor may turn the shaft; a current not yet measured in this mode does not show it."""
         if feedback.mode in POWERED or not self.measures_current:
             return True
         return self._current is not None and abs(self._current) > config.idle_current
@@ -284,11 +284,11 @@ class ShaftWatch:
 
 
 class BodyWatch:
-    """Motion of the body by a sensor that does not depend on the drives, while all of them are ordered to stand.
+    """Watches the body with a sensor independent of the drives, while all drives are ordered to stand.
 
     Args:
         source: role of the sensor.
-        fresh_for: age from which on its newest sample shows nothing, s.
+        fresh_for: age above which its latest sample is ignored, s.
     """
 
     def __init__(self, source: str, fresh_for: float) -> None:
@@ -297,20 +297,20 @@ class BodyWatch:
         self._stamp: int | None = None
         self._travel = 0.0
         self.runs = False
-        """Whether the newest sample shows motion that a motor may make."""
+        """Whether the latest sample shows motion that a motor may cause."""
 
     def observe(
         self, stamp: int, speed: float, config: RunawayConfig, standstill: float, *, standing: bool, driven: bool
     ) -> Runaway | None:
-        """Take a speed; returns what nobody commanded, once.
+        """Take a speed; return an uncommanded motion, once.
 
         Args:
-            stamp: of the sample, ns.
-            speed: of the body or a free wheel, m/s.
+            stamp: stamp of the sample, ns.
+            speed: speed of the body or of a free wheel, m/s.
             config: limits.
-            standstill: speed below which the robot rests, m/s.
-            standing: all orders are to stand, and every drive has had the time to obey.
-            driven: a motor may be what moves the robot.
+            standstill: speed below which the robot is at rest, m/s.
+            standing: whether all drives are ordered to stand and have had the time to obey.
+            driven: whether a motor may be moving the robot.
         """
         before, self._stamp = self._stamp, stamp
         moves = abs(speed) >= standstill
@@ -327,18 +327,18 @@ class BodyWatch:
     def observe_window(
         self, since: int, stamp: int, moved: float, config: RunawayConfig, *, stood: int, now: int, driven: bool
     ) -> Runaway | None:
-        """Take a proven motion over a time that follows the one before; returns what nobody commanded.
+        """Take proven motion in a time window; return an uncommanded motion.
 
-        A motion that is published again is passed over.
+        Distance accumulates over consecutive windows. A window that is published again is ignored.
 
         Args:
-            since: beginning of the time, ns.
-            stamp: its end, ns.
-            moved: distance of the body, m.
+            since: start of the window, ns.
+            stamp: end of the window, ns.
+            moved: distance travelled by the body, m.
             config: limits.
-            stood: since when the robot is to stand, ns.
-            now: until when the motion goes on alike, ns.
-            driven: a motor may be what moves the robot.
+            stood: time since when the robot must stand, ns.
+            now: end of the extrapolation of the motion, ns.
+            driven: whether a motor may be moving the robot.
         """
         if stamp == self._stamp:
             return None
@@ -353,31 +353,31 @@ class BodyWatch:
         return Runaway(RunawayKind.BODY_MOVES, self._source, speed, 0.0, 0.0)
 
     def expire(self, now: int) -> None:
-        """Forget the motion of a sample that is too old at ``now``, ns."""
+        """Ignore the motion of a sample that is too old at ``now``, ns."""
         if self._stamp is not None and now - self._stamp > self._fresh_for:
             self.runs = False
 
 
 class Escalation(IntEnum):
-    """What is done against a runaway, each step after the one before it has not helped."""
+    """Steps against a runaway; each follows when the previous one has not helped."""
 
     NONE = 0
     QUICK_STOP = 1
-    """Quick stop on every exchange, the deadman line falls, the emergency stop latches."""
+    """Quick stop in every exchange with the drive, deadman line low, emergency stop latched."""
     POWER_OFF = 2
     """Power stages off."""
     PORT_OFF = 3
-    """Power of the drives' USB ports off, where that is configured."""
+    """Power of the drives' USB ports off, where configured."""
 
 
 class RunawayCheck(Check):
-    """A motor turns as nobody commanded, in any mode. The finding stays until an operator resets the emergency stop.
+    """Detects uncommanded motion of a motor in any mode; the finding stays until an operator resets the emergency stop.
 
-    Every finding takes the next step: the bounds start again from the measured speed, and a step that works keeps the
+    Every finding triggers the next step. The bounds then restart at the measured speed, and a step that works keeps the
     shaft within them.
 
     Args:
-        view: what it may look at.
+        view: read access to the gate's state.
         config: limits.
     """
 
@@ -394,23 +394,23 @@ class RunawayCheck(Check):
         self._bodies = self._wheels, self._gyro, self._scans
         self._encoders: WheelEncoders | None = None
         self._unjudged: UnshownMotion | None = None
-        """Proven motion of the body without a motor current so far."""
+        """Proven motion of the body, kept until a motor current confirms it."""
         self._strays = 0
-        """Of the joints of the lidar's mount, as they count them."""
+        """Strays counted by the joints of the lidar's mount."""
         self._commanded = 0
-        """When motion was commanded last, ns."""
+        """Time of the last motion command, ns."""
         self._halted = 0
-        """Since when every command has been a quick stop, ns."""
+        """Time since when every command has been a quick stop, ns."""
         self._step = Escalation.NONE
         self._found: Runaway | None = None
         self._found_at = 0
-        """When it was found, ns."""
+        """Time of the finding, ns."""
         self._count = 0
 
-    # What it sees
+    # Inputs
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take a command of the newest tick, or a measure of motion."""
+        """Take the command of a tick, or a measurement of motion."""
         match seen:
             case Tick():
                 self._command(seen.now)
@@ -456,16 +456,16 @@ class RunawayCheck(Check):
 
     @property
     def _obeyed(self) -> int:
-        """When every drive has had the time to obey the newest order to stand, ns."""
+        """Time by when every drive must have obeyed the latest order to stand, ns."""
         limits = self.view.config
         return self._commanded + round((limits.reaction + limits.speed / limits.deceleration) * SECOND)
 
     @property
     def _stood(self) -> int:
-        """Start of the time in which motion of the body counts, ns.
+        """Time since when motion of the body is judged, ns.
 
-        It starts when all drives read standstill. Drives without a measured current get the full time to obey: scans
-        with late stamps may still show their braking.
+        Judging starts when all drives read standstill. Drives without a measured current get the full time to obey:
+        scans with late stamps may still show their braking.
         """
         still = [watch.still_since for watch in self._shafts if watch.measures_current]
         known = [since for since in still if since is not None]
@@ -480,7 +480,7 @@ class RunawayCheck(Check):
 
     def _take_unshown(self, motion: UnshownMotion, now: int) -> None:
         driven = self._pulled(now)
-        # The drive polls its current less often than its velocity: keep the motion until a newer current decides.
+        # The drive polls its current less often than its velocity: keep the motion until the next current decides.
         self._unjudged = None if driven or now - motion.stamp > SCAN.fresh_for() * SECOND else motion
         if self._unjudged is not None:
             return
@@ -497,7 +497,7 @@ class RunawayCheck(Check):
         self._take(found, now)
 
     def _take_joints(self, seen: StabiliserFeedback) -> None:
-        """A joint that strays has no torque already; the drives need no more than the stop."""
+        """Detect joints that stray: they already have no torque, so the drives need only the stop."""
         before, self._strays = self._strays, seen.pitch_joint.strays + seen.roll_joint.strays
         if self._strays > before:
             self._found = Runaway(RunawayKind.STRAYS, DeviceRole.STABILISER.value, 0.0, 0.0, 0.0)
@@ -505,7 +505,7 @@ class RunawayCheck(Check):
             self._step = max(self._step, Escalation.QUICK_STOP)
 
     def _pulled(self, now: int) -> bool:
-        """Whether a motor may be what moves the body: one that falls over or slides down is moved by its weight."""
+        """Whether a motor may be moving the body; a body that falls over or slides down is moved by its weight."""
         samples = self.view.samples
         if samples.tips(now):
             return False
@@ -523,10 +523,10 @@ class RunawayCheck(Check):
         least = Escalation.POWER_OFF if stopped or blind else Escalation.QUICK_STOP
         self._step = Escalation(min(max(self._step + 1, least), Escalation.PORT_OFF))
 
-    # What it says
+    # Results
 
     def reason(self, now: int) -> Iterator[Reason]:
-        """A finding that no operator has cleared."""
+        """Report a finding that no operator has cleared."""
         if self._found is not None:
             yield Reason.UNCOMMANDED_MOTION
 
@@ -541,21 +541,21 @@ class RunawayCheck(Check):
 
     @property
     def findings(self) -> int:
-        """Findings so far."""
+        """Number of findings so far."""
         return self._count
 
     @property
     def power_off(self) -> bool:
-        """Whether quick stops do not help."""
+        """Whether quick stops have not helped."""
         return self._step >= Escalation.POWER_OFF
 
     @property
     def port_off(self) -> bool:
-        """Whether switching the power stages off does not help either."""
+        """Whether switching the power stages off has not helped either."""
         return self._step >= Escalation.PORT_OFF
 
     def text(self, reason: Reason) -> str:
-        """Who turns, and what was done."""
+        """The motion, and the step taken against it."""
         found = self._found
         if found is None:
             return reason.text
@@ -567,12 +567,12 @@ class RunawayCheck(Check):
         return f"{found.text}; {done[self._step]}"
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """Measured speed and what the orders allowed."""
+        """Measured speed, with the speed allowed by the orders as its limit."""
         if (found := self._found) is not None and found.kind is not RunawayKind.STRAYS:
             limit = found.high if found.measured >= 0.0 else found.low
             yield Measurement(name="speed", value=found.measured, unit="m/s", limit=limit)
 
     def reset(self) -> None:
-        """An operator says that the cause is gone."""
+        """Clear the finding: the operator confirms that the cause is gone."""
         if self.view.mode is GateMode.ESTOPPED:
             self._found, self._step = None, Escalation.NONE

@@ -1,4 +1,4 @@
-"""Newest valid sample of every sensor, and whether it is fresh."""
+"""Latest valid sample of every sensor, and its freshness."""
 
 import math
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ STALE_TOPICS: Final[Mapping[Topic[Any], Reason]] = {
     **dict.fromkeys(topics.DRIVES, Reason.DRIVE_STALE),
     topics.STEERING: Reason.STEERING_STALE,
 }
-"""Topics whose samples are stale as soon as the service that writes them reports its loss."""
+"""Topics whose samples become stale as soon as their writing service reports its loss."""
 
 STALE_SENSORS: Final = {
     Reason.SCAN_STALE: DeviceRole.LIDAR,
@@ -43,10 +43,10 @@ STALE_SENSORS: Final = {
     Reason.STEERING_STALE: DeviceRole.STEERING,
     Reason.BATTERY_STALE: DeviceRole.BATTERY,
 }
-"""Which sensor is stale, by reason."""
+"""Stale sensor by reason."""
 
 MEASURED: Final = frozenset(BatteryLevel) - {BatteryLevel.UNKNOWN, BatteryLevel.SENSOR_FAULT}
-"""Levels of a battery reading that is valid."""
+"""Levels of a valid battery reading."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,22 +54,22 @@ class Staleness:
     """A sensor without a valid sample."""
 
     since: int | None
-    """When its newest valid sample became stale, ns; None = there never was one."""
+    """Time when the latest valid sample became stale, ns; None if there never was a valid sample."""
     age: float | None
-    """Of its newest valid sample, s."""
+    """Age of the latest valid sample, s; None if a valid sample is missing."""
     limit: float
-    """S."""
+    """Maximum age, s."""
     refused: Measurement | None
-    """Why its newest sample since was not valid."""
+    """Why a later sample was rejected."""
 
 
 class Samples:
-    """Newest valid sample of every sensor.
+    """Latest valid sample of every sensor.
 
     Args:
-        limits: in force.
+        limits: limits in force.
         chassis: kinematics of the body.
-        services: what is stale at once when a service reports its loss.
+        services: staleness reason that applies at once when a service reports its loss, by service name.
     """
 
     def __init__(self, limits: InForce, chassis: Chassis, services: Mapping[str, Reason]) -> None:
@@ -81,16 +81,16 @@ class Samples:
         self.steering: SteeringFeedback | None = None
         self.attitude: Attitude | None = None
         self.tilt = 0.0
-        """Angle between the robot's z axis and the vertical, rad, by the newest valid attitude."""
+        """Angle between the robot's z axis and the vertical by the latest valid attitude, rad."""
         self._shaken: Attitude | None = None
-        """Newest attitude whose tilt an acceleration hides."""
+        """Latest attitude whose tilt is hidden by an acceleration."""
         self.battery: Battery | None = None
         self._lost: dict[Reason, int] = {}
         self._refused: dict[Reason, Measurement] = {}
         self._speed: tuple[int, float | None] | None = None
-        """Time (ns) and result of the newest ``speed``, until the next sample."""
+        """Time (ns) and cached result of ``speed``, valid until the next sample."""
         self.angles = chassis.straight
-        """Steering angles by the newest steering feedback, rad."""
+        """Steering angles by the latest steering feedback, rad."""
 
     def observe(self, message: Message, topic: Topic[Any]) -> None:
         """Take a message of a topic."""
@@ -120,7 +120,7 @@ class Samples:
                 self._lose(message)
 
     def _take_scan(self, scan: LaserScan) -> None:
-        """Take a scan unless its age, the tilt of its plane or the lack of any range makes it not valid."""
+        """Take a scan unless its latency, the tilt of its plane or the lack of any range makes it invalid."""
         if not self._valid(scan, Reason.SCAN_STALE):
             return
         config = self._limits.config
@@ -134,14 +134,14 @@ class Samples:
             self.scan = scan
 
     def _lose(self, table: HealthTable) -> None:
-        """Samples from before the loss of a service become stale."""
+        """Mark samples from before the loss of a service as stale."""
         for service in table.services:
             if service.state is not ServiceState.READY and (stale := self._services.get(service.name)) is not None:
                 self._lost[stale] = max(service.since, self._lost.get(stale, service.since))
                 self._speed = None
 
     def gives(self, service: str) -> Reason | None:
-        """Which sensor is lost with a service, by the reason of its staleness."""
+        """Staleness reason of the sensor that is lost with a service."""
         return self._services.get(service)
 
     def _valid(self, message: Message, stale: Reason) -> bool:
@@ -154,7 +154,7 @@ class Samples:
         return False
 
     def _fresh(self, message: Message | None, limit: SensorLimit | None, now: int, stale: Reason) -> bool:
-        """Whether a sample is fresh; never of a sensor that the robot does not have (no limit)."""
+        """Whether a sample is fresh; False for a sensor that the robot does not have (no limit)."""
         if limit is None or message is None or message.received <= self._lost.get(stale, -1):
             return False
         return now - message.received <= limit.stale_after * SECOND
@@ -172,7 +172,7 @@ class Samples:
         return self._fresh(self.attitude, self._limits.config.attitude, now, Reason.ATTITUDE_STALE)
 
     def tips(self, now: int) -> bool:
-        """Whether the robot falls over or slides down at ``now`` (ns): by the last tilt that was measured.
+        """Whether the robot falls over or slides down at ``now`` (ns), by the last measured tilt.
 
         While it falls, its acceleration hides the tilt from the sensor.
         """
@@ -185,7 +185,7 @@ class Samples:
 
     @property
     def faults(self) -> list[DriveFeedback]:
-        """Newest feedback of the drives that report a fault."""
+        """Latest feedback of every drive that reports a fault."""
         return [drive for drive in self.drives if drive is not None and drive.mode is DriveMode.FAULT]
 
     def values(self, now: int) -> dict[str, Value]:
@@ -211,23 +211,23 @@ class Samples:
         return tuple([self._chassis.drivetrain.speed(drive.velocity) for drive in self._fresh_drives(now)])
 
     def twist(self, now: int) -> Twist2 | None:
-        """Velocity of the base by the measured shaft speeds and the newest steering angles; None without the former."""
+        """Velocity of the base by measured shaft speeds and latest steering angles; None without fresh shaft speeds."""
         rolling, angles = self.shaft_speeds(now), self.angles
         return self._chassis.twist(self._chassis.input_speeds(rolling, *angles), *angles) if rolling else None
 
     def turn_rate(self, now: int) -> float:
-        """Yaw rate of ``twist``, rad/s; 0 without it."""
+        """Yaw rate of ``twist``, rad/s; 0 if the twist is unknown."""
         twist = self.twist(now)
         return 0.0 if twist is None else twist[2]
 
     def _fresh_drives(self, now: int) -> list[DriveFeedback]:
-        """Feedback of all shafts; empty unless all of it is fresh."""
+        """Feedback of all shafts; empty unless all are fresh."""
         limit = self._limits.config.drive
         drives = [d for d in self.drives if d is not None and self._fresh(d, limit, now, Reason.DRIVE_STALE)]
         return drives if len(drives) == len(self.drives) else []
 
     def sensor_limits(self) -> dict[Reason, SensorLimit]:
-        """Limit of every sensor of the robot by the reason of its staleness, worst first."""
+        """Limits of the robot's sensors by staleness reason, worst first."""
         config = self._limits.config
         limits = {
             Reason.DRIVE_STALE: config.drive,
@@ -239,7 +239,7 @@ class Samples:
         return {reason: limit for reason, limit in limits.items() if limit is not None}
 
     def fresh(self, now: int) -> dict[Reason, bool]:
-        """Which sensors are fresh, by the reason of the stale ones."""
+        """Whether each sensor is fresh, by its staleness reason."""
         return {
             Reason.DRIVE_STALE: bool(self._fresh_drives(now)),
             Reason.STEERING_STALE: self.steering_fresh(now),
@@ -260,7 +260,7 @@ class Samples:
         return sampled >= since and abs(speed) < self._limits.config.standstill
 
     def staleness(self, stale: Reason, now: int) -> Staleness:
-        """Details of the stale sensor behind the reason ``stale``; with several shafts, of the oldest sample."""
+        """Details of the stale sensor behind ``stale``; with several shafts, of the oldest sample."""
         samples: tuple[Message | None, ...] = {
             Reason.SCAN_STALE: (self.scan,),
             Reason.ATTITUDE_STALE: (self.attitude,),
@@ -282,5 +282,5 @@ class Samples:
 
 
 def age(message: Message | None, now: int) -> float | None:
-    """Age of a message, s; None without one."""
+    """Age of a message, s; None without a message."""
     return None if message is None else (now - message.received) / SECOND

@@ -1,4 +1,4 @@
-"""What earlier scans saw around the body, for motions towards where the lidar does not look."""
+"""Memory of earlier scans around the body, for motions out of the lidar's field of view."""
 
 import math
 from collections import deque
@@ -18,29 +18,29 @@ from monstertruck_schemas.base import position_deviation
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 
 DRIFT: Final = 0.03
-"""Ground this near to where the body stood counts as free, m: the error of dead reckoning; less by as much as the
-pose's standard deviation has grown since, beyond the padding of the footprint. Of a moving body it does not: its tail
-would swing further with each scan."""
+"""Ground this near to a place where the body stood counts as free, m: the error of dead reckoning. The distance shrinks
+by the part of the growth of the pose's standard deviation since then that exceeds the padding of the footprint. A
+moving body has no such margin: its tail would swing further with each scan."""
 STANDING: Final = 0.001
-"""Distance travelled between two scans by a body that stands, m: rounding of its velocity."""
+"""Distance travelled between two scans below which the body stands, m: rounding of its velocity."""
 MAP_SIZE: Final = 64
 MAP_CELL: Final = 0.05
-"""Cells on each side of a survey, and their size, m: what a truck covers in reverse until it has seen more."""
+"""Cells along each side of a survey, and cell size, m: the ground a truck covers in reverse until it has seen more."""
 ELSEWHERE: Final = 0.3
-"""Share of the beams with a range that differ so once a robot was carried; people who pass change fewer."""
+"""Fraction of the beams with a range that must change to show that the robot was carried; passers-by change fewer."""
 
 
 class Beams(NamedTuple):
-    """How far a sensor sees free ground around itself."""
+    """Free ground around a sensor, by beam."""
 
     stamp: int
-    """Ns."""
+    """Time of measurement, ns."""
     start: float
     """Angle of the first beam, rad."""
     step: float
-    """Angle from a beam to the next, rad, negative clockwise."""
+    """Angle between adjacent beams, rad, negative clockwise."""
     free: Array
-    """Free distance along every beam, shape (n,), m; 0 = not known."""
+    """Free distance along every beam, shape (n,), m; 0 if unknown."""
 
     @classmethod
     def of(cls, scan: LaserScan) -> Self:
@@ -51,21 +51,21 @@ class Beams(NamedTuple):
 
 
 class _Taken(NamedTuple):
-    """A scan or a ping, and where it was taken."""
+    """A scan or ping, with the pose where it was taken."""
 
     beams: Beams
     pose: Pose2
-    """Of base, in the frame of the memory."""
+    """Pose of base, in the frame of the memory."""
     sensor: Pose2
     """Pose of the lidar or sonar, in the frame of the memory."""
     travelled: float
-    """m."""
+    """Distance travelled before it was taken, m."""
     points: Array
-    """Its returns near the body in the frame of the memory, shape (n, 2), m."""
+    """Returns near the body, in the frame of the memory, shape (n, 2), m."""
     free: Array
-    """Free distance of every beam, m; padded with a 0 before the first and after the last."""
+    """Free distance along every beam, m; padded with a 0 before the first and after the last beam."""
     variance: float
-    """Of the pose in odometry when it was taken, m^2."""
+    """Variance of the pose in odometry when it was taken, m^2."""
     beside: float = DRIFT
     """Ground this near to the body counts as free, m."""
 
@@ -74,30 +74,30 @@ class _Heard(NamedTuple):
     """Pings of one sonar."""
 
     views: deque[_Taken]
-    """Those kept to know which ground is free."""
+    """Pings kept as views of free ground."""
     rounds: deque[_Taken]
-    """The newest."""
+    """Latest pings, used as obstacles."""
 
 
 class GroundSurvey(NamedTuple):
-    """Which ground around a body counts as seen, and for how long."""
+    """Map of the seen ground around a body, with the age of each view."""
 
     stamp: int
-    """Of the scan whose base is its frame, ns."""
+    """Stamp of the scan whose base is the frame of the map, ns."""
     ages: NDArray[np.int8]
-    """Shape (MAP_SIZE, MAP_SIZE), row 0 at the lowest y, the middle at base: age of the newest view in percent of the
-    age up to which views count; -1 = not seen."""
+    """Age of the latest view, in percent of the maximum age of views; -1 if not seen. Shape (MAP_SIZE, MAP_SIZE), row 0
+    at the lowest y, base in the middle."""
 
 
 class ScanMemory:
-    """What earlier scans saw around the body, in a frame in which the wheels' dead reckoning gives its pose.
+    """Memory of earlier scans around the body, in the frame of the wheels' dead reckoning.
 
     Args:
         footprint: the body's outline.
         mount: pose of the lidar in base, m, m, rad.
-        distance: travelled distance for which points are remembered, m.
-        time: age up to which scans are remembered, s.
-        deviation: growth of the pose's standard deviation up to which scans are remembered, m.
+        distance: distance travelled before points are forgotten, m.
+        time: age above which scans are forgotten, s.
+        deviation: growth of the pose's standard deviation above which scans are forgotten, m.
     """
 
     def __init__(
@@ -110,14 +110,14 @@ class ScanMemory:
         self._variance_kept = deviation**2
         self._variance = 0.0
         self._rested: LaserScan | None = None
-        """First scan since the robot was disarmed or carried; None = it is armed."""
+        """First scan since the robot was disarmed or carried; None while it is armed."""
         self.forget()
 
     def forget(self) -> None:
-        """Start again: it is not known how the body has moved."""
+        """Forget everything, because the motion of the body is unknown."""
         self._pose: Pose2 = (0.0, 0.0, 0.0)
         self._travelled = 0.0
-        poses_kept = 64  # ticks whose pose is kept, to place a scan where it was taken
+        poses_kept = 64  # number of ticks whose pose is kept, to place a scan where it was taken
         self._ticks: deque[tuple[int, Pose2, float]] = deque(maxlen=poses_kept)
         self._newest: _Taken | None = None
         self._taken: deque[_Taken] = deque(maxlen=20)
@@ -126,7 +126,7 @@ class ScanMemory:
         self._points = np.empty((0, 2))
 
     def move(self, now: int, twist: Twist2, dt: float) -> None:
-        """The body moved with ``twist``, m/s and rad/s, for the ``dt`` s until ``now``, ns."""
+        """Move the body with ``twist`` (m/s, rad/s) for the ``dt`` s before ``now`` (ns)."""
         if twist != STILL:
             self._pose = integrate(self._pose, *twist, dt)
             self._travelled += self._footprint.corner_speed(twist) * dt
@@ -134,15 +134,16 @@ class ScanMemory:
 
     def doubt(self, covariance: Array) -> None:
         """Take the covariance of the pose in odometry, row-major of (x, y, yaw), shape (9,), m^2, m rad, rad^2."""
-        # Distance at which an error of the heading displaces remembered ground, m: a truck's length and what it stops
-        # in.
+        # Lever arm of a heading error that displaces remembered ground, m: the length of a truck plus its stopping
+        # distance.
         lever = 1.0
         self._variance = position_deviation(covariance) ** 2 + lever**2 * float(covariance[8])
 
     def rest(self, scan: LaserScan | None) -> None:
-        """Take a scan of a robot whose wheels stand and that may be carried; forget everything once it was.
+        """Take a scan of a robot whose wheels stand and that may be carried; forget everything once it was carried.
 
-        None: it is armed, and nobody carries it.
+        Args:
+            scan: latest scan; None while the robot is armed, and so not carried.
         """
         if scan is None or self._rested is None:
             self._rested = scan
@@ -155,14 +156,14 @@ class ScanMemory:
 
         Args:
             scan: the revolution.
-            points: its returns near the body in base, shape (n, 2), m.
+            points: returns of the scan near the body, in base, shape (n, 2), m.
         """
-        spacing = 0.02  # distance between remembered points along the line of the beams, m: less than their drift
+        spacing = 0.02  # distance between remembered points along the sequence of beams, m: less than their drift
         self._newest = self._take(Beams.of(scan), spaced(points, spacing), self._mount)
         travelled = self._newest.travelled
-        # What a body that stands sees does not age; what its first scan there saw may be out of sight since.
+        # The view of a standing body does not age; points of its first scan there may be out of sight by now.
         stood = [travelled - scan.travelled < STANDING for scan in list(self._taken)[-2:]]
-        memory_step = 0.1  # travelled distance between two remembered scans, m
+        memory_step = 0.1  # distance travelled between two remembered scans, m
         if stood == [True, True]:
             self._taken[-1] = self._newest
         elif stood[-1:] == [True] or not stood or travelled - self._taken[-1].travelled >= memory_step:
@@ -174,15 +175,15 @@ class ScanMemory:
         """Take an answer of a sonar.
 
         Args:
-            sonar: its name.
-            mount: its pose in base, m, m, rad.
-            beams: across its cone.
-            arc: where the echo may come from, in base, shape (n, 2), m.
+            sonar: name of the sonar.
+            mount: pose of the sonar in base, m, m, rad.
+            beams: free distance across the cone.
+            arc: possible origins of the echo in base, shape (n, 2), m.
         """
         # Maximum number of views kept per sonar: 2.1 m of travel, longer than a cone needs to become as wide as the
         # body.
         sonar_views = 8
-        rounds = 2  # number of newest echoes per sonar that count as obstacles: a single one may be reflected away
+        rounds = 2  # number of latest echoes per sonar used as obstacles: a single echo may be reflected away
         heard = self._heard.setdefault(sonar, _Heard(deque(maxlen=sonar_views), deque(maxlen=rounds)))
         taken = self._take(beams, arc, mount)
         heard.rounds.append(taken)
@@ -194,7 +195,7 @@ class ScanMemory:
         self._heard.pop(sonar, None)
 
     def _take(self, beams: Beams, points: Array, mount: Pose2) -> _Taken:
-        """Place a view of the sensor at ``mount`` and its points (n, 2) in base, m, at the pose of its stamp."""
+        """Place a view of the sensor at ``mount``, with its points (n, 2) in base (m), at the pose of its stamp."""
         present = beams.stamp, self._pose, self._travelled
         _, pose, travelled = min(self._ticks, key=lambda tick: abs(tick[0] - beams.stamp), default=present)
         there = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
@@ -202,7 +203,7 @@ class ScanMemory:
         return _Taken(beams, pose, tuple(sensor), travelled, there, np.pad(beams.free, 1), self._variance)
 
     def points(self) -> Array:
-        """Remembered points where the newest scan does not look, in base as of that scan, shape (n, 2), m."""
+        """Remembered points outside the view of the latest scan, in base at that scan, shape (n, 2), m."""
         return self._points
 
     def _hidden(self, newest: _Taken) -> Array:
@@ -212,7 +213,7 @@ class ScanMemory:
         there = np.concatenate((newest.points[:0], *kept))
         beams = _beams((newest,), there)[0][0]
         count, step = len(newest.beams.free), newest.beams.step
-        # Remembered points this near to the edge of the lidar's field are kept, rad: the error of the dead-reckoned
+        # Remembered points this near to the edge of the field of view are kept, rad: the error of the dead-reckoned
         # yaw.
         field_edge = 0.1
         edge = 0.0 if is_full_turn(count, step) else field_edge / abs(step)
@@ -221,18 +222,18 @@ class ScanMemory:
         return points[~on_body(self._footprint, points, 0.0)]
 
     def echoes(self) -> Array:
-        """Points of the newest arcs of all sonars, in base as of the newest scan, shape (n, 2), m."""
+        """Points of the latest arcs of all sonars, in base at the latest scan, shape (n, 2), m."""
         if self._newest is None or not self._heard:
             return np.empty((0, 2))
         arcs = np.concatenate([ping.points for heard in self._heard.values() for ping in heard.rounds])
         return points_relative(arcs, self._newest.pose)
 
     def _seeing(self, newest: _Taken) -> list[_Taken]:
-        """Scans and pings that count as views of the ground, the oldest first, ``newest`` last.
+        """Valid views of the ground by scans and pings, oldest first, ``newest`` last.
 
-        While the body stands the newest scan is one of those kept, too.
+        While the body stands, the latest scan is also among the kept scans.
         """
-        edge = 1e-6  # ground this near to a moving body is its edge, m
+        edge = 1e-6  # ground this near to a moving body counts as its edge, m
         views = (*self._views, *(view for heard in self._heard.values() for view in heard.views))
         return [*sorted(self._fresh(views, newest), key=lambda view: view.beams.stamp), newest._replace(beside=edge)]
 
@@ -245,7 +246,7 @@ class ScanMemory:
         ]
 
     def seen(self, points: Array) -> NDArray[np.bool_]:
-        """Which of the points (n, 2), in base as of the newest scan, m, are seen free or under the body."""
+        """Return whether each point (n, 2), in base at the latest scan (m), was seen free or is under the body."""
         newest = self._newest
         if newest is None:
             return on_body(self._footprint, points, DRIFT)
@@ -253,7 +254,7 @@ class ScanMemory:
         return np.asarray(self._free(self._seeing(newest), there).any(axis=0))
 
     def survey(self) -> Generator[None, None, GroundSurvey | None]:
-        """Ground around the body that counts as seen, in steps that take well below a millisecond each."""
+        """Map the seen ground around the body, in steps of well below 1 ms each."""
         newest = self._newest
         if newest is None:
             return None
@@ -268,7 +269,7 @@ class ScanMemory:
         return GroundSurvey(newest.beams.stamp, ages.reshape(MAP_SIZE, MAP_SIZE))
 
     def _free(self, taken: Sequence[_Taken], there: Array) -> NDArray[np.bool_]:
-        """Which points (n, 2) of the memory's frame each scan saw free, or the body stood on there; shape (m, n)."""
+        """Whether each scan saw each point (n, 2) of the memory's frame free or under the body; shape (m, n)."""
         beams, distances = _beams(taken, there)
         ends = np.cumsum([len(scan.free) for scan in taken])[:, None]
         starts = np.concatenate(([[0]], ends[:-1]))
@@ -283,7 +284,7 @@ class ScanMemory:
 
 
 def elsewhere(before: LaserScan, now: LaserScan) -> bool:
-    """Whether two scans of a robot whose wheels stood were taken in different places."""
+    """Whether two scans were taken in different places although the wheels stood."""
     if len(before.ranges) != len(now.ranges):
         now = _towards(before, now)
     measured = [scan.codes == VALID_BEAM for scan in (before, now)]
@@ -292,13 +293,13 @@ def elsewhere(before: LaserScan, now: LaserScan) -> bool:
     )
     known = [valid | (scan.codes <= NO_ECHO) for valid, scan in zip(measured, (before, now), strict=True)]
     compared = known[0] & known[1] & (measured[0] | measured[1])
-    changed = 0.1  # difference of a beam from that of an earlier scan that neither noise nor rounding makes, m
+    changed = 0.1  # minimum change of a beam between two scans that is neither noise nor rounding, m
     differ = compared & (np.abs(first - second) > changed)
     return bool(np.count_nonzero(differ) > ELSEWHERE * np.count_nonzero(compared))
 
 
 def _towards(like: LaserScan, scan: LaserScan) -> LaserScan:
-    """The beams of ``scan`` nearest to those of ``like``; without a code that says anything where it has none."""
+    """Resample ``scan`` at the bearings of ``like``; bearings without a beam get a code that carries no information."""
     count, step = len(scan.ranges), scan.angle_increment
     if not count:
         return like.model_copy(update={"codes": np.full(len(like.codes), NO_ECHO + 1, np.uint8)})
@@ -310,15 +311,15 @@ def _towards(like: LaserScan, scan: LaserScan) -> LaserScan:
 
 
 def spaced(points: Array, spacing: float) -> Array:
-    """Of points (n, 2) in the order of the beams, one on every ``spacing`` of the line along them, m."""
+    """Thin points (n, 2) in beam order to one per ``spacing`` (m) along the line through them."""
     along = np.cumsum(np.hypot(*np.diff(points, axis=0, prepend=points[:1]).T))
     return points[np.diff(along // spacing, prepend=-1.0) > 0]
 
 
 def _keep(views: deque[_Taken], taken: _Taken) -> None:
-    """Add a scan to those kept to know which ground is free, or have it replace that of a body that stood."""
-    # Distance (m) plus turn (rad) between two of the scans that are kept to know which ground is free: each sees
-    # further than a truck's length in half of all directions.
+    """Keep a scan as a view of free ground, or replace the last view if the body has stood since."""
+    # Distance (m) plus turn (rad) between two kept views of free ground: each view reaches further than the
+    # length of a truck in half of all directions.
     view_step = 0.3
     if views and taken.travelled - views[-1].travelled < STANDING:
         views[-1] = taken
@@ -327,19 +328,19 @@ def _keep(views: deque[_Taken], taken: _Taken) -> None:
 
 
 def _apart(one: Pose2, other: Pose2) -> float:
-    """Distance (m) and turn (rad) together."""
+    """Sum of distance (m) and turn (rad)."""
     return math.dist(one[:2], other[:2]) + abs(one[2] - other[2])
 
 
 def _beams(scans: Sequence[_Taken], points: Array) -> tuple[NDArray[np.intp], Array]:
-    """Number of every scan's beam towards each point, beyond the scan's where it has none; distance, m.
+    """Find each scan's beam towards each point, and the distance of the point.
 
     Args:
-        scans: m of them.
-        points: in the frame of the memory, shape (n, 2), m.
+        scans: m scans.
+        points: points in the frame of the memory, shape (n, 2), m.
 
     Returns:
-        Two of shape (m, n).
+        Beam numbers (out of the scan's range where it has no beam) and distances (m), both of shape (m, n).
     """
     x, y = relative(points, np.array([scan.sensor for scan in scans]))
     first = np.array([scan.beams.start for scan in scans])

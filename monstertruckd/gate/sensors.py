@@ -1,4 +1,4 @@
-"""Checks of the sensors: silent devices, failed services, faults of the drive, tilt and battery."""
+"""Sensor checks: silent devices, failed services, drive faults, tilt and battery."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
@@ -15,11 +15,11 @@ from monstertruckd.gate.motion import Course
 from monstertruckd.gate.samples import STALE_SENSORS, age
 
 DRIVE_LOSSES: Final = (Reason.DEVICE_RESTARTED, Reason.DEVICE_STOPPED)
-"""Why a drive's service may have ended that makes arming necessary, however short the loss."""
+"""Reasons for the loss of a drive's service that require arming again, however short the loss."""
 
 
 class TickCheck(Check):
-    """A pause between two ticks stops the robot until the ticks have been punctual for a while."""
+    """Stops the robot after a pause between two ticks, until the ticks have been punctual for ``stall_dwell``."""
 
     reasons = (Reason.TICK_STALLED,)
 
@@ -27,7 +27,7 @@ class TickCheck(Check):
         super().__init__(view)
         self._stalled_until = 0
         self._pause = 0.0
-        """Newest excessive pause between two ticks, s."""
+        """Latest excessive pause between two ticks, s."""
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
         """Measure the time between ticks."""
@@ -36,31 +36,31 @@ class TickCheck(Check):
             self._pause = seen.elapsed / SECOND
 
     def reason(self, now: int) -> Iterator[Reason]:
-        """A recent pause."""
+        """Report a recent pause."""
         if now < self._stalled_until:
             yield Reason.TICK_STALLED
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """The pause."""
+        """Duration of the pause."""
         yield Measurement(name="pause", value=self._pause, unit="s", limit=self.view.config.tick_stall)
 
 
 class DriveFaultCheck(Check):
-    """A drive controller reports a fault, or its service has ended for a reason that makes arming necessary."""
+    """Stops the robot on a fault of a drive controller, or a loss of its service that requires arming again."""
 
     reasons = (Reason.DRIVE_FAULT, *DRIVE_LOSSES)
 
     def __init__(self, view: GateView) -> None:
         super().__init__(view)
         self._losses: set[Reason] = set()
-        """Losses for which a drive's service is down."""
+        """Reasons of drive services that are down."""
         self._reported: set[Reason] = set()
-        """Losses reported since the newest tick."""
+        """Losses reported since the latest tick."""
         self._judged: set[Reason] = set()
-        """Losses reported before it, which that tick has to judge even if they are over."""
+        """Losses reported before the latest tick; this tick must judge them even if they are over."""
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take what services report of drives."""
+        """Take health reports of the drive services."""
         if isinstance(seen, Tick):
             self._judged, self._reported = self._reported, set()
         elif isinstance(seen, HealthTable):
@@ -72,14 +72,14 @@ class DriveFaultCheck(Check):
             self._reported |= self._losses
 
     def reason(self, now: int) -> Iterator[Reason]:
-        """Faults and losses."""
+        """Report faults and losses."""
         if self.view.samples.faults:
             yield Reason.DRIVE_FAULT
         losses = self._losses | self._reported | self._judged
         yield from (reason for reason in DRIVE_LOSSES if reason in losses)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """Fault codes."""
+        """Fault codes of the drives."""
         if reason is Reason.DRIVE_FAULT:
             for drive in self.view.samples.faults:
                 code = drive.fault_code
@@ -87,7 +87,7 @@ class DriveFaultCheck(Check):
 
 
 class ServiceCheck(Check):
-    """A service that the robot needs has failed."""
+    """Stops the robot when a required service has failed."""
 
     reasons = (Reason.SERVICE_FAILED,)
 
@@ -96,34 +96,34 @@ class ServiceCheck(Check):
         self._failed: tuple[str, ...] = ()
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
-        """Take the services' health."""
+        """Take the health of the services."""
         if isinstance(seen, HealthTable):
             tolerated = self.view.config.tolerated_failures
             failed = (service.name for service in seen.services if service.state is ServiceState.FAILED)
             self._failed = tuple(name for name in failed if name not in tolerated)
 
     def reason(self, now: int) -> Iterator[Reason]:
-        """Failed services."""
+        """Report failed services."""
         if self._failed:
             yield Reason.SERVICE_FAILED
 
     def text(self, reason: Reason) -> str:
-        """Names the services."""
+        """Reason with the names of the failed services."""
         return f"{reason.text}: {', '.join(self._failed)}"
 
     def describe(self, reason: Reason, now: int, since: int) -> Iterator[Cause]:
-        """One cause for each failed service."""
+        """One cause per failed service."""
         for name in self._failed:
             yield Cause(reason=reason, source=name, since=since, text=f"{reason.text}: {name}")
 
 
 class StalenessCheck(Check):
-    """A critical sensor has no fresh valid sample."""
+    """Stops the robot when a critical sensor has no fresh valid sample."""
 
     reasons = tuple(STALE_SENSORS)
 
     def reason(self, now: int) -> Iterator[Reason]:
-        """Stale critical sensors, worst first."""
+        """Report stale critical sensors, worst first."""
         view = self.view
         fresh = view.samples.fresh(now)
         for reason, limit in view.samples.sensor_limits().items():
@@ -132,7 +132,7 @@ class StalenessCheck(Check):
                 yield reason
 
     def describe(self, reason: Reason, now: int, since: int) -> Iterator[Cause]:
-        """The silent sensor, with the age of its newest valid sample."""
+        """The silent sensor, with the age of its latest valid sample."""
         staleness = self.view.samples.staleness(reason, now)
         figures = [Measurement(name="age", value=staleness.age, unit="s", limit=staleness.limit)]
         if staleness.refused is not None:
@@ -147,7 +147,7 @@ class StalenessCheck(Check):
 
 
 class TiltCheck(Check):
-    """A tilted robot goes slowly or stops; both limits have a hysteresis."""
+    """Slows or stops a tilted robot; both limits have a hysteresis."""
 
     reasons = (Reason.TILT_STOP, Reason.TILT_SLOW)
 
@@ -164,27 +164,27 @@ class TiltCheck(Check):
             self._stop = tilt >= limits.stop - (limits.hysteresis if self._stop else 0.0)
 
     def reason(self, now: int) -> Iterator[Reason]:
-        """Too much tilt."""
+        """Report a tilt above ``tilt.stop``."""
         if self._stop and self.view.samples.attitude_fresh(now):
             yield Reason.TILT_STOP
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Much tilt."""
+        """Limit the speed above ``tilt.slow``."""
         if self._slow and not self._stop and self.view.samples.attitude_fresh(now):
             yield PaceLimit(Reason.TILT_SLOW, self.view.config.tilt.slow_speed)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """The tilt."""
+        """Measured tilt."""
         samples, limit = self.view.samples, self.view.config.tilt.stop
         yield Measurement(name="tilt", value=samples.tilt, unit="rad", limit=limit, age=age(samples.attitude, now))
 
 
 class BatteryCheck(Check):
-    """A low battery, or a silent sensor of it, slows the robot; a critical battery stops it.
+    """Slows the robot on a low battery or a stale battery voltage; stops it on a critical battery.
 
     Args:
-        view: what it may look at.
-        measured: something is there to measure the battery.
+        view: read access to the gate's state.
+        measured: whether a device measures the battery.
     """
 
     reasons = (Reason.BATTERY_CRITICAL, Reason.BATTERY_LOW, Reason.BATTERY_STALE)
@@ -194,12 +194,12 @@ class BatteryCheck(Check):
         self._measured = measured
 
     def reason(self, now: int) -> Iterator[Reason]:
-        """A critical battery stays so when its sensor becomes stale."""
+        """Report a critical battery, even after its sensor has become stale."""
         if (battery := self.view.samples.battery) is not None and battery.level is BatteryLevel.CRITICAL:
             yield Reason.BATTERY_CRITICAL
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """A low battery, or one whose voltage is not known any longer."""
+        """Limit the speed on a low battery or a stale voltage."""
         config, battery = self.view.config, self.view.samples.battery
         if battery is not None and battery.level is BatteryLevel.LOW:
             yield PaceLimit(Reason.BATTERY_LOW, config.battery_low_speed)
@@ -208,6 +208,6 @@ class BatteryCheck(Check):
             yield PaceLimit(Reason.BATTERY_STALE, config.battery_low_speed)
 
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
-        """The voltage."""
+        """Battery voltage."""
         if (battery := self.view.samples.battery) is not None:
             yield Measurement(name="voltage", value=battery.voltage, unit="V", age=age(battery, now))

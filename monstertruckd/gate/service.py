@@ -1,4 +1,4 @@
-"""The safety gate as a service: feeds ``Gate``, ticks it on an absolute schedule, writes its commands."""
+"""The safety gate as a service: feeds ``Gate``, ticks it on an absolute schedule and publishes its commands."""
 
 import asyncio
 import logging
@@ -36,14 +36,14 @@ T = TypeVar("T")
 
 
 SURVEY_PERIOD: Final = SECOND
-"""``state/seen`` is published this often, or as soon as it is complete, ns."""
+"""Minimum period of ``state/seen``, ns; longer if a survey takes longer."""
 
 LATCH_RETRY: Final = 1.0
-"""Seconds between two tries to store the latch, or its mark."""
+"""Time between two attempts to store the latch or its mark, s."""
 
 
 METER_DEPTH: Final = 1 << 12
-"""Ticks kept by ``TickMeter``: 82 s at 50 Hz."""
+"""Number of ticks kept by ``TickMeter``: 82 s at 50 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Lateness:
 
 
 class TickMeter:
-    """Lateness of the newest ticks; the count and the maximum are over all ticks."""
+    """Lateness of the latest ticks; count and maximum cover all ticks."""
 
     def __init__(self, depth: int = METER_DEPTH) -> None:
         self._ring = np.zeros(depth)
@@ -65,13 +65,13 @@ class TickMeter:
         self._max = 0.0
 
     def record(self, lateness: float) -> None:
-        """Add one tick, seconds late."""
+        """Add the lateness of one tick (s)."""
         self._ring[self.ticks % len(self._ring)] = lateness
         self.ticks += 1
         self._max = max(self._max, lateness)
 
     def lateness(self) -> Lateness:
-        """Percentiles over the newest ticks, maximum over all."""
+        """Return percentiles over the latest ticks, and the maximum over all ticks."""
         if self.ticks == 0:
             return Lateness(0, 0.0, 0.0, 0.0)
         known = self._ring[: self.ticks]
@@ -82,7 +82,7 @@ class TickMeter:
 
 @dataclass(frozen=True, slots=True)
 class GateOutputs:
-    """Topics the gate writes; it holds the only write ends of the first two."""
+    """Topics written by the gate, the only writer of the first two."""
 
     drives: tuple[Publisher[DriveCommand], ...]
     steering: Publisher[SteeringCommand]
@@ -100,12 +100,12 @@ class GateService:
         clock: time.
         inputs: subscriptions.
         outputs: publishers.
-        events: where events go.
-        latch: keeps the emergency stop over restarts.
-        black_box: called with every stop as it happens; returns the file that will hold the minute before, if any.
-        offload: runs the storing of the latch, which blocks.
-        weakened: settings less safe than the defaults, shown to everybody.
-        cut_ports: takes the power from the drives' ports.
+        events: sink of events.
+        latch: keeps the emergency stop across restarts.
+        black_box: called at every stop; returns the file that will hold the preceding minute, if any.
+        offload: runs blocking writes of the latch.
+        weakened: settings less safe than the defaults, shown to every client.
+        cut_ports: switches off the power of the drives' ports.
     """
 
     name = ServiceName.GATE.value
@@ -135,15 +135,15 @@ class GateService:
         self._events = events
         self._black_box = black_box
         self._boxed: tuple[int, str | None] = (0, None)
-        """Number of the newest stop, and its black box."""
+        """Number of the latest stop, and its black box."""
         self._latch = latch
         self._offload = offload
         self._latched: bool | None = latch.stored()
-        """State on the disk; None = not known, because it is being written or could not be written or read."""
+        """State on the disk; None if unknown: a write is in progress or failed, or it cannot be read."""
         self._marked: bool | None = None
-        """The mark of the latch; None = not written in this run."""
+        """State of the latch's mark; None if not written in this run."""
         self._mark_due = 0
-        """No try to write the mark before this, ns."""
+        """Time of the next attempt to write the mark, ns."""
         self._latch_differs = asyncio.Event()
         self._meter = TickMeter()
         self._broken = asyncio.Event()
@@ -151,13 +151,13 @@ class GateService:
         self._published: tuple[object, ...] = ()
         self._published_at = 0
         self._survey: Generator[None, None, GroundSurvey | None] | None = None
-        """In the making, one step a tick."""
+        """Survey in progress, one step per tick; None if no survey is in progress."""
         self._surveyed = -SURVEY_PERIOD
-        """When it began, ns."""
+        """Start of the latest survey, ns."""
         self._feeds = [_Feed(topic, subscription, gate.observe) for topic, subscription in inputs.items()]
 
     def configure(self, config: GateConfig, weakened: tuple[str, ...]) -> None:
-        """Take other limits, which count from the next tick on; see ``Gate.configure``."""
+        """Replace the limits from the next tick on; see ``Gate.configure``."""
         self._guarded(None, self._gate.configure, config)
         added, self._weakened = set(weakened) - set(self._weakened), weakened
         for setting in sorted(added):
@@ -166,21 +166,21 @@ class GateService:
 
     @property
     def mode(self) -> GateMode:
-        """Present mode."""
+        """Current mode."""
         return self._gate.mode
 
     def ticks(self) -> int:
-        """Ticks so far, for the watchdog."""
+        """Return the number of ticks so far, for the watchdog."""
         return self._meter.ticks
 
     def lateness(self) -> Lateness:
-        """Punctuality of the tick."""
+        """Return the lateness of the ticks."""
         return self._meter.lateness()
 
     def control(self, order: ControlRequest) -> Decision:
         """Carry out an order at once; see ``Gate.control``.
 
-        An emergency stop does not wait for the next tick: it is commanded, and marked, before it is answered.
+        An emergency stop does not wait for the next tick: it is commanded and marked before the answer.
         """
         bug = Decision(Reason.INTERNAL, Reason.INTERNAL.text)
         before = self.mode
@@ -188,20 +188,20 @@ class GateService:
         if before is not GateMode.ESTOPPED and self.mode is GateMode.ESTOPPED:
             self._guarded(None, self._tick)
         elif decision.reason is Reason.OK and order.order not in STARTING:
-            self._published = ()  # orders that start are refused until their sender knows of this one
+            self._published = ()  # starting orders are refused until their sender knows of this order
         self._mark_latch()
         return decision
 
     def request(self, request: DriveRequest) -> Reason:
-        """Take a drive request from outside, at once; see ``Gate.request``."""
+        """Take an external drive request at once; see ``Gate.request``."""
         return self._guarded(Reason.INTERNAL, self._gate.request, request, self._clock.now())
 
     def planner_request(self, request: DriveRequest) -> Reason:
-        """Take a drive request of the robot's own planners, at once; see ``Gate.planner_request``."""
+        """Take a drive request of the robot's planners at once; see ``Gate.planner_request``."""
         return self._guarded(Reason.INTERNAL, self._gate.planner_request, request, self._clock.now())
 
     def observe_event(self, event: Event) -> None:
-        """Take any service's event at once; see ``Gate.observe``."""
+        """Take an event of any service at once; see ``Gate.observe``."""
         self._guarded(None, self._gate.observe, event, EVENT)
 
     def observe_health(self, table: HealthTable) -> None:
@@ -209,11 +209,11 @@ class GateService:
         self._guarded(None, self._gate.observe, table, HEALTH)
 
     def shut_down(self) -> None:
-        """Command neutral from now on; the ticks go on until ``run`` is cancelled."""
+        """Command neutral from now on; ticks continue until ``run`` is cancelled."""
         self._publish(self._gate.neutral(self._clock.now()), self._clock.now())
 
     def _guarded(self, default: T, take: Callable[..., T], *arguments: object) -> T:
-        """The result of ``take``; a bug in it ends this service, not the sender of the message."""
+        """Return the result of ``take``; a bug in it ends this service, not the sender of the message."""
         try:
             return take(*arguments)
         except Exception as bug:
@@ -228,9 +228,9 @@ class GateService:
         raise self._bug
 
     async def run(self, ready: Ready) -> None:
-        """Tick until cancelled; the last commands are neutral, whatever ends it, and the latch is on the disk.
+        """Tick until cancelled; whatever ends it, command neutral last and store the latch on the disk.
 
-        Orders are taken after it as well, until ``close``.
+        Orders are still accepted afterwards, until ``close``.
         """
         for setting in self._weakened:
             log.warning("%s: %s", Reason.WEAKENED.text, setting)
@@ -248,7 +248,7 @@ class GateService:
             await self.store_latch()
 
     async def _cut(self) -> None:
-        """Cut the ports each time that nothing else stops the robot."""
+        """Switch off the ports whenever no other step stops the robot."""
         while True:
             await self._nothing_helps.wait()
             self._nothing_helps.clear()
@@ -256,7 +256,7 @@ class GateService:
                 await self._cut_ports()
 
     async def close(self) -> None:
-        """Store the latch once more and remove its mark, when no more orders can arrive; does not raise ``OSError``."""
+        """Store the latch and remove its mark once no more orders can arrive; does not raise ``OSError``."""
         if await self.store_latch():
             self._latch.close()
 
@@ -276,7 +276,7 @@ class GateService:
         self._continue_survey(now)
 
     def _continue_survey(self, now: int) -> None:
-        """Compute the ground that was seen one step further, and publish it at the end."""
+        """Advance the survey of seen ground by one step, and publish it at the end."""
         if self._survey is None:
             if now - self._surveyed >= SURVEY_PERIOD:
                 self._survey, self._surveyed = self._gate.survey(), now
@@ -367,8 +367,8 @@ class GateService:
     def _mark_latch(self) -> None:
         """Mark an emergency stop before it is reported; clear the mark once the file on the disk agrees.
 
-        The thread that writes the file never touches the mark: a stop that is ordered while the file of the one before
-        is removed keeps its mark.
+        The thread that writes the file never touches the mark. So an emergency stop ordered while the file of the
+        previous one is being removed keeps its mark.
         """
         marked = self.mode is GateMode.ESTOPPED and self._latched is not True
         now = self._clock.now()
@@ -391,17 +391,17 @@ class GateService:
                 self._latch_differs.set()
 
     async def store_latch(self) -> bool:
-        """Write the latch file if it differs from the gate's mode, even if cancelled; False if writing failed."""
+        """Write the latch file if it differs from the gate's mode, even if cancelled; return False on failure."""
         wanted = self._gate.mode is GateMode.ESTOPPED
         if wanted == self._latched:
             return True
-        before, self._latched = self._latched, None  # stays so if cancelled: then it is stored once more
+        before, self._latched = self._latched, None  # remains None if cancelled, so that the file is stored once more
         try:
             await self._offload(partial(self._latch.store, wanted))
         except OSError as error:
             self._report(error)
             if await self._offload(self._latch.stored) is before:
-                self._latched = before  # else the file has changed, and only its folder is not synced
+                self._latched = before  # otherwise the file has changed, but its folder is not synced
             return False
         self._latched = wanted
         return True
@@ -412,7 +412,7 @@ class GateService:
 
 
 class _Feed:
-    """Passes each message of a latest-only subscription on once."""
+    """Forwards each message of a latest-only subscription once."""
 
     def __init__(
         self, topic: Topic[Any], subscription: Subscription[Any], observe: Callable[[Any, Topic[Any]], None]
@@ -430,20 +430,20 @@ class _Feed:
 
 
 STANDSTILL: Final = 4.0
-"""Seconds for the truck to come to rest."""
+"""Timeout for the truck to come to rest, s."""
 
 GRADUAL: Final = frozenset({Order.DISARM, Order.STOP})
-"""Orders that end with the truck at rest; the others take effect at once."""
+"""Orders completed when the truck is at rest; other orders take effect at once."""
 
 
 def register_gate_calls(rpc: RpcRegistry, bus: Bus, clock: Clock) -> None:
     """Serve every ``Order`` under its name; the payload is a ``ControlRequest``, the answer a ``GateState``.
 
-    An order is injected on ``req/control``, so that it is recorded and checked like any other; it is answered once it
-    is carried out, or refused with the reason.
+    An order is injected on ``req/control``, so that it is recorded and checked like any other order. The answer follows
+    when the order is carried out, or refused with the reason.
 
     Args:
-        rpc: gets the calls.
+        rpc: registry of the calls.
         bus: carries the orders to the gate.
         clock: time.
     """
@@ -500,7 +500,7 @@ def _is_carried_out(order: Order, state: GateState) -> bool:
 
 
 def _grid(survey: GroundSurvey, now: int, seq: int) -> Grid:
-    """A survey as a message."""
+    """Convert a survey to a message."""
     corner = -MAP_SIZE / 2 * MAP_CELL
     return Grid(
         stamp=survey.stamp,

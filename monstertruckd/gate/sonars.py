@@ -1,14 +1,15 @@
-"""Obstacles by sonars: the swept footprint against arcs, for robots without a lidar.
+"""Sonar obstacle check for robots without a lidar: the swept footprint against arcs.
 
-An echo is somewhere on the arc of its range across the sonar's cone. The rule for the unknown bearing:
+An echo comes from an unknown point on the arc across the sonar's cone at the measured range. Rules for the bearing:
 
 - A sonar whose axis is within ``ALIGNED`` of the direction of travel: the whole arc is an obstacle.
-- Any other sonar: the part within ``gate.sonar.core`` of its axis. The whole arc would block a robot that drives along
-  a wall; an obstacle in the rest of the arc is in the cone of the sonar ahead before the robot reaches it.
-- The newest two rounds of pings are used, as a single echo may be reflected away.
+- Any other sonar: only the part within ``gate.sonar.core`` of its axis is an obstacle. The whole arc would block a
+  robot that drives along a wall; an obstacle in the rest of the arc enters the cone of the sonar ahead before the
+  robot reaches it.
+- The latest two rounds of pings are used, because a single echo may be reflected away.
 
-A sonar that does not answer leaves its cone unknown. One in the direction of travel stops the robot, any other one
-slows it, and so does a direction of travel without a sonar.
+A sonar that does not answer leaves its cone unknown. A silent sonar in the direction of travel stops the robot. Any
+other silent sonar slows it, as does a direction of travel without a sonar.
 """
 
 import math
@@ -32,29 +33,29 @@ from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.motion import Course
 
 ALIGNED: Final = 0.3
-"""Greatest angle between the axis of a sonar and the direction of travel for it to look ahead, rad."""
+"""Maximum angle between the direction of travel and the axis of a sonar that looks ahead, rad."""
 TURNING: Final = 0.3
-"""A motion whose base travels less than this per metre of pace counts as a turn on the spot: no sonar looks ahead."""
+"""Travel of the base per metre of pace below which a motion is a turn on the spot: no sonar looks ahead."""
 
 Place = tuple[float, float, float]
 
 
 class SonarView(NamedTuple):
-    """What the sonars say of a motion."""
+    """Result of the sonars for a motion."""
 
     free: float
-    """Distance that the footprint can travel, m; +inf = no obstacle within reach."""
+    """Distance the footprint can travel, m; +inf without an obstacle within reach."""
     dead: tuple[str, ...]
-    """Sonars that look where the robot goes and do not answer."""
+    """Silent sonars in the direction of travel."""
     unknown: bool
-    """Another sonar does not answer, or none looks where the robot goes."""
+    """Whether another sonar is silent, or no sonar faces the direction of travel."""
 
 
 class SonarGuard:
     """Sweeps the footprint along a motion against the echoes.
 
     Args:
-        limits: the gate's, in force.
+        limits: limits in force.
         footprint: the body's outline.
         mounts: pose (x, y, yaw) of every sonar in base by name, m, m, rad.
     """
@@ -65,26 +66,26 @@ class SonarGuard:
         self._mounts = mounts
         self._rounds: deque[SonarRanges] = deque(maxlen=2)
         self._answered: dict[str, int] = {}
-        """When every sonar answered last, ns."""
+        """Time of the last answer of every sonar, ns."""
         self.view = SonarView(math.inf, (), False)
-        """View of the newest motion that was checked."""
+        """View of the latest checked motion."""
 
     def observe(self, ranges: SonarRanges) -> None:
-        """Take a round of pings; one that is too late is left out."""
+        """Take a round of pings; ignore a late round."""
         if is_late(ranges, self._limits.config):
             return
         self._rounds.append(ranges)
         self._answered |= {sonar.name: ranges.received for sonar in ranges.sonars if sonar.answered}
 
     def fresh(self, now: int) -> bool:
-        """Whether there is a round that is not too old."""
+        """Whether the latest round exists and is fresh."""
         return bool(self._rounds) and now - self._rounds[-1].received <= self._limits.config.sonar.stale_after * SECOND
 
     def look(self, twist: UnitTwist, reach: float, now: int) -> SonarView:
         """Sweep a motion.
 
         Args:
-            twist: of the base.
+            twist: twist of the base.
             reach: distance swept, m.
             now: ns.
         """
@@ -100,11 +101,11 @@ class SonarGuard:
         return self.view
 
     def delay(self, now: int) -> float:
-        """Age of the newest round, s."""
+        """Age of the latest round, s; 0 without a round."""
         return max(now - self._rounds[-1].stamp, 0) / SECOND if self._rounds else 0.0
 
     def _ahead(self, twist: UnitTwist) -> frozenset[str]:
-        """Sonars that look in the direction of travel."""
+        """Sonars that face the direction of travel."""
         if math.hypot(twist[0], twist[1]) < TURNING:
             return frozenset()
         travel = math.atan2(twist[1], twist[0])
@@ -113,7 +114,7 @@ class SonarGuard:
         )
 
     def _points(self, ahead: frozenset[str], now: int) -> Array:
-        """Points of all arcs in base, (n, 2), m."""
+        """Points of all arcs in base, shape (n, 2), m."""
         arcs = [np.empty((0, 2))]
         for ranges in self._rounds:
             if now - ranges.received > self._limits.config.sonar.stale_after * SECOND:
@@ -127,10 +128,10 @@ class SonarGuard:
 
 
 class SonarCheck(Check):
-    """The swept footprint must not meet the echoes of the sonars of a robot without a lidar.
+    """Keeps the swept footprint clear of sonar echoes on a robot without a lidar.
 
     Args:
-        view: what it may look at.
+        view: read access to the gate's state.
         mounts: pose (x, y, yaw) of every sonar in base by name, m, m, rad.
     """
 
@@ -181,12 +182,12 @@ class SonarCheck(Check):
 
 
 def is_late(ranges: SonarRanges, config: GateConfig) -> bool:
-    """Whether a round of pings came too late to count."""
+    """Whether a round of pings arrived too late to be used."""
     return abs(ranges.received - ranges.stamp) > config.max_latency * SECOND
 
 
 def arc(place: Place, distance: float, half: float) -> Array:
-    """Points at ``distance``, m, within ``half``, rad, of a sonar's axis, in base, (n, 2)."""
+    """Points at ``distance`` (m) within ``half`` (rad) of a sonar's axis, in base, shape (n, 2), m."""
     x, y, yaw = place
     count = max(3, math.ceil(2 * half * distance / 0.02) + 1)  # distance between the points of an arc, m
     angles = yaw + np.linspace(-half, half, count)

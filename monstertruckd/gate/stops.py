@@ -1,4 +1,4 @@
-"""Why the truck was stopped: causes with measurements, lost devices behind them, and the numbered log of stops."""
+"""Stop log: numbered stops, their causes with measurements, and the lost devices behind the causes."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ from monstertruckd.gate.arbitration import Source
 from monstertruckd.gate.samples import STALE_SENSORS
 
 HUB_WINDOW: Final = SECOND
-"""A hub's loss is reported once all its devices are gone, at most this long before or after theirs, ns."""
+"""Maximum time between the losses of a hub and of its devices, ns; its loss is reported once all devices are gone."""
 
 HUB_EVENTS: Final = frozenset({Reason.HUB_LOST, Reason.OVER_CURRENT})
-"""Events that explain the loss of every device they name in ``roles``."""
+"""Events that explain the loss of every device listed in their ``roles``."""
 
 
 def lease_cause(source: Source, now: int) -> Cause:
-    """The cause of a stop for the expired lease of ``source``."""
+    """Stop cause for the expired lease of ``source``."""
     request = source.request
     figures = [
         Measurement(
@@ -36,7 +36,7 @@ def lease_cause(source: Source, now: int) -> Cause:
         )
     ]
     if not source.inside and request.gate_stamp is not None:
-        # From the gate state its sender had to the request's arrival: both directions and the sender's own delay.
+        # From the gate state known to the sender to the arrival of the request: both directions and the sender's delay.
         figures.append(Measurement(name="round trip", value=(source.arrived - request.gate_stamp) / SECOND, unit="s"))
     return Cause(
         reason=Reason.LEASE_EXPIRED,
@@ -49,19 +49,19 @@ def lease_cause(source: Source, now: int) -> Cause:
 
 @dataclass(slots=True)
 class _Outage:
-    """A service's newest outage."""
+    """Latest outage of a service."""
 
     first: ServiceHealth
-    """Its first failure: later ones only repeat that the device is still absent."""
+    """First failure; later failures only repeat that the device is still absent."""
     end: int | None = None
-    """When the service was ready again, ns."""
+    """Time when the service was ready again, ns."""
 
 
 class Outages:
-    """Newest outage of each service, and the events that explain outages: lost devices, hubs and links.
+    """Latest outage of each service, and the events that explain outages: lost devices, hubs and links.
 
     Args:
-        services: of the sensors, with the reason their loss gives.
+        services: reason given by the loss of each sensor service, by service name.
     """
 
     def __init__(self, services: Mapping[str, Reason]) -> None:
@@ -71,7 +71,7 @@ class Outages:
         self._link: Event | None = None
 
     def observe(self, message: Message) -> None:
-        """Take the services' health, and events of any service."""
+        """Take a health table, or an event of any service."""
         if isinstance(message, HealthTable):
             self._observe_health(message)
         elif isinstance(message, Event):
@@ -94,11 +94,11 @@ class Outages:
                 self._hubs[role] = event
 
     def explain(self, causes: Sequence[Cause], over: Mapping[Reason, int] = MappingProxyType({})) -> tuple[Cause, ...]:
-        """The given causes, each linked to what was behind it; a cause shared by several comes once.
+        """Link each cause to the cause behind it; a shared cause is listed once.
 
         Args:
-            causes: of a stop.
-            over: when a sensor was fresh again, ns: what befell it later was not behind its silence.
+            causes: causes of a stop.
+            over: time when a sensor was fresh again, ns; a later outage does not explain its silence.
         """
         chain = list(causes)
         found: dict[tuple[Reason, str, int], int] = {}
@@ -117,7 +117,7 @@ class Outages:
         return tuple(chain)
 
     def _behind(self, cause: Cause, over: int | None) -> Iterator[Cause]:
-        """Causes behind ``cause``, each behind the one before it."""
+        """Chain of causes behind ``cause``: each is behind the previous one."""
         services = [name for name, stale in self._services.items() if stale is cause.reason] or [cause.source]
         outages = (outage for name in services if (outage := self._outages.get(name)) is not None)
         outage = next((outage for outage in outages if outage.end is None or cause.since <= outage.end), None)
@@ -138,19 +138,19 @@ def _cause_of(event: Event) -> Cause:
 
 
 class StopLog:
-    """Collects stops between two ticks, and causes of the newest one that become known afterwards.
+    """Collects stops between two ticks, and adds causes of the latest stop that become known later.
 
     Args:
-        outages: explain causes.
+        outages: outages that explain causes.
     """
 
     def __init__(self, outages: Outages) -> None:
         self._outages = outages
         self._count = 0
         self._causes: tuple[Cause, ...] = ()
-        """Of the newest stop, before ``Outages.explain``."""
+        """Causes of the latest stop, before ``Outages.explain``."""
         self._over: dict[Reason, int] = {}
-        """When a sensor whose silence was a cause of it was fresh again, ns."""
+        """Time when each sensor whose silence caused the stop was fresh again, ns."""
         self._newest: Stop | None = None
         self._pending: list[Stop] = []
 
@@ -170,13 +170,13 @@ class StopLog:
 
         Args:
             now: ns.
-            mode: the gate's next mode.
-            causes: what tripped the gate, worst first.
-            ordered: it was an ordinary order.
-            quick: by quick stop.
-            driver: newest request of the driving source.
-            speed: measured, m/s; None = not known.
-            stopping_distance: expected, m.
+            mode: next mode of the gate.
+            causes: causes of the stop, worst first.
+            ordered: whether an ordinary order caused the stop.
+            quick: whether the drives stop by quick stop.
+            driver: latest request of the driving source.
+            speed: measured speed, m/s; None if unknown.
+            stopping_distance: expected stopping distance, m.
         """
         self._count += 1
         self._causes, self._over = tuple(causes), {}
@@ -200,24 +200,24 @@ class StopLog:
         self._pending.append(self._newest)
 
     def summary(self, now: int) -> str:
-        """The newest stop in one line; empty before the first one."""
+        """One line about the latest stop; empty before the first stop."""
         newest = self._newest
         if newest is None:
             return ""
         return f"stopped {duration_text((now - newest.stamp) / SECOND)} ago: {causes_text(newest.causes, newest.stamp)}"
 
     def drain(self, now: int, present: Collection[Reason]) -> tuple[Stop, ...]:
-        """Stops since the last call, or the newest one again if more of its causes are known; their ``seq`` is still 0.
+        """Return the stops since the last call, or the latest stop again if more of its causes are known; ``seq`` is 0.
 
         Args:
             now: ns.
-            present: what limits or stops the truck now.
+            present: reasons that limit or stop the truck now.
         """
         newest = self._newest
         for cause in self._causes:
             if cause.reason in STALE_SENSORS and cause.reason not in present:
                 self._over.setdefault(cause.reason, now)
-        explained_within = 3 * SECOND  # so long after a stop later reports may still extend its causes, ns
+        explained_within = 3 * SECOND  # period after a stop while reports may still add causes, ns
         if newest is not None and not self._pending and now - newest.stamp <= explained_within:
             causes = self._outages.explain(self._causes, self._over)
             if causes != newest.causes:

@@ -1,4 +1,4 @@
-"""What the lidar sees: a beam without a range may be free ground, or a covered or dazzled sensor."""
+"""View of the lidar: a beam without a range may mean free ground, or a covered or dazzled sensor."""
 
 import math
 from typing import Final
@@ -11,7 +11,7 @@ from monstertruck_planners.collision import Footprint, on_body
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 
 SECTORS: Final = 36
-"""Sectors around the lidar: 0.1 m wide at the end of the distance the gate checks, less than the width of the body."""
+"""Number of sectors around the lidar: 0.1 m wide at the end of the checked distance, narrower than the body."""
 SECTOR: Final = 2 * math.pi / SECTORS
 
 Sectors = NDArray[np.intp]
@@ -26,7 +26,7 @@ class Visibility:
     Args:
         footprint: the body's outline.
         mount: pose (x, y, yaw) of the lidar in base, m, m, rad.
-        share: of a sector's beams that must see, 0..1.
+        share: fraction of a sector's beams that must see, 0..1.
     """
 
     def __init__(self, footprint: Footprint, mount: tuple[float, float, float], share: float) -> None:
@@ -44,7 +44,7 @@ class Visibility:
 
         Args:
             scan: the revolution.
-            points: its valid returns in base, ``scan_points``, shape (n, 2), m.
+            points: valid returns of the scan in base, ``scan_points``, shape (n, 2), m.
         """
         geometry = scan.start_angle, scan.angle_increment, len(scan.ranges)
         if geometry != self._geometry:
@@ -52,7 +52,7 @@ class Visibility:
             start, increment, count = geometry
             self._sector_of_beam = _sector(start + increment * np.arange(count, dtype=np.float64))
             self._beams = np.bincount(self._sector_of_beam, minlength=SECTORS).astype(float)
-            present = 0.5  # share of a sector's beams that a scan must have for the sector to be in the lidar's field
+            present = 0.5  # minimum fraction of a sector's beams in a scan for the sector to be in the field of view
             self._field = self._beams * abs(increment) > present * SECTOR
         sees = scan.codes <= NO_ECHO
         sees[((scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)).nonzero()[0]] = ~on_body(
@@ -67,21 +67,21 @@ class Visibility:
         return _sector(np.arctan2(points[:, 1] - y, points[:, 0] - x) - yaw)
 
     def covers(self, points: Array) -> NDArray[np.bool_]:
-        """Which of the points (n, 2) in base, m, lie in the lidar's field."""
+        """Whether each point (n, 2) in base (m) lies in the lidar's field of view."""
         return self._field[self.sectors_of(points)]
 
     def travelled(self, ground: Array) -> Sectors:
-        """Sectors of the points (n, 2) in base, m, that the body does not stand on."""
+        """Sectors of the points (n, 2) in base (m) that are not under the body."""
         margin = 0.005  # ground this near to the body counts as under it, m
         sectors = self.sectors_of(ground[~on_body(self._footprint, ground, margin)])
         return np.bincount(sectors, minlength=SECTORS).nonzero()[0]
 
     def last_seen(self, sectors: Sectors) -> NDArray[np.int64]:
-        """When each of the sectors was seen, ns, 0 for never; those outside the lidar's field are left out."""
+        """Time each sector was last seen, ns, 0 for never; omits sectors outside the lidar's field of view."""
         return self._seen_at[sectors[self._field[sectors]]]
 
     def age(self, points: Array, now: int) -> NDArray[np.int64]:
-        """How long ago the sector of every point (n, 2) in base was seen, ns."""
+        """Time since the sector of every point (n, 2) in base was last seen, ns."""
         return now - self._seen_at[self.sectors_of(points)]
 
 
