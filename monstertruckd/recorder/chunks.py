@@ -1,4 +1,4 @@
-"""Chunks of an MCAP file, opened within bounds: what a chunk says of its size is not believed."""
+"""Bounded decompression of MCAP chunks; the size a chunk declares is not trusted."""
 
 import zlib
 from collections.abc import Iterator
@@ -18,10 +18,10 @@ LIMIT: Final = f"expected at most {MOST_UNPACKED // MEGABYTE} MB"
 
 
 def unpacked(chunk: Chunk) -> bytes:
-    """Content of a chunk, decompressed and checked.
+    """Return the content of a chunk, decompressed and checked.
 
     Raises:
-        McapError: it is larger than ``MOST_UNPACKED``, than it says, or not what its checksum says.
+        McapError: it exceeds ``MOST_UNPACKED``, differs from its declared size, or fails its checksum.
         RuntimeError: damaged lz4 data.
         zstandard.ZstdError: damaged zstd data.
     """
@@ -47,7 +47,7 @@ def unpacked(chunk: Chunk) -> bytes:
 
 
 def records_in(content: bytes) -> Iterator[McapRecord]:
-    """Schemas, channels and messages of a chunk, one after the other.
+    """Yield the schemas, channels and messages of a chunk in order.
 
     Raises:
         McapError: a record is longer than the chunk.

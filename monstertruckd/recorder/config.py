@@ -23,62 +23,62 @@ class Compression(StrEnum):
 
 
 class RecorderConfig(Schema):
-    """Where and how the log is written."""
+    """Log files."""
 
     directory: str = "logs"
-    """Folder of the log files; made when missing."""
+    """Folder of the log files; created if missing."""
     compression: Compression = Compression.LZ4
     chunk_size: Bytes = 256 * 1024
-    """Bytes after which a chunk is closed."""
+    """Maximum chunk size (bytes)."""
     chunk_seconds: Annotated[float, Field(gt=0, le=0.5)] = 0.5
-    """Seconds after which a chunk is closed: what a crash can lose, and half as much again."""
+    """Maximum chunk duration (s); a crash can lose 1.5 times this."""
     rotate_bytes: Bytes = 512 * 1024 * 1024
-    """Size after which the next file is begun."""
+    """Maximum file size (bytes); beyond, a new file is started."""
     rotate_seconds: Seconds = 1800.0
-    """Duration after which the next file is begun."""
+    """Maximum file duration (s); beyond, a new file is started."""
     quota_bytes: Bytes = 8 * 1024 * 1024 * 1024
-    """Size of all logs in the folder above which the oldest are removed."""
+    """Maximum total size of the logs in the folder (bytes); beyond, the oldest are removed."""
     fsync_seconds: Seconds = 5.0
-    """Seconds between two fsync, which is what a power cut can lose."""
+    """Fsync interval (s); a power cut can lose this much."""
     queue_size: Annotated[int, Field(gt=0)] = 8192
-    """Messages waiting for the disk before newer ones are dropped and counted."""
+    """Maximum number of messages waiting for the disk; further ones are dropped and counted."""
 
 
 class BlackBoxConfig(Schema):
-    """The minute before every trip of the gate, kept in memory until then."""
+    """Black box: the minute before every gate trip, kept in memory until then."""
 
     directory: str | None = None
-    """Folder of the boxes; null = ``blackbox`` in the recorder's folder, and none at all without a recorder."""
+    """Folder of the boxes; null: ``blackbox`` in the recorder's folder, or no boxes without a recorder."""
     before: Seconds = 60.0
-    """Seconds before the trip."""
+    """Recorded time before the trip (s)."""
     after: Seconds = 5.0
-    """Seconds after it; trips meanwhile share the box."""
+    """Recorded time after the trip (s); further trips within it share the box."""
     journal: Seconds = 60.0
-    """Seconds of events and log records, where those are to reach further back than the rest."""
+    """Retention of events and log records (s), if longer than for other messages."""
     pictures: Seconds = 5.0
-    """Seconds before the trip of which all pictures are kept."""
+    """Time before the trip with all pictures kept (s)."""
     picture_period: Seconds = 0.5
-    """Seconds between two pictures that are kept of the time before."""
+    """Interval between the older pictures that are kept (s)."""
     memory_bytes: Annotated[int, Field(ge=1024 * 1024)] = 24 * 1024 * 1024
-    """Bytes all that may take; beyond, the oldest pictures go first, then the oldest of the rest."""
+    """Memory limit (bytes); beyond, the oldest pictures are dropped first, then the oldest other messages."""
     quota_bytes: Bytes = 512 * 1024 * 1024
-    """Size of all boxes in the folder above which the oldest are removed; the newest of each reason stays."""
+    """Maximum total size of the boxes (bytes); the oldest are removed, except the latest of each reason."""
     interval: Annotated[float, Field(ge=0)] = 60.0
-    """Least seconds between two boxes of one reason; a trip meanwhile waits for it, at most ``before``."""
+    """Minimum interval between boxes of one reason (s); an earlier trip waits for it, at most ``before``."""
     unless: Annotated[tuple[Reason, ...], Field(strict=False)] = (Reason.STOPPED, Reason.DISARMED)
-    """Reasons without a box: by default what an operator ordered."""
+    """Reasons that write no box; by default those ordered by an operator."""
 
 
 class MapRender(Schema):
-    """The picture of path over scan map that the worker draws."""
+    """Picture of the path over a scan map, drawn by a worker."""
 
     latency: Annotated[float, Field(gt=0, le=5)] = 0.2
-    """Seconds after which its results count on the virtual clock"""
+    """Latency of its results on the virtual clock (s)"""
     deadline: Annotated[float, Field(gt=0, le=60)] = 5.0
-    """Seconds after which a silent worker is killed"""
+    """Timeout of a silent worker (s), which is then killed"""
     period: Annotated[float, Field(ge=0.1, le=60)] = 0.5
-    """Seconds between two scans it is given"""
+    """Interval between the scans passed to the worker (s)"""
     max_tilt: Annotated[float, Field(gt=0, le=math.pi / 2)] = math.radians(3)
-    """Scans whose plane was tilted more than this are left out, rad: over 5 m they are 0.26 m off"""
+    """Maximum tilt of a scan (rad), else it is left out; the default is an error of 0.26 m at 5 m"""
     picture: Path | None = None
-    """PNG file drawn whenever a path has come to its end"""
+    """PNG file, drawn whenever a path has ended"""

@@ -67,10 +67,10 @@ READERS: Final[dict[int, Any]] = {
     Opcode.METADATA_INDEX: MetadataIndex,
     Opcode.STATISTICS: Statistics,
 }
-"""Classes of records by opcode, but for messages, whose reader needs their length."""
+"""Record classes by opcode, except messages, whose reader needs their length."""
 
 PRIVATE: Final = 0x80
-"""Opcodes from here on are private ones; unknown ones below are damage."""
+"""First private opcode; unknown lower opcodes are damage."""
 
 
 def is_finished(path: Path) -> bool:
@@ -138,9 +138,9 @@ def read_statistics(file: BinaryIO, size: int) -> Statistics | None:
 
 
 def digest_of(opcode: int, content: bytes) -> bytes:
-    """Return the digest by which a repeated record is recognised."""
+    """Return a digest for recognising repeated records."""
     # 16: bytes of a chunk's two times
-    begin = 16 if opcode == Opcode.CHUNK else 0  # no checksum covers a chunk's times
+    begin = 16 if opcode == Opcode.CHUNK else 0  # the times of a chunk have no checksum
     return blake2b(content[begin:], digest_size=16).digest()
 
 

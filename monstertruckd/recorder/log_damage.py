@@ -17,9 +17,9 @@ class LogDamage:
     counted: bool = True
     """Whether ``lost`` is exact; without a sound index more may be lost."""
     spans: tuple[tuple[float, float | None], ...] = ()
-    """Begin and end of each loss, s after the log's first message; None = end of the log."""
+    """Start and end of each loss, relative to the first message (s); None: end of the log."""
     repeated: int = 0
-    """Chunks that the log held twice."""
+    """Number of duplicate chunks."""
     damage: str | None = None
     """Description of the damage; None if the log is sound."""
 

@@ -1,4 +1,4 @@
-"""Log files and their folder: topics as MCAP channels, one file being written, numbered names."""
+"""Log files and their folder: topics as MCAP channels, one open file, numbered names."""
 
 import fcntl
 import json
@@ -26,7 +26,7 @@ class Channels:
     """Registers each topic with its schema when it is first requested.
 
     Args:
-        writer: of the file, started.
+        writer: started writer of the file.
     """
 
     def __init__(self, writer: Writer) -> None:
@@ -35,12 +35,12 @@ class Channels:
         self._channels: dict[str, int] = {}
 
     def of(self, topic: Topic[Any]) -> int:
-        """Number of the topic's channel."""
+        """Return the channel number of a topic."""
         return self._channels.get(topic.name) or self._register(topic)
 
     @property
     def numbers(self) -> dict[str, str]:
-        """Topic of every channel so far, by number."""
+        """Topics of all channels so far, by number."""
         return {str(number): topic for topic, number in self._channels.items()}
 
     def _register(self, topic: Topic[Any]) -> int:
@@ -55,9 +55,9 @@ class Channels:
 
 
 NAME: Final = re.compile(r"run-(\d{6,})-(\d{3,})\.mcap")
-"""Name of a log: run and part."""
+"""Name of a log, with run and part."""
 DAMAGED_NAME: Final = re.compile(re.escape(DAMAGED) + r"(-\d+)?$")
-"""End of the name of a damaged original: the second one of a log is NAME.damaged-2."""
+"""Name suffix of a damaged original; the second original of a log is NAME.damaged-2."""
 
 _COMPRESSION: Final = {
     Compression.NONE: CompressionType.NONE,
@@ -67,9 +67,9 @@ _COMPRESSION: Final = {
 
 
 TIMES: Final = "times"
-"""Metadata record that says of which clock the file's times are."""
+"""Metadata record with the clocks of the file's times."""
 LOG_OFFSET: Final = "log_offset_ns"
-"""Its entry with what was added to daemon times for the file's log times, ns."""
+"""Entry of ``TIMES``: offset added to daemon times for the log times of the file (ns)."""
 
 
 CHANNELS: Final = "channels"
@@ -81,43 +81,43 @@ RUN_LOG: Final = "log"
 
 
 def log_offset(now: int, real_offset: int) -> int:
-    """What a file that begins now adds to daemon times for its log times.
+    """Return the offset that a file starting now adds to daemon times for its log times (ns).
 
     Args:
-        now: daemon time, ns.
-        real_offset: real (UNIX) minus daemon time, ns.
+        now: daemon time (ns).
+        real_offset: real (UNIX) minus daemon time (ns).
 
     Returns:
-        ``real_offset`` or, while the computer does not know the date, 0.
+        ``real_offset``, or 0 while the computer does not know the date.
     """
     return real_offset if is_date(now + real_offset) else 0
 
 
 class LogEntry(NamedTuple):
-    """A message to be logged."""
+    """Message to log."""
 
     topic: Topic[Any]
     log_time: int
-    """When the daemon published or received it, ns of daemon time."""
+    """Daemon time of publication or reception (ns)."""
     stamp: int
     sequence: int
-    """Counts the topic's messages; a gap is a message dropped on the way to the log."""
+    """Message count of the topic; a gap is a message dropped on the way to the log."""
     payload: bytes
 
 
 class LogFile:
-    """An open MCAP file, locked against repair and removal.
+    """Open MCAP file, locked against repair and removal.
 
-    Its log times are daemon times plus one offset, its publish times the messages' own stamps in daemon time.
+    Log times are daemon times plus a constant offset; publish times are the stamps of the messages in daemon time.
 
     Args:
-        path: file to make.
-        compression: of the chunks.
-        chunk_size: bytes after which a chunk is closed.
+        path: file to create.
+        compression: compression of the chunks.
+        chunk_size: maximum chunk size (bytes).
         attachments: written first, each as ``<name>.json``.
         metadata: text about the run.
-        start: when it begins, ns of daemon time.
-        offset: added to daemon times for log times, ns.
+        start: start of the file in daemon time (ns).
+        offset: offset added to daemon times for log times (ns).
 
     Raises:
         OSError: the file exists, or cannot be written.
@@ -137,9 +137,9 @@ class LogFile:
         self.start = start
         self.offset = offset
         self.open_since: int | None = None
-        """When the oldest message came that is not in the file yet, ns of daemon time."""
+        """Daemon time of the oldest message that is not in the file yet (ns)."""
         self._named = False
-        """The disk has the file's name."""
+        """Whether the file name is synced to the disk."""
         self._output = _Output(path)
         try:
             self._writer = Writer(
@@ -162,16 +162,16 @@ class LogFile:
 
     @property
     def size(self) -> int:
-        """Bytes in the file."""
+        """File size (bytes)."""
         return self._output.size
 
     @property
     def removed(self) -> bool:
-        """Whether somebody removed the file: what is written to it is gone once it is closed."""
+        """Whether the file has been removed: its content is lost when it is closed."""
         return self._output.removed
 
     def add(self, entry: LogEntry) -> None:
-        """Put a message into the open chunk."""
+        """Add a message to the open chunk."""
         before = self._output.size
         self._writer.add_message(
             self._channels.of(entry.topic),
@@ -186,12 +186,12 @@ class LogFile:
             self.open_since = entry.log_time
 
     def flush(self) -> None:
-        """Close the open chunk and hand it to the kernel: it survives the process."""
+        """Close the open chunk and pass it to the kernel, so it survives the process."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self.open_since = None
 
     def sync(self) -> None:
-        """Wait until the disk has it: it survives a power cut."""
+        """Wait until the data is on disk, so it survives a power cut."""
         if self._channels.numbers:
             self._writer.add_metadata(CHANNELS, self._channels.numbers)
         self._settle()
@@ -216,10 +216,10 @@ class LogFile:
 
 
 class _PackedIndex:
-    """The index of one chunk, as the bytes that end the file.
+    """Index of a chunk, as the bytes at the end of the file.
 
     Args:
-        index: as the writer makes it.
+        index: index created by the writer.
     """
 
     __slots__ = ("_record",)
@@ -230,31 +230,31 @@ class _PackedIndex:
         self._record: bytes = builder.end()  # type: ignore[no-untyped-call]
 
     def write(self, builder: RecordBuilder) -> None:
-        """Put it into the summary."""
+        """Write the index to the summary."""
         builder.write(self._record)
 
 
 class _PackedIndexes(list[_PackedIndex]):
-    """Indexes of chunks, packed when they are appended.
+    """Chunk indexes, packed when they are appended.
 
-    As the writer's objects those of two chunks a second with forty channels each grow by 0.34 MB a minute until the
-    recording ends; packed, by 0.06 MB.
+    With two chunks per second and forty channels each, the writer's objects grow by 0.34 MB per minute until the
+    recording ends; packed, by 0.06 MB per minute.
     """
 
     def append(self, index: Any) -> None:
-        """Keep the bytes of an index."""
+        """Append the bytes of an index."""
         super().append(_PackedIndex(index))
 
 
 def _pack_indexes(writer: Writer) -> None:
-    """Let a writer keep its chunks' indexes packed until it writes them."""
+    """Make a writer keep its chunk indexes packed until it writes them."""
     name = "_Writer__chunk_indices"  # the writer offers no other way
     assert getattr(writer, name) == []
     setattr(writer, name, _PackedIndexes())
 
 
 class _Output:
-    """Unbuffered file: what was written is in the kernel, and an error leaves nothing to flush."""
+    """Unbuffered file: written data is in the kernel, so an error leaves nothing to flush."""
 
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
@@ -273,7 +273,7 @@ class _Output:
         return self.size
 
     def flush(self) -> None:
-        """Nothing is buffered."""
+        """Do nothing, as nothing is buffered."""
 
     @property
     def removed(self) -> bool:
@@ -304,20 +304,20 @@ class LogFolder:
         self._part = 0
 
     def next_path(self) -> Path:
-        """Name of the next file of this run."""
+        """Return the path of the next file of this run."""
         path = self.directory / f"run-{self._run:06d}-{self._part:03d}.mcap"
         self._part += 1
         return path
 
     def next_run(self) -> None:
-        """Take another run number: another process uses this one."""
+        """Switch to the next run number, because another process uses this one."""
         self._run += 1
         self._part = 0
 
     def finished(self, current: Path) -> dict[Path, int]:
-        """Size of every log but ``current``, oldest first, each after the damaged originals that ``repair`` kept of it.
+        """Return the size of every log except ``current``, oldest first, each after its damaged originals.
 
-        What has a log's name without being a file is none.
+        ``repair`` keeps these originals. Entries that are not regular files are ignored.
         """
         found = []
         for path in self.directory.iterdir():

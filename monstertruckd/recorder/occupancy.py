@@ -1,4 +1,4 @@
-"""A growing raster of what lidar scans hit and what they saw through."""
+"""Growing raster of hits and passes of lidar scans."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from monstertruck_kinematics.elementary import Array
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """Axis-aligned rectangle, m."""
+    """Axis-aligned rectangle (m)."""
 
     x0: float
     y0: float
@@ -19,10 +19,10 @@ class Area:
 
 
 class OccupancyRaster:
-    """Counts, per cell, in how many scans it was hit and in how many it was seen through.
+    """Counts, per cell, the scans that hit it and the scans that passed through it.
 
     Args:
-        cell: edge of a cell, m.
+        cell: cell size (m).
     """
 
     def __init__(self, cell: float = 0.05) -> None:
@@ -33,17 +33,17 @@ class OccupancyRaster:
 
     @property
     def area(self) -> Area:
-        """What the raster covers."""
+        """Area covered by the raster."""
         low = self._corner * self.cell
         rows, columns = self._hits.shape
         return Area(float(low[0]), float(low[1]), float(low[0] + columns * self.cell), float(low[1] + rows * self.cell))
 
     def add(self, origin: Array, points: Array) -> None:
-        """Take in one scan.
+        """Add a scan.
 
         Args:
-            origin: shape (2,), the sensor in the map frame, m.
-            points: shape (n, 2), where its beams ended, in the map frame, m.
+            origin: position of the sensor in the map frame (m), shape (2,).
+            points: ends of its beams in the map frame (m), shape (n, 2).
         """
         points = points[np.isfinite(points).all(axis=1)]
         if len(points) == 0:
@@ -59,7 +59,7 @@ class OccupancyRaster:
         self._passes += through & ~hit
 
     def occupancy(self) -> Array:
-        """Share of hits, shape (rows, columns), row 0 at the lowest y; NaN where nothing was seen."""
+        """Return the fraction of hits, shape (rows, columns), row 0 at the lowest y; NaN for unseen cells."""
         total = self._hits.astype(np.float64) + self._passes
         with np.errstate(invalid="ignore"):
             return self._hits / total
@@ -89,7 +89,7 @@ class OccupancyRaster:
 
 
 def _beams(origin: Array, points: Array, step: float) -> Array:
-    """Points every ``step`` along each beam, its last step left out; shape (m, 2)."""
+    """Return points every ``step`` along each beam except the last step, shape (m, 2)."""
     beams = points - origin
     lengths = np.hypot(beams[:, 0], beams[:, 1])
     counts = np.floor(lengths / step).astype(np.int64)

@@ -1,4 +1,4 @@
-"""The picture of the path over the scan map: feeds the renderer's worker, saves what it draws."""
+"""Picture of the path over the scan map: feeds the renderer worker and saves its pictures."""
 
 import math
 from typing import Any
@@ -23,17 +23,17 @@ TARGET = "monstertruckd.recorder.picture_worker:MapRenderer"
 
 
 class MapService:
-    """One scan per period goes to the worker; the picture is saved whenever a path has come to its end.
+    """Passes one scan per period to the worker; saves the picture whenever a path has ended.
 
     Args:
         config: periods, deadline, file.
-        mount: of the lidar.
-        clock: time.
-        scan: lidar.
-        pose: pose in map.
-        path: path being tracked.
-        tracker: progress on it.
-        events: where finished pictures are reported.
+        mount: mounting pose of the lidar.
+        clock: time source.
+        scan: lidar scans.
+        pose: pose in the map frame.
+        path: tracked path.
+        tracker: progress on the path.
+        events: sink for finished pictures.
     """
 
     name = ServiceName.MAP.value
@@ -59,7 +59,7 @@ class MapService:
         self._tracker = tracker
         self._events = events
         self._driven: list[tuple[float, float, float]] = []
-        self._spacing = 0.02  # metres between two remembered poses of the driven path, at first
+        self._spacing = 0.02  # initial spacing of the remembered poses of the driven path (m)
         self._before = Reason.DRIVING
 
     async def run(self, ready: Ready) -> None:
@@ -85,7 +85,7 @@ class MapService:
                     await worker.step({"scans": scans})
 
     def _ended(self) -> TrackerState | None:
-        """The state in which a path came to its end since the last look, however briefly it was reported."""
+        """Return the state at the end of a path since the last check, however briefly it was reported."""
         ended = None
         for state in self._tracker.drain():
             if state.outcome is not Reason.DRIVING and self._before is Reason.DRIVING:
@@ -100,7 +100,7 @@ class MapService:
         pose = (odometry.pose.x, odometry.pose.y, odometry.pose.yaw)
         if not self._driven or math.dist(pose[:2], self._driven[-1][:2]) > self._spacing:
             self._driven.append(pose)
-            if len(self._driven) > 2000:  # poses after which every other one is forgotten and the spacing doubles
+            if len(self._driven) > 2000:  # poses kept; beyond, every other one is dropped and the spacing doubles
                 self._driven = self._driven[::2]
                 self._spacing *= 2
         if scan.tilt is not None and scan.tilt > self._config.max_tilt:

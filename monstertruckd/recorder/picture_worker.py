@@ -8,8 +8,8 @@ A step's inputs are a dict:
   (shape (n, 2) or (n, 3), map frame) and ``style``, a key of ``STYLES``;
 - ``file``: where to save the picture; the file appears complete or not at all.
 
-Its outputs are a dict: ``scans``, how many were taken in since the start, and, of a picture, ``png`` (or ``error``, why
-it could not be saved).
+Its outputs are a dict: ``scans``, the number of scans added since the start, and for a picture ``png`` (or ``error``,
+why it could not be saved).
 """
 
 import io
@@ -56,7 +56,7 @@ class MapRenderer:
         self._scans = 0
 
     def step(self, inputs: Mapping[str, Any]) -> dict[str, Any]:
-        """Take in scans, then draw if asked to."""
+        """Add scans, then draw if requested."""
         for pose, points in inputs.get("scans", ()):
             x, y, yaw = pose
             cos, sin = np.cos(yaw), np.sin(yaw)
@@ -117,7 +117,7 @@ def render(
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    """From metres to pixels of the oversampled sheet."""
+    """Transform from metres to pixels of the oversampled sheet."""
 
     area: Area
     scale: float
@@ -130,7 +130,7 @@ class _Frame:
 
     @property
     def unit(self) -> float:
-        """Round length of the grid's squares and of the scale bar, m."""
+        """Round length of the grid squares and of the scale bar (m)."""
         return _nice_length(max(self.area.x1 - self.area.x0, self.area.y1 - self.area.y0) / 8)
 
     @property
@@ -238,7 +238,7 @@ def _ends(pen: ImageDraw.ImageDraw, frame: _Frame, poses: Array, style: Style) -
 
 
 def _scale_bar(pen: ImageDraw.ImageDraw, frame: _Frame, right: int, bottom: int) -> None:
-    """As long as a square of the grid."""
+    """Draw the scale bar, as long as a grid square."""
     length = frame.unit
     end, y, tick = right, bottom + 34 * _OVERSAMPLING, 5 * _OVERSAMPLING
     start = end - round(length * frame.scale)
@@ -259,7 +259,7 @@ def _legend(pen: ImageDraw.ImageDraw, left: int, bottom: int, rows: list[tuple[s
 
 
 def _nice_length(about: float) -> float:
-    """The nearest of 1, 2, 5 times a power of ten that is not longer."""
+    """Return the largest of 1, 2, 5 times a power of ten that is not longer."""
     power = 10.0 ** np.floor(np.log10(about))
     return float(max(factor * power for factor in (1, 2, 5) if factor * power <= about * 1.0001))
 

@@ -1,4 +1,4 @@
-"""Reading MCAP logs front to back, finished or not, with every checksum verified."""
+"""Sequential reading of MCAP logs, finished or not, with every checksum verified."""
 
 import itertools
 import json
@@ -41,14 +41,14 @@ from monstertruckd.recorder.log_file import LOG_OFFSET, TIMES
 from monstertruckd.recorder.salvage import ChannelFacts, Salvage
 
 CONFIG: Final = "config.json"
-"""The attachment with the daemon's configuration."""
+"""Attachment with the configuration of the daemon."""
 
 
 def spare_log(output: Path) -> None:
     """Refuse to overwrite a log.
 
     Raises:
-        InputError: there is a log under that name.
+        InputError: ``output`` is a log.
     """
     if output.is_file():
         with output.open("rb") as file:
@@ -58,20 +58,20 @@ def spare_log(output: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class LogMessage:
-    """One message of a log."""
+    """Message of a log."""
 
     topic: str
     """Name in the topic table, e.g. ``sensor/scan``."""
     log_time: int
-    """Daemon time of recording, ns, whatever clock the file's log times are of."""
+    """Daemon time of recording (ns), regardless of the clock of the file's log times."""
     stamp: int
-    """The message's own stamp, ns."""
+    """Stamp of the message (ns)."""
     sequence: int
     payload: bytes
     schema: str
 
     def decode(self) -> Message:
-        """The typed message.
+        """Return the typed message.
 
         Raises:
             NotFoundError: the topic is not in the table.
@@ -84,10 +84,10 @@ class LogMessage:
 
 
 class LogReader:
-    """Iterates over a log, once or again; of a damaged file, over every whole chunk, as ``recover`` keeps them.
+    """Iterates over a log, any number of times; over every intact chunk of a damaged file, as ``recover`` keeps them.
 
     Args:
-        path: an MCAP file.
+        path: MCAP file.
 
     Raises:
         NotFoundError: no such file.
@@ -97,15 +97,15 @@ class LogReader:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.damage: str | None = None
-        """After an iteration to the end: why messages are missing, how many and when; None if none is known to be."""
+        """After a complete iteration: why messages are missing, how many and when; None if none are known to be."""
         self.flaws: list[str] = []
-        """What else an iteration to the end found damaged; it costs no message."""
+        """Other damage found by a complete iteration, which loses no message."""
         self.verdict: LogDamage | None = None
-        """Figures of the damage; None if the last iteration met none on its way to the index."""
+        """Figures of the damage; None if the last iteration found none before the index."""
         self.position = 0
-        """Bytes an iteration has read so far, for progress bars."""
+        """Bytes read so far by an iteration, for progress bars."""
         self.log_offset = 0
-        """The file's log times minus daemon times, ns, once an iteration has passed the metadata."""
+        """Log times minus daemon times (ns), known after an iteration has passed the metadata."""
         with open_file(path) as file:
             head = file.read(len(MAGIC))
             if not MAGIC.startswith(head) and (not _resembles(head) or Salvage(file).strange):
@@ -115,7 +115,7 @@ class LogReader:
         return self._messages(self.records())
 
     def before_damage(self) -> Iterator[LogMessage]:
-        """The messages up to the first error, for what a gap would make meaningless."""
+        """Yield the messages up to the first error, for evaluations that a gap would invalidate."""
         return self._messages(self.records(past_damage=False))
 
     def _messages(self, records: Iterator[McapRecord]) -> Iterator[LogMessage]:
@@ -139,12 +139,12 @@ class LogReader:
                 )
 
     def records(self, *, past_damage: bool = True) -> Iterator[McapRecord]:
-        """Every whole MCAP record before the index, chunks opened; channels precede their messages.
+        """Yield every intact MCAP record before the index, with chunks opened; channels precede their messages.
 
-        Their times are as they are in the file; see ``log_offset``.
+        Times are as in the file; see ``log_offset``.
 
         Args:
-            past_damage: go on behind an error.
+            past_damage: continue after an error.
         """
         self.damage, self.flaws, self.verdict, self.log_offset = None, [], None, 0
         size = self.size
@@ -161,7 +161,7 @@ class LogReader:
             self.position = size
 
     def _sound(self, file: BinaryIO, size: int) -> Iterator[McapRecord]:
-        """The same of a sound log; raises one of ``DAMAGE`` at the first error, whose record begins at ``position``."""
+        """Yield the records; raise one of ``DAMAGE`` at the first error, with the record offset in ``position``."""
         channels, seen = set[int](), set[bytes]()
         given: Counter[type[McapRecord]] = Counter()
         self.position, repeated = 0, 0
@@ -194,16 +194,16 @@ class LogReader:
                 yield record
 
     def _learn(self, record: McapRecord) -> None:
-        """Note the offset of the log times from daemon time.
+        """Store the offset of the log times from daemon time.
 
         Raises:
-            ValueError: the offset is no number.
+            ValueError: the offset is not a number.
         """
         if isinstance(record, Metadata) and record.name == TIMES:
             self.log_offset = int(record.metadata.get(LOG_OFFSET, "0"))
 
     def _opened(self, opcode: int, content: bytes) -> Iterable[McapRecord]:
-        """Records of one record of the data section (those of a chunk)."""
+        """Return the records contained in a record of the data section: the content of a chunk, or the record."""
         stream = ReadDataStream(BytesIO(content))
         match opcode:
             case Opcode.CHUNK:
@@ -214,7 +214,7 @@ class LogReader:
                 return (self._checked(Attachment.read(stream), content),)
             case Opcode.HEADER | Opcode.SCHEMA | Opcode.CHANNEL | Opcode.METADATA:
                 return (READERS[opcode].read(stream),)
-        if opcode == 0:  # no opcode: the zeros of a file that a power cut left without its content
+        if opcode == 0:  # not an opcode: zeros of a file that lost its content in a power cut
             raise McapError("zeros")
         if opcode != Opcode.MESSAGE_INDEX and opcode < PRIVATE:
             raise McapError(f"no record of the data section: {opcode}")
@@ -229,8 +229,8 @@ class LogReader:
     def _end(
         self, file: BinaryIO, size: int, content: bytes, summed: int, given: Mapping[type[McapRecord], int]
     ) -> None:
-        """Compare what was read with the end of the data section and the index after it."""
-        (expected,) = CHECKSUM.unpack(content)  # of another length it was another record before its first byte flipped
+        """Compare the records read with the end of the data section and the index after it."""
+        (expected,) = CHECKSUM.unpack(content)  # a wrong length means another record with a flipped first byte
         if expected not in (0, summed):
             raise McapError("checksum of the data section")
         begin = file.tell()
@@ -247,7 +247,7 @@ class LogReader:
             self.flaws.append("lacks an attachment or metadata")
 
     def _salvaged(self, file: BinaryIO, first: str) -> Iterator[McapRecord]:
-        """Yield the whole records from ``position`` on; the damage is known after the last one.
+        """Yield the intact records from ``position`` on; the damage is known after the last one.
 
         Args:
             file: the log.
@@ -275,9 +275,9 @@ class LogReader:
             self.flaws.append(text)
 
     def preamble(self) -> Iterator[McapRecord]:
-        """The records before the first message: the recorder writes attachments and metadata there.
+        """Yield the records before the first message, where the recorder writes attachments and metadata.
 
-        What an iteration to the end found wrong stays known.
+        Keeps the damage found by a complete iteration.
         """
         known = self.damage, self.flaws, self.verdict
         try:
@@ -286,38 +286,38 @@ class LogReader:
             self.damage, self.flaws, self.verdict = known
 
     def config(self) -> dict[str, Any]:
-        """The attached configuration as plain values; empty where there is none. Raises as ``attached_config`` does."""
+        """Return the attached configuration as plain values, or an empty one. Raises like ``attached_config``."""
         return attached_config(self.path, self.attachments()) or {}
 
     @property
     def fault(self) -> str | None:
-        """Everything an iteration to the end found wrong, to follow the log's name; None for a sound log."""
+        """All damage found by a complete iteration, phrased to follow the log's name; None for an undamaged log."""
         return ", ".join([*self.flaws, *([] if self.damage is None else [self.damage])]) or None
 
     @property
     def size(self) -> int:
-        """Bytes of the file."""
+        """File size (bytes)."""
         return self.path.stat().st_size
 
     def attachments(self) -> dict[str, bytes]:
-        """Attached files of the preamble, by name."""
+        """Return the attached files of the preamble, by name."""
         return {record.name: record.data for record in self.preamble() if isinstance(record, Attachment)}
 
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records of the preamble, by name."""
+        """Return the metadata records of the preamble, by name."""
         return {record.name: dict(record.metadata) for record in self.preamble() if isinstance(record, Metadata)}
 
 
 def _resembles(head: bytes) -> bool:
-    """Whether these first bytes may be a damaged log's: part of the magic is left, or all are zeros."""
+    """Whether these first bytes may be from a damaged log: part of the magic is left, or all are zeros."""
     return not any(head) or any(one == other for one, other in zip(head, MAGIC, strict=False))
 
 
 def _introduction(number: int, facts: ChannelFacts) -> Iterator[Schema | Channel]:
-    """A channel that may not have been introduced yet, with its schema, under a number that no file can hold."""
+    """Yield a channel that may not have been introduced yet, and its schema under a number that no file can hold."""
     schema = 0
     if facts.schema is not None:
-        schema = (1 << 16) + number  # numbers of schemas in a file are below
+        schema = (1 << 16) + number  # schema numbers in a file are lower
         name, encoding, data = facts.schema
         yield Schema(id=schema, name=name, encoding=encoding, data=data)
     yield Channel(
@@ -330,16 +330,16 @@ def _introduction(number: int, facts: ChannelFacts) -> Iterator[Schema | Channel
 
 
 def attached_config(log: Path, attachments: Mapping[str, bytes]) -> dict[str, Any] | None:
-    """The daemon's configuration among what is attached to ``log``; see ``attached_values``."""
+    """Return the daemon configuration among the attachments of ``log``; see ``attached_values``."""
     return attached_values(log, attachments, CONFIG)
 
 
 def attached_values(log: Path, attachments: Mapping[str, bytes], name: str) -> dict[str, Any] | None:
-    """Plain values of the JSON attachment ``name`` among those of ``log``; None where there is none.
+    """Return the plain values of the JSON attachment ``name`` of ``log``, or None without it.
 
     Raises:
-        InputError: it is damaged.
-        ConfigError: it is no JSON object.
+        InputError: the attachment is damaged.
+        ConfigError: the attachment is not a JSON object.
     """
     if name + DAMAGED in attachments:
         raise InputError(f"{log}: {name} in it is damaged")
@@ -356,5 +356,5 @@ def attached_values(log: Path, attachments: Mapping[str, bytes], name: str) -> d
 
 
 def open_log(log: str | Path | LogReader) -> LogReader:
-    """Open a log for reading; see ``LogReader``, which stays itself."""
+    """Open a log for reading; return a ``LogReader`` unchanged."""
     return log if isinstance(log, LogReader) else LogReader(Path(log))

@@ -1,4 +1,4 @@
-"""The recorder: takes encoded messages on the event loop; its thread writes, rotates and keeps the quota."""
+"""Recorder: accepts encoded messages on the event loop; its thread writes, rotates and keeps the quota."""
 
 import asyncio
 import hashlib
@@ -34,12 +34,12 @@ class LogDigest:
         self._hash = hashlib.sha256()
 
     def update(self, key: str, stamp: int, payload: bytes) -> None:
-        """Add one message; lengths are part of the digest, so no two runs share one by shifted borders."""
+        """Add a message; the digest includes lengths, so shifted message borders change it."""
         name = key.encode()
         self._hash.update(_DIGEST_FRAME.pack(stamp, len(name), len(payload)) + name + payload)
 
     def hexdigest(self) -> str:
-        """64 hexadecimal digits of all messages so far."""
+        """Return the digest of all messages so far, as 64 hexadecimal digits."""
         return self._hash.hexdigest()
 
 
@@ -47,24 +47,24 @@ log = logging.getLogger(__name__)
 
 
 _STEP: Final = SECOND
-"""So far apart are a file's dates and the computer's after a step of its clock, not by its drift."""
+"""Difference between the dates of a file and of the computer that shows a clock step, not drift (ns)."""
 
 
 class LogWriter:
     """Writes entries into numbered files; a context manager that finishes the last one.
 
-    All dates of a file are by one offset; when the computer's clock is set to another time the next file begins. So
-    it does when somebody removed the file, which is noticed when it is synced.
+    All dates of a file use one offset; when the clock of the computer is set, a new file begins. A new file also begins
+    if the file was removed, which is detected at the next sync.
 
     Args:
         config: sizes, durations and folder.
-        attachments: JSON-able values attached to every file, by name.
+        attachments: JSON-serialisable values attached to every file, by name.
         metadata: text about the run, in every file.
-        start: daemon time the first file starts at, ns.
-        real_offset: real (UNIX) minus daemon time, ns.
+        start: daemon time of the start of the first file (ns).
+        real_offset: real (UNIX) minus daemon time (ns).
 
     Raises:
-        OSError: from every method: the disk is full or refuses.
+        OSError: from every method: the disk is full or fails.
     """
 
     def __init__(
@@ -79,20 +79,20 @@ class LogWriter:
         self._attachments = attachments
         self._metadata = metadata
         self.real_offset = real_offset
-        """Real (UNIX) minus daemon time, ns; set by the owner when it changes."""
+        """Real (UNIX) minus daemon time (ns); updated by the owner."""
         self._folder = LogFolder(Path(config.directory))
         self._reported: set[Path] = set()
         """Files that could not be removed."""
         self._retained: dict[str, LogEntry] = {}
-        """Newest of every retained topic: the head of the next file, so that each file stands alone."""
+        """Latest message of every retained topic; written first to the next file, so each file is self-contained."""
         self._removed = False
-        """The present file was removed."""
+        """Whether the current file was removed."""
         self._file = self._open(start)
         self._synced = start
 
     @property
     def path(self) -> Path:
-        """The file being written."""
+        """Path of the file being written."""
         return self._file.path
 
     def __enter__(self) -> Self:
@@ -107,7 +107,7 @@ class LogWriter:
             self._file.abandon()
 
     def write(self, entry: LogEntry) -> None:
-        """Add one message; closes chunk and file when they are due."""
+        """Add a message; close the chunk and the file when due."""
         self.tick(entry.log_time)
         if self._is_complete(entry.log_time):
             self._file.finish()
@@ -120,7 +120,7 @@ class LogWriter:
         self._file.add(entry)
 
     def tick(self, now: int) -> None:
-        """Close the chunk, sync the file and keep the quota if that is due at log time ``now``."""
+        """Close the chunk, sync the file and keep the quota if due at log time ``now``."""
         since = self._file.open_since
         if since is not None and now - since >= self._config.chunk_seconds * SECOND:
             self._file.flush()
@@ -133,12 +133,12 @@ class LogWriter:
                 log.warning("%s was removed while it was written: what it held is lost", self.path)
 
     def _is_complete(self, now: int) -> bool:
-        """Whether the next file is due: by size, by age, or because the computer's clock was set."""
+        """Whether a new file is due: by removal, size, age, or because the clock of the computer was set."""
         age = now - self._file.start
         if self._removed or self._file.size >= self._config.rotate_bytes or age >= self._config.rotate_seconds * SECOND:
             return True
-        # 10 * SECOND: shortest time between two files for want of the right date: a clock that is set again and again
-        # makes no flood
+        # 10 * SECOND: minimum age of a file before a clock step ends it, so that a clock set repeatedly does not
+        # cause a flood of files
         return age >= 10 * SECOND and abs(log_offset(now, self.real_offset) - self._file.offset) > _STEP
 
     def _open(self, start: int) -> LogFile:
@@ -164,9 +164,9 @@ class LogWriter:
             return file
 
     def _keep_quota(self) -> None:
-        """Remove the oldest files that exceed the quota; never one that is being written or repaired.
+        """Remove the oldest files beyond the quota, except files being written or repaired.
 
-        A file that cannot be removed stays, counts, and is reported once: the recording goes on.
+        A file that cannot be removed stays in the total and is reported once; the recording continues.
         """
         excess = self._file.size + sum(self._others.values()) - self._config.quota_bytes
         for path, size in list(self._others.items()):
@@ -195,22 +195,22 @@ RepairSink = Callable[[str], None]
 
 
 class Recorder:
-    """Records while its ``async with`` body runs; leaving it finishes the log.
+    """Records while its ``async with`` body runs; finishes the log at the end.
 
-    A disk that is full or refuses ends the recording: ``on_failure`` is called once, later messages count as
-    drops, and nothing is raised, because driving goes on. Unfinished logs in the folder are repaired meanwhile by
-    a process of their own.
+    If the disk is full or fails, the recording ends: ``on_failure`` is called once and later messages are counted as
+    drops. No exception is raised, because driving continues. Meanwhile a separate process repairs the unfinished logs
+    in the folder.
 
     Args:
-        config: where and how.
+        config: recorder settings.
         clock: daemon time of the messages.
         on_failure: called on the event loop with the reason and one line of text.
-        attachments: JSON-able values attached to every file as ``<name>.json`` (config, calibration, versions).
+        attachments: JSON-serialisable values attached to every file as ``<name>.json`` (config, calibration, versions).
         metadata: text about the run, in every file.
-        digest: updated with every recorded message, in the thread.
+        digest: updated in the thread with every recorded message.
         deterministic: for the virtual clock: ``record`` waits for the disk instead of dropping, chunks are closed
-            by log time alone, and ``health`` names no file, so that two runs of one seed record the same.
-        on_repair: called on the event loop with the outcome, in words, of every repair of an unfinished log.
+            by log time only, and ``health`` contains no file name, so that two runs with one seed record the same.
+        on_repair: called on the event loop with the outcome of every repair of an unfinished log, as text.
     """
 
     name = ServiceName.RECORDER.value
@@ -237,9 +237,9 @@ class Recorder:
         self._deterministic = deterministic
         self._batch: list[LogEntry] = []
         self._queue: queue.SimpleQueue[tuple[int, list[LogEntry]] | None] = queue.SimpleQueue()
-        """Batches, each with the offset of real time when it was handed over."""
+        """Batches, each with the real-time offset at its hand-over."""
         self._written = 0
-        """Counted by the thread alone."""
+        """Number of written messages; modified only by the thread."""
         self._progress = threading.Event()
         self._sequences = {topic.name: 0 for topic in TOPICS}
         self._recording = False
@@ -270,13 +270,13 @@ class Recorder:
         await asyncio.shield(self._done)
 
     def record(self, topic: Topic[Any], stamp: int, payload: bytes, at: int | None = None) -> None:
-        """Take one encoded message; never waits for the disk (except in deterministic runs).
+        """Record an encoded message without waiting for the disk, except in deterministic runs.
 
         Args:
-            topic: its entry of the topic table; topics that are not logged are ignored.
-            stamp: the message's own stamp, ns.
-            payload: its bytes on the wire.
-            at: when it was published, ns; None = now.
+            topic: entry of the topic table; topics that are not logged are ignored.
+            stamp: stamp of the message (ns).
+            payload: encoded message.
+            at: time of publication (ns); None for now.
         """
         if not topic.logged:
             return
@@ -290,19 +290,19 @@ class Recorder:
         self._messages += 1
         self._bytes += len(payload)
         if not self._batch and not self._deterministic:
-            # 0.05: a batch is handed over after this time even if it is not full
+            # 0.05: time (s) until a batch is handed over even if it is not full
             self._loop.call_later(0.05, self._hand_over)
         self._batch.append(LogEntry(topic, self._clock.now() if at is None else at, stamp, sequence, payload))
-        # 256: messages handed to the thread together; each hand-over makes both threads wait for the interpreter
+        # 256: messages per hand-over to the thread; each hand-over makes both threads wait for the interpreter
         if len(self._batch) >= 256:
             self._hand_over()
 
     def refuse(self, error: OSError) -> None:
-        """Every later write fails with ``error``: for fault drills."""
+        """Make every later write fail with ``error``, for fault drills."""
         self._refusal = error
 
     def health(self, seq: int) -> RecorderHealth:
-        """State of the recording; counts are of messages and payload bytes handed to the writer."""
+        """Return the state of the recording; counts are messages and payload bytes passed to the writer."""
         now = self._clock.now()
         return RecorderHealth(
             stamp=now,
@@ -334,7 +334,7 @@ class Recorder:
             self._batch = []
 
     def _run(self, start: int, offset: int) -> None:
-        """The thread."""
+        """Write the log; runs in the thread."""
         repair: subprocess.Popen[bytes] | None = None
         try:
             try:
@@ -374,7 +374,7 @@ class Recorder:
 
     def _write(self, writer: LogWriter) -> None:
         for topic in TOPICS:
-            wire.schema(topic)  # once, before the first chunk is due
+            wire.schema(topic)  # cache the schema before the first chunk is due
         wait = None if self._deterministic else self._config.chunk_seconds / 2
         while True:
             try:

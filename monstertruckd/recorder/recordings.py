@@ -1,7 +1,7 @@
 """Remote calls for the recordings on the robot: list, read in chunks, delete.
 
-A download must not harm the robot: chunks are small, their rate is limited by making the caller wait, files are read
-in a thread, and one source downloads at a time. Names are looked up among the files that are there: no path is one.
+Downloads must not disturb the robot: chunks are small, a delay of each answer limits their rate, a thread reads the
+files, and one source downloads at a time. Names are matched against the existing files, so a path is never accepted.
 """
 
 import asyncio
@@ -28,38 +28,38 @@ READ: Final = "recording_read"
 DELETE: Final = "recording_delete"
 
 CHUNK: Final = 65_536
-"""Bytes of one answer at most."""
+"""Maximum data per answer (bytes)."""
 DOWNLOAD_RATE: Final = 1_000_000.0
-"""Bytes a second that all downloads take together."""
+"""Maximum total download rate (bytes/s)."""
 TURN: Final = 5.0
-"""Seconds without a chunk after which another source may download."""
+"""Time without a chunk until another source may download (s)."""
 NAME: Final = re.compile(r"[A-Za-z0-9_.-]{1,120}\.mcap(\.damaged(-\d{1,3})?)?")
 DAMAGED_KIND: Final = "damaged"
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One file."""
+    """Recording file."""
 
     name: str
     bytes: int
     modified: float
-    """Real time of the last change, s since 1970."""
+    """Real time of the last change (s since 1970)."""
     kind: str
     """``run``, ``blackbox`` (the minute before a stop), or ``damaged``: the original of a log that was repaired."""
     open: bool
-    """It is being written: by this daemon, or by another one or a repair that has it locked."""
+    """Whether it is being written by this daemon, or locked by another daemon or a repair."""
 
 
 class Recordings:
-    """The recordings of one robot.
+    """Recordings of a robot.
 
     Args:
-        folders: where they are, by kind.
-        current: file that is being written; None = none is.
-        clock: time.
-        events: gets an event for every deletion, with who requested it.
-        offload: where files are read.
+        folders: folders of the recordings, by kind.
+        current: returns the file being written, or None.
+        clock: time source.
+        events: sink for deletions, with the source of each request.
+        offload: runs the reading of files.
     """
 
     def __init__(
@@ -76,11 +76,11 @@ class Recordings:
         self._events = events
         self._offload = offload
         self._reader = ""
-        """Source that downloads."""
+        """Source that is downloading."""
         self._until = 0
-        """It alone may until then, ns."""
+        """End of its exclusive access (ns)."""
         self._free = 0
-        """When the next chunk may leave, ns."""
+        """Earliest time of the next chunk (ns)."""
         self._reading = asyncio.Lock()
 
     def register(self, rpc: Rpc) -> None:
@@ -97,7 +97,7 @@ class Recordings:
                     continue
                 try:
                     status = path.stat()
-                except FileNotFoundError:  # the quota of the logs, or another caller, took it
+                except FileNotFoundError:  # removed by the log quota or another caller
                     continue
                 damaged = DAMAGED_NAME.search(path.name)
                 shown = DAMAGED_KIND if damaged else kind
@@ -113,7 +113,7 @@ class Recordings:
     async def _list(self, _: dict[str, Any]) -> dict[str, Any]:
         rows = await self._offload(lambda: [replace(row, open=_is_open(path, row)) for path, row in self._files()])
         rows.sort(key=lambda row: row.modified, reverse=True)
-        most = 500  # recordings listed; the newest
+        most = 500  # maximum number of listed recordings, the latest ones
         return {"recordings": [asdict(row) for row in rows[:most]], "left_out": max(len(rows) - most, 0)}
 
     async def _read(self, payload: dict[str, Any]) -> dict[str, Any]:
@@ -131,7 +131,7 @@ class Recordings:
                 path, row = self._find(payload)
                 try:
                     with path.open("rb") as file:
-                        file.seek(min(offset, row.bytes))  # behind the end there is nothing
+                        file.seek(min(offset, row.bytes))  # empty beyond the end
                         data = file.read(CHUNK)
                 except OSError as error:
                     raise InputError(f"recording {row.name}: cannot be read: {error.strerror}") from error
@@ -165,5 +165,5 @@ class Recordings:
 def _is_open(path: Path, row: Recording) -> bool:
     try:
         return row.open or in_use(path)
-    except OSError:  # gone, or not ours to read
+    except OSError:  # removed, or not readable
         return False

@@ -1,7 +1,7 @@
 """Repair of logs that a crash left without an index.
 
-``python -m monstertruckd.recorder.repair FOLDER`` repairs a folder's unfinished logs, niced. The recorder starts
-this as a process of its own: a thread would compete with the control loop for the interpreter.
+``python -m monstertruckd.recorder.repair FOLDER`` repairs the unfinished logs of a folder at low priority. The recorder
+starts it as a separate process, because a thread would compete with the control loop for the interpreter.
 """
 
 import fcntl
@@ -32,17 +32,17 @@ log = logging.getLogger(__name__)
 
 _PART: Final = ".part"
 RECOVERED: Final = "recovered"
-"""Metadata record of a repaired log: of which log it is, and what is lost."""
+"""Metadata record of a repaired log: name of the original log, and the losses."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recovery(LogDamage):
-    """Outcome of one repair."""
+    """Outcome of a repair."""
 
     path: Path
-    """The repaired file; the log itself if it was sound."""
+    """Repaired file; the log itself if it was undamaged."""
     original: Path | None = None
-    """Where the damaged log is kept; None when it was sound, or is where it was."""
+    """Path of the kept damaged log; None if the log was undamaged or has not moved."""
 
     def __str__(self) -> str:
         if self.damage is None:
@@ -52,21 +52,21 @@ class Recovery(LogDamage):
 
 
 def in_use(path: Path) -> bool:
-    """Whether the file is locked by a recorder or a repair; two who ask at once do not see each other."""
+    """Whether a recorder or a repair has locked the file; two simultaneous callers do not see each other."""
     with path.open("rb") as file:
         return not _lock(file, fcntl.LOCK_SH)
 
 
 def recover(source: str | Path, target: str | Path, stop: threading.Event | None = None) -> Recovery:
-    """Rewrite every whole chunk of ``source`` as a finished log ``target``.
+    """Rewrite every intact chunk of ``source`` as a finished log ``target``.
 
-    ``target`` appears complete or not at all. It may be ``source`` itself: a sound log stays as it is; a damaged one
-    is kept, unchanged, as NAME.mcap.damaged, and the repaired one takes its name.
+    ``target`` appears complete or not at all. It may be ``source`` itself: an undamaged log is left unchanged; a
+    damaged log is kept unchanged as NAME.mcap.damaged, and the repaired log takes its name.
 
     Args:
-        source: the damaged log.
-        target: the repaired one.
-        stop: set by another thread, abandons the repair.
+        source: damaged log.
+        target: repaired log.
+        stop: event set by another thread to abandon the repair.
 
     Raises:
         InputError: not a log, being written right now, or ``target`` is another file or cannot be written.
@@ -103,7 +103,7 @@ def _recovery(done: LogDamage, path: Path, original: Path | None = None) -> Reco
 
 @contextmanager
 def _written(target: Path) -> Iterator[Path]:
-    """Yield where to write ``target`` until it is complete; what is there if the body fails is removed."""
+    """Yield the path for writing ``target`` until it is complete; remove the partial file if the body fails."""
     part = target.with_name(target.name + _PART)
     try:
         yield part
@@ -116,7 +116,7 @@ def _written(target: Path) -> Iterator[Path]:
 
 
 def _keep(source: Path) -> Path:
-    """Give a damaged log a second name, under which it stays; a repair that was cut off may have done so."""
+    """Give a damaged log a second name to keep it; an interrupted repair may already have done so."""
     for kept in damaged_names(source):
         if not os.path.lexists(kept):
             kept.hardlink_to(source)
@@ -133,7 +133,7 @@ def recover_directory(directory: Path, stop: threading.Event | None = None) -> l
 
 
 def _repairs(directory: Path, stop: threading.Event | None = None) -> Iterator[Recovery | TruckError | OSError]:
-    """Outcome of every unfinished log of a folder, logged as well."""
+    """Repair every unfinished log of a folder; log and yield each outcome."""
     for path in sorted(directory.glob("*.mcap")):
         try:
             if not _unfinished(path):
@@ -150,10 +150,10 @@ def _repairs(directory: Path, stop: threading.Event | None = None) -> Iterator[R
 
 
 def _unfinished(path: Path) -> bool:
-    """Whether a log waits for repair; a folder or pipe of that name does not.
+    """Whether a log needs repair; a folder or pipe of that name does not.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the log cannot be read.
     """
     return path.is_file() and not is_finished(path) and not in_use(path)
 
@@ -167,7 +167,7 @@ def _lock(file: BinaryIO, how: int) -> bool:
 
 
 def _copy(salvage: Salvage, source: Path, output: BinaryIO, stop: threading.Event | None) -> LogDamage:
-    """Copy all whole records and note in the metadata ``recovered`` what is lost."""
+    """Copy all intact records and record the losses in the metadata ``recovered``."""
     writer = Writer(output)
     registered = _Registered(writer)
     started = False
@@ -205,7 +205,7 @@ class _Registered:
         self._channels: dict[tuple[int, ChannelFacts], int] = {}
 
     def channel(self, number: int, facts: ChannelFacts) -> int:
-        """Number in the new file of a channel of the old one."""
+        """Return the number in the new file for a channel of the old file."""
         if (number, facts) not in self._channels:
             if facts.schema not in self._schemas and facts.schema is not None:
                 self._schemas[facts.schema] = self._writer.register_schema(*facts.schema)
@@ -217,7 +217,7 @@ class _Registered:
 
 
 def start_repair(folder: Path) -> "subprocess.Popen[bytes] | None":
-    """Start the process if there is anything to repair.
+    """Start the repair process if there is anything to repair.
 
     Raises:
         OSError: the folder cannot be read, or no process can be started.
@@ -229,7 +229,7 @@ def start_repair(folder: Path) -> "subprocess.Popen[bytes] | None":
 
 
 def repairs(process: "subprocess.Popen[bytes]") -> Iterator[str]:
-    """Yield the outcome for each log, in words, until the process ends."""
+    """Yield the outcome for each log as text, until the process ends."""
     assert process.stdout is not None
     with process.stdout as lines:
         for line in lines:
@@ -238,7 +238,7 @@ def repairs(process: "subprocess.Popen[bytes]") -> Iterator[str]:
 
 
 def _may_wait(path: Path) -> bool:
-    """Whether a log may wait for repair; the process reports one that cannot be read."""
+    """Whether a log may need repair; the repair process reports unreadable logs."""
     try:
         return _unfinished(path)
     except OSError:
@@ -246,7 +246,7 @@ def _may_wait(path: Path) -> bool:
 
 
 def main(folder: Path) -> None:
-    """Repair ``folder``; standard output has the outcome for each log, as a JSON string on a line."""
+    """Repair ``folder``; print the outcome for each log as a JSON string per line."""
     os.nice(15)
     logging.disable()  # the daemon reports the outcomes, with the journal's priorities
     for outcome in _repairs(folder):

@@ -1,7 +1,7 @@
-"""The newest messages in memory, by time and by size: what a black box is written from.
+"""Ring of recent messages in memory, bounded by time and size; the source of black boxes.
 
-Messages are stored contiguously in blocks: times, number of the topic, payload. Blocks are memory maps of their
-own, which return to the kernel at once; messages as Python objects fragment the heap, and the daemon grows for hours.
+Messages are stored contiguously in blocks: times, topic number, payload. Each block is a separate memory map, which
+returns to the kernel at once. Python objects would fragment the heap, and the daemon would grow for hours.
 """
 
 from collections import deque
@@ -18,28 +18,28 @@ from monstertruck_schemas.topics import Topic
 from monstertruckd.recorder.log_file import LogEntry
 
 SHARE: Final = 32
-"""Part of the whole memory that a block takes at most."""
+"""A block takes at most the memory limit divided by this."""
 
 _HEAD: Final = Struct("<qqqII")
-"""Log time, stamp, sequence, number of the topic, length of the payload."""
+"""Log time, stamp, sequence, topic number, payload length."""
 
 
 PICTURES: Final = "foxglove.CompressedImage"
 JOURNAL: Final = "event"
-"""Group of topics that are kept longer than the others: they are small."""
+"""Group of topics that are kept longer than others, because their messages are small."""
 
 
 @dataclass(frozen=True, slots=True)
 class Retention:
-    """How long each sort of message is kept, s."""
+    """Retention of each kind of message (s)."""
 
     everything: float
     journal: float
-    """Events and log records."""
+    """Retention of events and log records."""
     pictures: float
-    """All pictures; older ones are sampled."""
+    """Retention of all pictures; older ones are sampled."""
     picture_period: float
-    """Between two pictures that are left of the older ones."""
+    """Interval between the older pictures that are kept."""
 
 
 class _Block:
@@ -52,11 +52,11 @@ class _Block:
         self.used = 0
 
     def time(self, at: int) -> int:
-        """Log time of the entry that begins there."""
+        """Return the log time of the entry at offset ``at``."""
         return int(_HEAD.unpack_from(self.data, at)[0])
 
     def entry(self, at: int, topics: list[Topic[Any]]) -> LogEntry:
-        """The entry that begins there."""
+        """Return the entry at offset ``at``."""
         log_time, stamp, sequence, topic, length = _HEAD.unpack_from(self.data, at)
         begin = at + _HEAD.size
         return LogEntry(topics[topic], log_time, stamp, sequence, self.data[begin : begin + length])
@@ -68,12 +68,12 @@ def _length(entry: LogEntry) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """Entries of one sort at one instant; what the ring does afterwards does not change it."""
+    """Entries of one kind at one instant; later changes of the ring do not affect it."""
 
     topics: list[Topic[Any]]
     blocks: tuple[_Block, ...]
     at: int
-    """Where the first entry begins in the first block."""
+    """Offset of the first entry in the first block."""
     count: int
 
     def __iter__(self) -> Iterator[LogEntry]:
@@ -88,11 +88,11 @@ class _View:
 
 
 class RingSnapshot:
-    """Everything a ring kept at one instant, by log time; put in order only when iterated over, in any thread.
+    """Contents of a ring at one instant, by log time; sorted only on iteration, in any thread.
 
     Args:
-        heads: newest messages of retained topics from before the window; they stand at its begin.
-        views: of the parts; the first one that is not empty begins the window.
+        heads: last messages of retained topics before the window; they get the log time of its start.
+        views: views of the parts; the first one that is not empty starts the window.
     """
 
     def __init__(self, heads: tuple[LogEntry, ...], views: tuple[_View, ...]) -> None:
@@ -109,32 +109,32 @@ class RingSnapshot:
 
 
 class _Part:
-    """Entries of one sort, oldest first.
+    """Entries of one kind, oldest first.
 
     Args:
-        seconds: how long they are kept.
-        block: bytes of a block; a larger entry gets one of its own.
+        seconds: retention time.
+        block: block size (bytes); a larger entry gets a separate block.
     """
 
     def __init__(self, seconds: float, block: int) -> None:
         self.size = 0
-        """Bytes of its blocks."""
+        """Total size of the blocks (bytes)."""
         self.oldest = self.newest = 0
-        """Log times of the first and the last entry, if there is one."""
+        """Log times of the first and the last entry; undefined without entries."""
         self._span = round(seconds * SECOND)
         self._block = block
         self._topics: list[Topic[Any]] = []
         self._numbers: dict[str, int] = {}
         self._blocks: deque[_Block] = deque()
         self._at = 0
-        """Where the first entry begins in the first block."""
+        """Offset of the first entry in the first block."""
         self._count = 0
 
     def __len__(self) -> int:
         return self._count
 
     def append(self, entry: LogEntry) -> bool:
-        """Add the newest entry; whether that took another block."""
+        """Append an entry; return whether that took a new block."""
         topic, log_time, stamp, sequence, payload = entry
         length = len(payload)
         grown = not self._blocks or self._blocks[-1].used + _HEAD.size + length > len(self._blocks[-1].data)
@@ -156,7 +156,7 @@ class _Part:
         return grown
 
     def popleft(self) -> LogEntry:
-        """Take out the oldest entry."""
+        """Remove and return the oldest entry."""
         entry = self._blocks[0].entry(self._at, self._topics)
         self._at += _length(entry)
         self._count -= 1
@@ -172,7 +172,7 @@ class _Part:
         return self._count > 0 and now - self.oldest > self._span
 
     def view(self) -> _View:
-        """What is here now; copies no entries."""
+        """Return a view of the current entries, without copying them."""
         return _View(self._topics, tuple(self._blocks), self._at, self._count)
 
     def _number(self, topic: Topic[Any]) -> int:
@@ -182,20 +182,20 @@ class _Part:
 
 
 class Ring:
-    """Bounded memory of the newest messages.
+    """Bounded memory of recent messages.
 
-    When the bytes do not suffice, a journal of more than a quarter of them loses its oldest messages first;
-    then the oldest pictures go, then the oldest of the rest; all are counted. Of every retained topic the newest
-    message from before the window is kept, so that what is left stands alone.
+    Beyond the size limit, a journal that takes more than a quarter of it loses its oldest messages first, then the
+    oldest pictures are dropped, then the oldest other messages; all are counted. The last message before the window is
+    kept for every retained topic, so that the remaining messages are complete on their own.
 
     Args:
-        span: how long what is kept.
-        limit: bytes, of whole blocks; the newest message of each sort stays even beyond them.
+        span: retention of each kind of message.
+        limit: total size of the blocks (bytes); the latest message of each kind stays even beyond it.
     """
 
     def __init__(self, span: Retention, limit: int) -> None:
         self._limit = limit
-        block = min(256 * 1024, limit // SHARE)  # bytes of entries that are freed together
+        block = min(256 * 1024, limit // SHARE)  # block size in bytes; a block is freed as a whole
         self._rest = _Part(span.everything, block)
         self._journal = _Part(span.journal, block)
         self._fresh = _Part(span.pictures, block)
@@ -204,18 +204,18 @@ class Ring:
         self._period = round(span.picture_period * SECOND)
         self._heads: dict[str, LogEntry] = {}
         self._newest = 0
-        """Log time of the newest message."""
+        """Log time of the latest message."""
         self._next_expiry = 0
         self.lost = 0
-        """Messages removed early for want of memory."""
+        """Number of messages removed early for lack of memory."""
 
     @property
     def size(self) -> int:
-        """Bytes taken by blocks; the newest message of each retained topic comes on top."""
+        """Size of the blocks (bytes), without the kept messages of retained topics."""
         return self._rest.size + self._journal.size + self._sampled.size + self._fresh.size
 
     def add(self, entry: LogEntry) -> None:
-        """Add the newest message, and remove what is too old or too much."""
+        """Add a message, and remove messages beyond the time and size limits."""
         part = self._part_of.get(entry.topic.name)
         if part is None:
             part = self._part(entry.topic)
@@ -225,7 +225,7 @@ class Ring:
             self._trim()
 
     def snapshot(self) -> RingSnapshot:
-        """Everything kept; takes no longer however much it is than a list of its blocks."""
+        """Return a snapshot of the ring; copies only the list of blocks, however many messages there are."""
         self._trim()
         parts = (self._rest, self._journal, self._sampled, self._fresh)
         return RingSnapshot(tuple(self._heads.values()), tuple(part.view() for part in parts))
@@ -236,8 +236,8 @@ class Ring:
         return part
 
     def _trim(self) -> None:
-        """Remove expired entries; whatever then exceeds the limit is removed and counted as lost."""
-        # (SECOND // 10): nanoseconds between two removals of expired entries: removing many at a time is cheaper
+        """Remove expired entries, then remove entries beyond the size limit and count them as lost."""
+        # SECOND // 10: interval (ns) between removals of expired entries; removing many at a time is cheaper
         self._next_expiry = self._newest + (SECOND // 10)
         self._expire(self._newest)
         while self.size > self._limit and (crowded := self._fullest()) is not None:
@@ -257,9 +257,8 @@ class Ring:
                 kept.append(picture)
 
     def _fullest(self) -> _Part | None:
-        """The part to remove from; never the newest message of its sort."""
-        # 0.25: part of the whole memory that the journal takes at most: a flood of it must not displace what was
-        # measured
+        """Return the part to remove from, if any; the latest message of each kind stays."""
+        # 0.25: maximum share of the memory for the journal; a flood of events must not displace measurements
         flooded = self._journal.size > 0.25 * self._limit
         first = (self._journal,) if flooded else ()
         parts = (*first, self._sampled, self._fresh, self._rest, self._journal)

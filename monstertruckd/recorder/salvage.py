@@ -1,9 +1,9 @@
-"""Search of a damaged log for whole records: every chunk whose checksum holds, wherever it is in the file.
+"""Salvage of intact records from a damaged log: every chunk with a valid checksum, anywhere in the file.
 
-The file is read from its begin to its end, record by record. Where a record does not fit, the next one that does is
-looked for, byte by byte; a chunk fits by its checksum, another record by lengths that add up. Whatever lies between is
-a gap. Channels are those of the chunks, of the index, and of the metadata that the recorder repeats (``CHANNELS``), so
-that a message outlasts the chunk in which its channel was introduced.
+The file is read from start to end, record by record. After an invalid record, the next valid one is searched byte by
+byte: a chunk is valid if its checksum matches, another record if its lengths are consistent. The bytes between are a
+gap. Channels come from the chunks, the index, and the metadata that the recorder repeats (``CHANNELS``), so a message
+can be read even if the chunk that introduced its channel is lost.
 """
 
 import errno
@@ -52,39 +52,39 @@ _CANDIDATE: Final = re.compile(rb"[\x01-\x0f].{5}\x00\x00\x00", re.DOTALL)
 """A known opcode, and a length below 1 TB."""
 _CHUNK_CANDIDATE: Final = re.compile(rb"(?=\x06.{5}\x00\x00\x00)", re.DOTALL)
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
-"""First and last log time, size unpacked, checksum, length of the compression's name."""
+"""First and last log time, uncompressed size, checksum, length of the compression name."""
 _SIZE: Final = struct.Struct("<Q")
 _INDEX_HEAD: Final = struct.Struct("<HI")
 _INDEX_ENTRY: Final = 16
-"""Bytes: log time and offset of a message."""
+"""Size of an index entry (bytes): log time and offset of a message."""
 _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17}
-"""Of records whose content has one length."""
+"""Content lengths of fixed-size records (bytes)."""
 UNKNOWN: Final = "unknown/channel-{}"
-"""Topic of messages whose channel is lost."""
+"""Topic name for messages whose channel is lost."""
 
 
 class Span(NamedTuple):
-    """A time in which messages are lost, in log times (ns); None = from the begin, or to the end."""
+    """Log time interval with lost messages (ns); None: from the start, or to the end."""
 
     start: int | None
     end: int | None
 
 
 class ChannelFacts(NamedTuple):
-    """What a channel is, without the numbers of its file."""
+    """Channel description, without the numbers used in its file."""
 
     topic: str
     message_encoding: str
     metadata: tuple[tuple[str, str], ...]
     schema: tuple[str, str, bytes] | None
-    """Name, encoding and data."""
+    """Schema name, encoding and data."""
 
 
 class _Bytes:
-    """A file's bytes; those that the disk refuses are zeros.
+    """Bytes of a file; unreadable ones are zeros.
 
     Args:
-        file: opened for reading.
+        file: file opened for reading.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -93,7 +93,7 @@ class _Bytes:
 
     def at(self, begin: int, size: int) -> bytes:
         """Return ``size`` bytes from ``begin``, fewer at the end."""
-        sector = 4096  # bytes that a disk refuses together
+        sector = 4096  # unit of unreadable data on a disk (bytes)
         try:
             return os.pread(self._descriptor, size, begin)
         except OSError as error:
@@ -106,11 +106,11 @@ class _Bytes:
             return self.at(begin, middle - begin) + self.at(middle, begin + size - middle)
 
     def is_magic(self, at: int) -> bool:
-        """Whether the mark of begin and end is there."""
+        """Whether the magic bytes are at this offset."""
         return self.at(at, len(MAGIC)) == MAGIC
 
     def next_candidate(self, at: int) -> int:
-        """Return where a record may begin, from ``at`` on; the end if nowhere."""
+        """Return the next possible start of a record from ``at`` on, or the end of the file."""
         window = 1 << 20  # bytes searched at once
         while at < self.size:
             found = _CANDIDATE.search(self.at(at, window + HEAD.size))
@@ -121,64 +121,64 @@ class _Bytes:
 
 
 class Salvage:
-    """The whole records of a log, in order, each chunk once.
+    """Intact records of a log, in order, each chunk once.
 
     Args:
-        file: the log, opened for reading; it must stay open.
+        file: log opened for reading; it must stay open.
     """
 
     def __init__(self, file: BinaryIO) -> None:
         self._data = _Bytes(file)
         self.indexed = _is_indexed(file)
-        """The index at the file's end is sound."""
+        """Whether the index at the end of the file is valid."""
         self.ended = self._data.size > len(MAGIC) and self._data.is_magic(self._data.size - len(MAGIC))
-        """The file ends as a finished log does."""
+        """Whether the file ends like a finished log."""
         self.messages = 0
-        """Messages given so far."""
+        """Number of messages yielded so far."""
         self.first: int | None = None
-        """Least log time of the messages given so far, ns."""
+        """Minimum log time of the messages yielded so far (ns)."""
         self.flaws: list[str] = []
-        """Damage that costs no message, found so far."""
+        """Damage found so far that loses no message."""
         self._spans: list[Span] = []
         self._newest: int | None = None
-        """Greatest log time of the messages given so far, ns."""
+        """Maximum log time of the messages yielded so far (ns)."""
         self._gap = False
-        """Nothing was given since the last gap."""
+        """Whether nothing has been yielded since the last gap."""
         self._found = _Scan(self._data, trusted=self.indexed).run()
 
     @property
     def strange(self) -> bool:
-        """Whether this is no log at all: another begin, and nothing of a log behind it.
+        """Whether the file is not a log: no magic bytes at the start, and no records after it.
 
-        One of zeros is what a power cut leaves of a log that was never synced.
+        A file of zeros is a log: a power cut leaves one if the log was never synced.
         """
         begin = self._data.at(0, len(MAGIC))
         return not (MAGIC.startswith(begin) or any(self._found.parts)) and any(begin)
 
     @property
     def gaps(self) -> int:
-        """Places at which something cannot be read."""
+        """Number of unreadable places."""
         return self._found.parts.count(None)
 
     @property
     def repeated(self) -> int:
-        """Chunks that are there more than once, and are given once."""
+        """Number of duplicate chunks; each chunk is yielded once."""
         return self._found.repeated
 
     @property
     def counted(self) -> bool:
-        """Whether ``lost`` is all; without an index it is the least."""
+        """Whether ``lost`` is exact; without an index it is a lower bound."""
         return self._found.statistics is not None
 
     @property
     def lost(self) -> int:
-        """Messages that are lost, as far as the file says; after ``records``."""
+        """Number of lost messages, as far as the file shows; valid after ``records``."""
         statistics = self._found.statistics
         return self._found.indexed if statistics is None else max(statistics.message_count - self.messages, 0)
 
     @property
     def lacking(self) -> bool:
-        """Whether an attachment or metadata is lost, as far as the file says."""
+        """Whether an attachment or metadata is lost, as far as the file shows."""
         statistics, kinds = self._found.statistics, [part.opcode for part in self._found.parts if part]
         return statistics is not None and (
             kinds.count(Opcode.ATTACHMENT) < statistics.attachment_count
@@ -186,13 +186,13 @@ class Salvage:
         )
 
     def spans(self) -> list[Span]:
-        """Return the times of lost messages, in order; after ``records``."""
+        """Return the time spans of lost messages, in order; valid after ``records``."""
         if self._found.statistics is None:
             return self._spans
         return self._missing() if self.lost else []
 
     def _missing(self) -> list[Span]:
-        """Spans of chunks that the index names and that are not there, neighbours as one."""
+        """Return the spans of indexed chunks that are missing; adjacent ones are merged."""
         there = Counter(self._found.chunks)
         spans: list[Span] = []
         alone = True
@@ -211,7 +211,7 @@ class Salvage:
         """Yield headers, attachments, metadata, and messages with their channel, in the order of the file.
 
         Args:
-            begin: byte from which on they are yielded; those before it are counted.
+            begin: offset (bytes) of the first record to yield; messages before it are only counted.
         """
         self._newest, self._gap = None, False
         for part in self._found.parts:
@@ -234,7 +234,7 @@ class Salvage:
             self._spans.append(Span(self._newest, None))
 
     def _count(self, times: "_Times") -> None:
-        """Note messages that are there."""
+        """Count messages that are present."""
         if not times.messages:
             return
         if self._gap:
@@ -281,27 +281,27 @@ def _is_indexed(file: BinaryIO) -> bool:
 
 
 class _WholeRecord(NamedTuple):
-    """A record that is whole."""
+    """Intact record."""
 
     offset: int
     opcode: int
     length: int
-    """Of its content."""
+    """Length of the content (bytes)."""
 
     @property
     def end(self) -> int:
-        """Offset of what follows."""
+        """Offset of the next record."""
         return self.offset + HEAD.size + self.length
 
     def content(self, data: _Bytes) -> bytes:
-        """Its content in the file."""
+        """Return the content of the record."""
         return data.at(self.offset + HEAD.size, self.length)
 
     def read(self, data: _Bytes) -> Any:
-        """The record, whose lengths add up.
+        """Return the record, whose lengths are consistent.
 
         Raises:
-            McapError: they do not; or one of ``DAMAGE``.
+            McapError: inconsistent lengths; or one of ``DAMAGE``.
         """
         content = self.content(data)
         stream = ReadDataStream(BytesIO(content))
@@ -318,27 +318,27 @@ class _Times(NamedTuple):
 
     messages: int
     begin: int
-    """Of the first one in the file."""
+    """Log time of the first message in the file."""
     first: int
-    """The least."""
+    """Minimum log time."""
     newest: int
-    """The greatest."""
+    """Maximum log time."""
 
     @classmethod
     def of(cls, times: Sequence[int]) -> "_Times":
-        """Of messages in their order."""
+        """Return the times of messages in file order."""
         return cls(len(times), times[0], min(times), max(times)) if times else cls(0, 0, 0, 0)
 
 
 @dataclass(slots=True)
 class _KnownChannels:
-    """Schemas and channels by number; the first one of a number stands."""
+    """Schemas and channels by number; the first of each number is kept."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
 
     def learn(self, record: McapRecord) -> None:
-        """Note a schema or channel."""
+        """Add a schema or channel."""
         if isinstance(record, Schema):
             self.schemas.setdefault(record.id, record)
         elif isinstance(record, Channel):
@@ -347,35 +347,35 @@ class _KnownChannels:
 
 @dataclass(slots=True)
 class _Found:
-    """What the first pass learns of a file."""
+    """Results of the first pass over a file."""
 
     parts: list[_WholeRecord | None] = field(default_factory=list)
-    """Whole records of the data section; None = a gap."""
+    """Intact records of the data section; None for a gap."""
     sealed: _KnownChannels = field(default_factory=_KnownChannels)
-    """Of whole chunks, and of a sound index."""
+    """Channels of intact chunks and of a valid index."""
     spare: _KnownChannels = field(default_factory=_KnownChannels)
-    """Of records without a checksum."""
+    """Channels of records without a checksum."""
     names: dict[int, str] = field(default_factory=dict)
-    """Topics by channel, from the recorder's metadata."""
+    """Topics by channel number, from the metadata of the recorder."""
     times: dict[int, _Times] = field(default_factory=dict)
-    """Of the messages of each whole chunk, by the chunk's offset."""
+    """Message times of each intact chunk, by chunk offset."""
     chunks: list[tuple[int, int, int]] = field(default_factory=list)
-    """First and last log time, and size, of whole chunks."""
+    """First and last log time, and size, of intact chunks."""
     expected: list[ChunkIndex] = field(default_factory=list)
-    """Chunks that a sound index names."""
+    """Chunks listed in a valid index."""
     statistics: Statistics | None = None
-    """Of a sound index."""
+    """Statistics of a valid index."""
     indexed: int = 0
-    """Messages that the message indexes of lost chunks name."""
+    """Number of messages listed in the message indexes of lost chunks."""
     repeated: int = 0
 
 
 class _Scan:
-    """The first pass over a file.
+    """First pass over a file.
 
     Args:
-        data: the file.
-        trusted: its index is sound.
+        data: bytes of the file.
+        trusted: whether its index is valid.
     """
 
     def __init__(self, data: _Bytes, *, trusted: bool) -> None:
@@ -383,16 +383,16 @@ class _Scan:
         self._found = _Found()
         self._seen: set[bytes] = set()
         self._behind = False
-        """The data section is over: damage there costs no message."""
+        """Whether the scan is past the data section, where damage loses no message."""
         self._sure = True
-        """No gap since the begin or the last chunk: a message index is that of this chunk."""
+        """Whether there is no gap since the start or the last chunk, so a message index belongs to this chunk."""
         self._broken = False
-        """There is a gap, perhaps in the index."""
+        """Whether there is a gap, possibly in the index."""
         self._loose = False
-        """The log has messages outside of chunks, behind no gap."""
+        """Whether the log has messages outside chunks before any gap."""
 
     def run(self) -> _Found:
-        """Find all whole records."""
+        """Find all intact records."""
         at, in_step = 0, True
         while at < self._data.size:
             if self._data.is_magic(at):
@@ -408,15 +408,15 @@ class _Scan:
                 in_step, at = self._take_unsealed(part)
         found, parts = self._found, self._found.parts
         loose = found.statistics is not None and not found.statistics.chunk_count
-        if self._broken and not (loose or self._loose):  # what looks like messages is inside of broken chunks
+        if self._broken and not (loose or self._loose):  # apparent messages are inside broken chunks
             self._found.parts = [part for part in parts if part is None or part.opcode != Opcode.MESSAGE]
         return self._found
 
     def _take_unsealed(self, part: _WholeRecord) -> tuple[bool, int]:
-        """Note a record without a valid checksum, which may be cut off, or overwritten by a chunk.
+        """Add a record without a valid checksum, which may be truncated or overwritten by a chunk.
 
         Returns:
-            Whether what follows is in step, and where it begins.
+            Whether the following data is in step, and its offset.
         """
         content = part.content(self._data)
         for found in _CHUNK_CANDIDATE.finditer(content):
@@ -436,7 +436,7 @@ class _Scan:
             self._found.parts.append(None)
 
     def _part(self, at: int, *, in_step: bool) -> _WholeRecord | None:
-        """The record that begins there, if it is whole."""
+        """Return the record at offset ``at`` if it is intact."""
         head = self._data.at(at, HEAD.size)
         if len(head) < HEAD.size:
             return None
@@ -465,7 +465,7 @@ class _Scan:
         return bool(size == part.length - _INDEX_HEAD.size and size % _INDEX_ENTRY == 0)
 
     def _adds_up(self, part: _WholeRecord) -> bool:
-        """Whether the lengths of a chunk add up, looked at before all of it is read."""
+        """Whether the lengths of a chunk are consistent; checked before reading all of it."""
         head = self._data.at(part.offset + HEAD.size, _CHUNK_HEAD.size)
         if len(head) < _CHUNK_HEAD.size:
             return False
@@ -474,7 +474,7 @@ class _Scan:
         return len(size) == _SIZE.size and _CHUNK_HEAD.size + named + _SIZE.size + _SIZE.unpack(size)[0] == part.length
 
     def _is_followed(self, part: _WholeRecord) -> bool:
-        """Whether the end of the file, or the head of another record, follows."""
+        """Whether the record is followed by the end of the file or by a record head."""
         rest = self._data.size - part.end
         if rest == 0 or self._data.is_magic(part.end):
             return True
@@ -496,14 +496,14 @@ class _Scan:
         return in_step or part.opcode != Opcode.ATTACHMENT or self._is_sealed(part)
 
     def _is_sealed(self, part: _WholeRecord) -> bool:
-        """Whether a whole record is what its own checksum says."""
+        """Whether an intact record has a matching checksum."""
         if part.opcode != Opcode.ATTACHMENT:
             return part.opcode == Opcode.CHUNK
         record = part.read(self._data)
         return checked_attachment(record, part.content(self._data)) is record
 
     def _take(self, part: _WholeRecord) -> None:
-        """Note a whole record."""
+        """Add an intact record."""
         found = self._found
         match part.opcode:
             case Opcode.DATA_END:
@@ -528,7 +528,7 @@ class _Scan:
                 self._take_once(part)
 
     def _take_index(self, record: McapRecord) -> None:
-        """Note a record of an index."""
+        """Add an index record."""
         if isinstance(record, Statistics) and self._trusted:
             self._found.statistics = record
         elif isinstance(record, ChunkIndex) and self._trusted:
