@@ -1,1 +1,1 @@
-"""What the computer and its init system see of the daemon: health, logging, notifications, stalls."""
+"""Interface of the daemon to the computer and its init system: health, logging, notifications, stalls."""

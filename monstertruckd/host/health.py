@@ -1,4 +1,4 @@
-"""Health of every service as a topic, and real time against the daemon's own."""
+"""Health of every service as a topic, and the offset of real time from daemon time."""
 
 import logging
 from collections.abc import Callable, Collection
@@ -23,25 +23,24 @@ log = logging.getLogger(__name__)
 HEALTH_PERIOD = 1.0
 
 PASSING: Final = frozenset({Reason.SLOW_LINK})
-"""Reasons of a service that works, but badly: its warning says so, its information that it is over."""
+"""Reasons for degraded operation: a warning reports its start, an information event its end."""
 LASTING: Final = frozenset({Reason.FILE_DAMAGED, Reason.LOG_DAMAGED})
-"""Reasons of a service that goes on without something: its warning says so until the daemon ends."""
+"""Reasons for permanently reduced operation: the warning stays until the daemon exits."""
 
 
 class HealthBoard:
-    """Collects every service's state, publishes the table on change and once a second.
+    """Collects the state of every service; publishes the table on change and once a second.
 
-    The loss and the recovery of a service are events; a repeated failure of one outage is none, unless its cause is
-    another one or the service is given up. A device that was
-    unplugged from a hub is reported at its second failure: if the whole hub is gone there is none, as it waits for the
-    hub, whose loss is one event for all.
+    Loss and recovery of a service are events. Repeated failures within one outage are not, unless the cause changes or
+    the service is given up. A device unplugged from a hub is reported at its second failure. If the whole hub is gone,
+    there is no second failure: the device waits for the hub, whose loss is one event for all its devices.
 
     Args:
-        clock: time.
-        out: the table.
-        events: losses and recoveries.
-        waiting: what keeps the service of that name from starting, in words; None = nothing.
-        on_hubs: services whose device hangs on a hub.
+        clock: time source.
+        out: publisher of the table.
+        events: sink for losses and recoveries.
+        waiting: describes the reason why the named service waits to start; None if it does not wait.
+        on_hubs: services whose device is connected through a hub.
     """
 
     name = ServiceName.HEALTH.value
@@ -62,12 +61,12 @@ class HealthBoard:
         self._unplugged: set[str] = set()
         self._rows: dict[str, ServiceHealth] = {}
         self._down: dict[str, set[Reason]] = {}
-        """Services that do not work, with the causes that were reported since they did."""
+        """Services that are down, with the causes reported during the outage."""
         self._degraded: dict[str, Event] = {}
         self._damaged: dict[str, Event] = {}
 
     def observe_event(self, event: Event) -> None:
-        """Take any service's event: its row names what it suffers from until it says that it is over, or restarts."""
+        """Handle an event of any service: its row shows the problem until the service reports its end or restarts."""
         if event.reason in PASSING and event.severity is Severity.INFO:
             self._degraded.pop(event.source, None)
         elif event.reason in PASSING:
@@ -79,7 +78,7 @@ class HealthBoard:
         self._publish()
 
     def report(self, row: ServiceHealth) -> None:
-        """Take in a service's new state (a ``HealthSink``)."""
+        """Update the state of a service (a ``HealthSink``)."""
         self._rows[row.name] = row
         if row.state is ServiceState.STARTING:
             self._degraded.pop(row.name, None)
@@ -100,12 +99,12 @@ class HealthBoard:
         self._publish()
 
     def _may_be_its_hub(self, row: ServiceHealth) -> bool:
-        """The first time that a working device on a hub is gone."""
+        """Whether this is the first loss of a working device on a hub."""
         first = row.state is ServiceState.BACKOFF and not (row.name in self._down or row.name in self._unplugged)
         return first and row.reason is Reason.DEVICE_LOST and row.name in self._on_hubs
 
     def rows(self) -> tuple[ServiceHealth, ...]:
-        """All services, in the order in which they first reported."""
+        """Return the rows of all services, in order of their first report."""
         return tuple(self._with_reason(row) for row in self._rows.values())
 
     def _with_reason(self, row: ServiceHealth) -> ServiceHealth:
@@ -117,20 +116,20 @@ class HealthBoard:
         return row
 
     def require(self, name: str) -> None:
-        """Refuse what is asked of a service that has failed for good.
+        """Refuse requests to a service that has failed permanently.
 
         Raises:
-            RequestRefusedError: it has.
+            RequestRefusedError: the service has failed permanently.
         """
         row = self._rows.get(name)
         if row is not None and row.state is ServiceState.FAILED:
             raise RequestRefusedError(Reason.SERVICE_FAILED, f"{name}: {row.detail}")
 
     async def run(self, ready: Ready) -> None:
-        """Publish the table once a second; log what is not ready after the start, and once that all are."""
+        """Publish the table once a second; after the start, log missing services, and once that all are ready."""
         ready()
         complete = False
-        summary_after = 5  # periods after the start at which the log says what is there and what is not
+        summary_after = 5  # periods from the start until the log lists missing services
         for periods in count(1):
             await self._clock.sleep(HEALTH_PERIOD)
             self._publish()
@@ -138,7 +137,7 @@ class HealthBoard:
                 complete = self._summarise(missing=periods == summary_after)
 
     def _summarise(self, *, missing: bool) -> bool:
-        """Log that all services are ready, or, with ``missing``, which are not; whether all are."""
+        """Log that all services are ready or, with ``missing``, which are not; return whether all are."""
         rows = self.rows()
         rest = [row for row in rows if row.state is not ServiceState.READY]
         if not rest:
@@ -155,12 +154,12 @@ class HealthBoard:
 
 
 class ServiceCalls:
-    """Registers the remote calls of one service; once that has failed for good they are refused: nothing would follow.
+    """Registers the remote calls of one service; they are refused after the service has failed permanently.
 
     Args:
-        rpc: where.
-        board: knows its state.
-        service: its name.
+        rpc: registry.
+        board: holds the state of the service.
+        service: name of the service.
     """
 
     def __init__(self, rpc: RpcRegistry, board: HealthBoard, service: str) -> None:
@@ -196,8 +195,8 @@ class ClockService:
         before: int | None = None
         while True:
             offset = self._clock.real_offset()
-            # SECOND // 20: a change of the real-time offset within one period beyond this is a step, not drift (NTP
-            # slews < 1 ms/s)
+            # SECOND // 20: a larger change of the real-time offset within one period is a step, not drift (NTP slews
+            # < 1 ms/s)
             step = offset - before if before is not None and abs(offset - before) > SECOND // 20 else 0
             if step:
                 self._events(Reason.CLOCK_STEPPED, Severity.WARNING, self.name, seconds=step / SECOND)
@@ -208,9 +207,9 @@ class ClockService:
 
 
 class MeterService:
-    """Publishes the control tick's punctuality and the recorder's state once a second.
+    """Publishes the lateness of control ticks and the state of the recorder once a second.
 
-    A disk too slow for the recorder is an event, at most once a minute.
+    Reports a disk that is too slow for the recorder as an event, at most once a minute.
     """
 
     name = ServiceName.METER.value
@@ -231,10 +230,10 @@ class MeterService:
         self._loop = bus.publisher(LOOP, Writer.DAEMON)
         self._recording = bus.publisher(RECORDER, Writer.DAEMON)
         self._late = 0
-        """Seconds with late ticks, less those without."""
+        """Number of seconds with late ticks minus those without, at least 0."""
         self._said: int | None = None
         self._lost = 0
-        """Messages that the recorder had lost when that was last reported."""
+        """Number of lost messages in the last report."""
         self._lost_said: int | None = None
 
     async def run(self, ready: Ready) -> None:
@@ -262,7 +261,7 @@ class MeterService:
                 self._say_lost(recording)
 
     def _say_lost(self, health: RecorderHealth) -> None:
-        """Report that messages are missing in the log; of a recording that ended, that it did is said by itself."""
+        """Report messages missing in the log; the end of a recording has its own event."""
         if not health.lost or health.drops == self._lost or not _again(self._lost_said, health.stamp):
             return
         source = ServiceName.RECORDER.value
@@ -270,14 +269,14 @@ class MeterService:
         self._lost, self._lost_said = health.drops, health.stamp
 
     def _say_busy(self, health: LoopHealth) -> None:
-        """Log that the computer is busy once it lasts, at most once a minute."""
+        """Log a lasting overload of the computer, at most once a minute."""
         self._late = self._late + 1 if health.busy else max(0, self._late - 1)
-        # 3: seconds with late ticks after which the log says that the computer is busy: a start has some
+        # 3: seconds with late ticks before an overload is logged, since a start causes some
         if health.busy and self._late >= 3 and _again(self._said, health.stamp):
             self._said = health.stamp
             log.warning("%s", health.busy)
 
 
 def _again(said: int | None, now: int) -> bool:
-    """Whether what was said at ``said``, ns, is to be said again."""
-    return said is None or now - said > 60.0 * SECOND  # seconds until it says so again
+    """Whether a message logged at ``said`` (ns) is due again."""
+    return said is None or now - said > 60.0 * SECOND  # seconds until it is repeated

@@ -1,4 +1,4 @@
-"""Log records as messages: what the daemon logs is on ``event/log``, in the log and in the black box."""
+"""Log records as messages: publishes the daemon's log on ``event/log``, in the log and in the black box."""
 
 import logging
 import threading
@@ -15,7 +15,7 @@ from monstertruck_schemas.event import LogLevel, LogRecord
 from monstertruckd.host.logging_queue import shown
 
 JOURNAL_QUEUE: Final = 256
-"""Records on their way to the loop; beyond that the oldest of the lowest level is lost and counted."""
+"""Maximum number of records queued for the loop; beyond, the oldest of the lowest level is lost and counted."""
 
 _LEVELS: Final = (
     (logging.CRITICAL, LogLevel.FATAL),
@@ -27,7 +27,7 @@ _LEVELS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    """A record, as it was when it was logged."""
+    """Log record at the time of logging."""
 
     stamp: int
     level: int
@@ -38,15 +38,15 @@ class _Line:
 
 
 class Journal(logging.Handler):
-    """Takes records in any thread and publishes them on the loop, one a turn, by the daemon's clock.
+    """Accepts records in any thread and publishes them on the loop, one per turn, with the daemon's clock.
 
-    What is logged while one is being published is left out here: it may be about just that, and would never end.
+    Skips records logged while a record is being published: they may be caused by the publishing and would never end.
 
     Args:
-        clock: time; must be readable from any thread, as the wall clock is.
-        out: ``event/log``.
+        clock: time source; must be readable from any thread, as the wall clock is.
+        out: publisher of ``event/log``.
         on_loss: called with the number of records that did not fit.
-        reproducible: for the virtual clock: only what the loop's own thread logs, as other threads run on real time.
+        reproducible: for the virtual clock: accept only records of the loop's thread, as other threads run on real time
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Journal(logging.Handler):
         self._hop: ThreadHop[_Line] = ThreadHop(self._publish, JOURNAL_QUEUE, on_loss, rank=lambda line: line.level)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Queue the record; never waits, and complains of a wrong log call as every handler does."""
+        """Queue the record without waiting; handle a wrong log call like every handler."""
         here = threading.get_ident() == self._loop_thread
         if (here and self._publishing) or (self._reproducible and not here):
             return
@@ -74,7 +74,7 @@ class Journal(logging.Handler):
         self._hop.put(_Line(self._clock.now(), record.levelno, record.name, text, name, record.lineno))
 
     def end(self) -> None:
-        """Discard what waits and everything to come; on the loop."""
+        """Discard queued and future records; call on the loop."""
         self._hop.close()
 
     def _publish(self, line: _Line) -> None:
@@ -100,7 +100,7 @@ class Journal(logging.Handler):
 def published(
     clock: Clock, out: Publisher[LogRecord], on_loss: Callable[[int], None], *, reproducible: bool
 ) -> Iterator[None]:
-    """All logging goes to ``out`` as well while the context lasts; see ``Journal``."""
+    """Publish all logging on ``out`` as well during the context; see ``Journal``."""
     journal = Journal(clock, out, on_loss, reproducible=reproducible)
     root = logging.getLogger()
     root.addHandler(journal)

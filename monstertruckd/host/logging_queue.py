@@ -1,4 +1,4 @@
-"""Logging that never blocks the control loop: records go through a bounded queue to a thread that writes them."""
+"""Logging that never blocks the control loop: a bounded queue passes records to a thread that writes them."""
 
 import io
 import logging
@@ -13,12 +13,12 @@ from copy import copy
 from typing import Final, TextIO
 
 LOG_QUEUE: Final = 1000
-"""Records waiting for a stuck terminal or journal; beyond that they are lost and counted."""
+"""Maximum number of records waiting for a stuck terminal or journal; further ones are lost and counted."""
 PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
-"""Levels of syslog, which journald reads from a line's head."""
+"""Syslog levels, which journald reads from the start of a line."""
 
 LONGEST_RECORD: Final = 16_384
-"""Characters of one record; what is beyond is cut off."""
+"""Maximum length of a record (characters); longer ones are truncated."""
 
 _KEYS: Final = r"(?:password|passwd|passphrase|secret|token|authorization|(?<![a-z])psk|api[_-]?key)"
 _NAMES: Final = ("passw", "passphrase", "secret", "token", "authorization", "psk", "api")
@@ -35,15 +35,15 @@ _SECRETS: Final = (
     (_NAMES, re.compile(rf"(?i)(?P<head>{_KEYS}{_ASSIGNED}){_VALUE}"), _INSTEAD),
     (("--",), re.compile(rf"(?i)(?P<head>(?<![\w-])--[a-z-]{{0,40}}?{_KEYS}\s{{1,8}}){_VALUE}"), _INSTEAD),
 )
-"""What no log may show: private keys, credentials in addresses, values named like a secret.
+"""Patterns of secrets that no log may show: private keys, credentials in addresses, values named like a secret.
 
-Each with words one of which, in lower case, is in whatever it matches. Every pattern looks at each character a bounded
-number of times: no record can hold up the process.
+Each has hint words; every match contains at least one of them in lower case. Every pattern reads each character a
+bounded number of times, so no record can block the process.
 """
 
 
 def redacted(text: str) -> str:
-    """``text`` without passwords, tokens and keys."""
+    """Return ``text`` without passwords, tokens and keys."""
     lower = text.lower()
     for hints, pattern, instead in _SECRETS:
         if any(hint in lower for hint in hints):
@@ -52,15 +52,15 @@ def redacted(text: str) -> str:
 
 
 def shown(text: str) -> str:
-    """What of a record's ``text`` is shown: no secrets, and ``LONGEST_RECORD`` characters at most."""
-    margin = 1024  # characters beyond the cut that are searched as well, so that no secret is cut in half and missed
+    """Return ``text`` of a record without secrets, truncated to ``LONGEST_RECORD`` characters."""
+    margin = 1024  # characters beyond the limit that are also searched, so that no secret is cut in half and missed
     safe = redacted(text[: LONGEST_RECORD + margin])
     beyond = len(safe) - LONGEST_RECORD + max(0, len(text) - LONGEST_RECORD - margin)
     return f"{safe[:LONGEST_RECORD]} ... {beyond} characters more" if beyond > 0 else safe
 
 
 class LossyQueueHandler(logging.handlers.QueueHandler):
-    """Counts what does not fit instead of waiting or complaining."""
+    """Queue handler; counts records that do not fit instead of waiting or raising."""
 
     def __init__(self) -> None:
         self.records: queue.Queue[logging.LogRecord | None] = queue.Queue(LOG_QUEUE)
@@ -68,7 +68,7 @@ class LossyQueueHandler(logging.handlers.QueueHandler):
         self.lost = 0
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """Put the record into the queue, or lose it."""
+        """Queue the record, or count it as lost."""
         try:
             self.records.put_nowait(record)
         except queue.Full:
@@ -76,11 +76,11 @@ class LossyQueueHandler(logging.handlers.QueueHandler):
 
 
 class LogOutputThread:
-    """The thread that writes; a stuck output never keeps the process from ending.
+    """Thread that writes log records; a stuck output never keeps the process from exiting.
 
     Args:
-        handler: where the records come from.
-        output: where they go.
+        handler: source of the records.
+        output: handler that writes them.
     """
 
     def __init__(self, handler: LossyQueueHandler, output: logging.Handler) -> None:
@@ -91,8 +91,8 @@ class LogOutputThread:
         self._thread.start()
 
     def stop(self) -> None:
-        """Write what still waits, as far as the output takes it within 1 s."""
-        output_timeout = 1.0  # seconds the end of the process waits for a stuck output
+        """Write the remaining records, as far as the output accepts them within 1 s."""
+        output_timeout = 1.0  # seconds the exiting process waits for a stuck output
         try:
             self._handler.records.put(None, timeout=output_timeout)
         except queue.Full:
@@ -109,12 +109,12 @@ class LogOutputThread:
 
 
 class PlainFormatter(logging.Formatter):
-    """One line a record, without secrets, with journald's priority in front where the journal reads.
+    """Formats a record as one line without secrets, with a journald priority prefix if the journal reads it.
 
     Args:
-        journal: whether that reads.
-        terminal: whether somebody looks on: of a record with an attribute ``brief`` (a text; None = without) that is
-            shown instead of its message.
+        journal: whether the journal reads the output.
+        terminal: whether the output is a terminal: then the attribute ``brief`` of a record (a text, or None) replaces
+            its message.
     """
 
     def __init__(self, *, journal: bool, terminal: bool = False) -> None:
@@ -123,7 +123,7 @@ class PlainFormatter(logging.Formatter):
         self._terminal = terminal
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record's text; every line of a traceback keeps the priority."""
+        """Return the text of a record; every line of a traceback gets the priority."""
         brief = getattr(record, "brief", None) if self._terminal else None
         if brief is not None:
             record = copy(record)
@@ -136,9 +136,9 @@ class PlainFormatter(logging.Formatter):
 
 
 def read_by_journal(stream: TextIO, environment: Mapping[str, str] = os.environ) -> bool:
-    """Whether systemd's journal reads ``stream``: JOURNAL_STREAM names its device and inode (systemd.exec(5)).
+    """Whether systemd's journal reads ``stream``: JOURNAL_STREAM holds its device and inode (systemd.exec(5)).
 
-    The variable alone is no proof: processes whose output goes elsewhere inherit it.
+    The variable alone is not proof: processes with redirected output inherit it.
     """
     named = environment.get("JOURNAL_STREAM")
     if named is None:
@@ -151,7 +151,7 @@ def read_by_journal(stream: TextIO, environment: Mapping[str, str] = os.environ)
 
 
 def start_logging(*, verbose: bool, stream: TextIO = sys.stderr) -> LogOutputThread:
-    """Send all logging to ``stream`` from a thread; ``stop()`` of what is returned writes what still waits."""
+    """Send all logging to ``stream`` from a thread; ``stop()`` of the result writes the remaining records."""
     output = logging.StreamHandler(stream)
     output.setFormatter(PlainFormatter(journal=read_by_journal(stream), terminal=stream.isatty()))
     handler = LossyQueueHandler()

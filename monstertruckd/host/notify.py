@@ -1,4 +1,4 @@
-"""Notifications to systemd: ready, alive, stopping (protocol of sd_notify(3)). Alive: the tick keeps its pace."""
+"""Notifications to systemd: ready, alive, stopping (sd_notify(3) protocol). Alive means the tick keeps its pace."""
 
 import os
 import socket
@@ -13,14 +13,14 @@ from monstertruck_schemas.state import GateMode
 
 
 class Notify(Protocol):
-    """Takes lines for systemd; true if they arrived."""
+    """Sends lines to systemd; returns whether they arrived."""
 
     def __call__(self, *lines: str) -> bool:
-        """Send them as one message, or lose them."""
+        """Send the lines as one message, or lose them."""
 
 
 def notify_socket(address: str) -> Notify:
-    """Sender to a socket by its path, or abstract with a leading @. It never blocks and never raises."""
+    """Return a sender to a socket path, or to an abstract socket with a leading @. It never blocks or raises."""
     name = "\0" + address[1:] if address.startswith("@") else address
 
     def send(*lines: str) -> bool:
@@ -34,7 +34,7 @@ def notify_socket(address: str) -> Notify:
 
 
 def watchdog_seconds(environment: Mapping[str, str], pid: int) -> float | None:
-    """Seconds without a ping after which systemd gives the process up; None = never, or another process is meant."""
+    """Return the watchdog timeout of systemd (s); None without a watchdog or if it is for another process."""
     try:
         seconds = int(environment["WATCHDOG_USEC"]) / 1e6
         meant = int(environment.get("WATCHDOG_PID") or pid)
@@ -47,12 +47,12 @@ class NotifyService:
     """Sends systemd READY once the daemon is up and the tick runs, then pings while the tick keeps its pace.
 
     Args:
-        send: where lines go.
-        watchdog: seconds; None = no pings, only the status.
-        clock: time.
-        ticks: control ticks so far.
+        send: sends lines to systemd.
+        watchdog: watchdog timeout (s); None to send only the status and no pings.
+        clock: time source.
+        ticks: returns the number of control ticks so far.
         rate: nominal ticks per second.
-        status: state of the robot, one line.
+        status: returns the state of the robot in one line.
     """
 
     name = ServiceName.NOTIFY.value
@@ -68,10 +68,10 @@ class NotifyService:
     ) -> None:
         self._send = send
         self._ping = ("WATCHDOG=1",) if watchdog is not None else ()
-        self._period = 1.0 if watchdog is None else watchdog / 3  # seconds between two looks without a watchdog
+        self._period = 1.0 if watchdog is None else watchdog / 3  # interval between checks (s) without a watchdog
         self._clock = clock
         self._ticks = ticks
-        # 0.5: part of the nominal ticks between two looks without which the tick counts as hanging
+        # 0.5: minimum fraction of the nominal ticks between checks; with fewer, the tick is hanging
         self._enough = 0.5 * rate * self._period
         self._status = status
         self._up = False
@@ -79,26 +79,26 @@ class NotifyService:
         self._sent_status = ""
 
     def up(self) -> None:
-        """Everything has been started; from now on the tick alone decides."""
+        """Note that everything has been started; from now on only the tick decides."""
         self._up = True
 
     def stopping(self) -> None:
-        """The daemon ends on purpose."""
+        """Notify systemd that the daemon exits on purpose."""
         self._send("STOPPING=1", "STATUS=stopping")
 
     async def run(self, ready: Ready) -> None:
         """Notify systemd until cancelled."""
         ready()
         while not (self._up and self._ticks() and self._notify("READY=1")):
-            await self._clock.sleep(0.02)  # seconds between two looks until the first tick
+            await self._clock.sleep(0.02)  # interval between checks until the first tick (s)
         while True:
             await self._clock.sleep(self._period)
             self._notify()
 
     def _notify(self, *first: str) -> bool:
-        """Send what is news; a status that did not arrive is news again the next time.
+        """Send changes and pings; a status that did not arrive is sent again next time.
 
-        Only the ticks since the last look count, notified or not: a gate that limps must not save them up for a ping.
+        A ping depends only on the ticks since the last check, sent or not: a slow gate must not accumulate them.
         """
         ticks, status = self._ticks(), self._status()
         kept_pace = ticks - self._seen_ticks >= self._enough
@@ -115,7 +115,7 @@ class NotifyService:
 
 
 def status_line(mode: GateMode, services: Iterable[ServiceHealth]) -> str:
-    """The robot in one line: the gate's state, and which services do not work."""
+    """Return the robot's state in one line: the gate mode, and the services that are not ready."""
     down = [f"{row.name} ({row.state.value})" for row in services if row.state is not ServiceState.READY]
     return f"{mode.value}; not ready: {', '.join(down)}" if down else mode.value
 
@@ -123,7 +123,7 @@ def status_line(mode: GateMode, services: Iterable[ServiceHealth]) -> str:
 def notify_from(
     environment: Mapping[str, str], clock: Clock, ticks: Callable[[], int], rate: float, status: Callable[[], str]
 ) -> NotifyService | None:
-    """The service for the present process; None where no systemd waits for it."""
+    """Create the service for this process; None if systemd does not expect notifications."""
     address = environment.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
         return None

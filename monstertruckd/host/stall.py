@@ -1,4 +1,4 @@
-"""Finds out what a control tick that does not come waits for: a thread dumps all tracebacks."""
+"""Diagnosis of a stalled control tick: a thread dumps all tracebacks."""
 
 import asyncio
 import faulthandler
@@ -18,26 +18,25 @@ from monstertruck_schemas.roles import ServiceName
 log = logging.getLogger(__name__)
 
 KEPT_DUMPS: Final = 20
-"""Dumps kept in the folder."""
+"""Maximum number of dumps kept in the folder."""
 
 _NAME: Final = re.compile(r"stall-(\d{6,})\.txt")
 
 
 class StallWatch:
-    """Service that watches the control tick from a thread of its own.
+    """Service that watches the control tick from a separate thread.
 
-    A dump goes into a file and to the log, which another thread writes; on a terminal the log names the file alone. It
-    is made with the interpreter's lock held.
-    An extension that never gives the lock back is left to systemd's watchdog, whose SIGABRT stops the process before
-    it dumps: ``faulthandler.dump_traceback_later`` walks the stacks of running threads, and a daemon that was merely
-    stopped and continued died of that.
+    A dump goes to a file and to the log, which another thread writes; on a terminal the log shows only the file name.
+    The dump is made with the interpreter lock held. An extension that never releases the lock is left to systemd's
+    watchdog, whose SIGABRT stops the process without a dump. ``faulthandler.dump_traceback_later`` is not used: it
+    walks the stacks of running threads, which crashed a daemon that was merely stopped and continued.
 
     Args:
-        clock: time; readable from any thread.
-        ticks: how many ticks there were; readable from any thread.
-        folder: for the files.
-        stall: seconds without a tick that are worth a dump.
-        interval: least seconds between two dumps.
+        clock: time source; readable from any thread.
+        ticks: number of ticks so far; readable from any thread.
+        folder: folder of the dumps.
+        stall: time without a tick that triggers a dump (s).
+        interval: minimum interval between dumps (s).
     """
 
     name = ServiceName.STALLS.value
@@ -72,13 +71,13 @@ class StallWatch:
             await in_thread(thread.join)
 
     def _watch(self) -> None:
-        """The thread."""
+        """Watch the ticks; runs in the thread."""
         seen, since, looked = 0, self._clock.now(), self._clock.now()
         stalled = False
-        while not self._ending.wait(0.05):  # seconds between two looks
+        while not self._ending.wait(0.05):  # interval between checks (s)
             now, ticks = self._clock.now(), self._ticks()
             if now - looked > self._stall:
-                since = now  # nor did this thread run: the whole process was stopped, or the lock was held
+                since = now  # this thread did not run either: the whole process was stopped, or the lock was held
             looked = now
             if ticks != seen:
                 if stalled:
@@ -89,7 +88,7 @@ class StallWatch:
                 self._dump(now - since)
 
     def _dump(self, silent: int) -> None:
-        """Dump now, unless that was done a moment ago."""
+        """Dump now, unless the last dump was less than the interval ago."""
         now = self._clock.now()
         if self._dumped is not None and now - self._dumped < self._interval:
             return
@@ -107,7 +106,7 @@ class StallWatch:
         log.error("%s; all threads:\n%s", what, text, extra={"brief": brief})
 
     def _make_room(self) -> int:
-        """Remove the oldest dumps; the next one's number."""
+        """Remove the oldest dumps; return the number of the next one."""
         self._folder.mkdir(parents=True, exist_ok=True)
         found = sorted((int(name[1]), path) for path in self._folder.iterdir() if (name := _NAME.fullmatch(path.name)))
         for _, path in found[: max(0, len(found) - KEPT_DUMPS + 1)]:
@@ -116,7 +115,7 @@ class StallWatch:
 
 
 def _tracebacks() -> str:
-    """Where every thread is."""
+    """Return the tracebacks of all threads."""
     with os.fdopen(os.memfd_create("stall"), "w+b") as memory:
         faulthandler.dump_traceback(file=memory)
         memory.seek(0)

@@ -1,4 +1,4 @@
-"""What ran: versions of everything a log may have to be explained by."""
+"""Versions of the running software, for the interpretation of logs."""
 
 import platform
 import shutil
@@ -18,7 +18,7 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 
 @cache
 def running_versions() -> Mapping[str, str]:
-    """This package, its libraries, the interpreter, the system, and the state of the checkout it runs from, if any."""
+    """Versions of this package, its libraries, the interpreter and the system, and the state of a git checkout."""
     found = {
         "monstertruckd": __version__,
         "python": platform.python_version(),
@@ -33,13 +33,13 @@ def running_versions() -> Mapping[str, str]:
 
 
 def checkout(root: Path) -> str | None:
-    """Commit of a git checkout, ``-dirty`` behind it if files differ; None if it is none, or git is not there."""
+    """Return the commit of a git checkout, with ``-dirty`` if files differ; None without a checkout or git."""
     git = shutil.which("git")
     if git is None or not (root / ".git").exists():
         return None
     command = [git, "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
     try:
-        # 2.0: seconds git may take
+        # 2.0: timeout of git (s)
         answer = subprocess.run(command, capture_output=True, text=True, timeout=2.0, check=True)  # noqa: S603
     except (OSError, subprocess.SubprocessError):
         return None
