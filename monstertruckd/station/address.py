@@ -1,4 +1,4 @@
-"""Which robots a station shows."""
+"""Addresses of the robots that a station shows."""
 
 import re
 from dataclasses import dataclass
@@ -20,18 +20,18 @@ def _option(robot: str, endpoint: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RobotAddress:
-    """Name of a robot, and the endpoint at which it, or a router it is connected to, listens."""
+    """Name of a robot, and the listening endpoint of the robot or of a router connected to it."""
 
     name: str
     endpoint: str
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read ``NAME@ENDPOINT``; without an endpoint it is the robot of this name on this machine.
+        """Parse ``NAME@ENDPOINT``; without an endpoint, use the robot of this name on this machine.
 
         Raises:
-            InputError: the name cannot be part of a key, the endpoint is none, or several robots of this machine have
-                the name; lists them.
+            InputError: the name is not valid in a key, the endpoint is invalid, or several robots of this machine have
+                the name; lists these robots.
         """
         name, at, endpoint = text.partition("@")
         if not _NAME.fullmatch(name):
@@ -42,15 +42,15 @@ class RobotAddress:
 
     @classmethod
     def default(cls) -> Self:
-        """The robot of a station that names none.
+        """Return the default robot of a station.
 
         Raises:
-            InputError: several robots of this machine could be meant, or none answers at the default port; lists them.
+            InputError: several robots of this machine match, or none answers at the default port; lists the robots.
         """
         return cls("truck", only_robot(None, _option))
 
     def session(self, program: str, clock: Clock, timeout: float) -> TruckClient:
-        """A session with the robot for a program of the station; ``timeout`` as of ``TruckClient``, s."""
+        """Return a session with the robot for a program of the station; ``timeout`` as in ``TruckClient`` (s)."""
         tls = tls_for(self.endpoint)
         source = own_source(None if tls is None else tls.owner(), program)
         return TruckClient(self.name, self.endpoint, source=source, clock=clock, timeout=timeout, tls=tls)

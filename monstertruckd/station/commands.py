@@ -1,4 +1,4 @@
-"""What a browser may ask of the station: one JSON object a message."""
+"""Commands of a browser to the station: one JSON object per message."""
 
 import math
 from typing import Annotated, Final, Literal
@@ -11,13 +11,13 @@ from monstertruck_schemas.req import UNCONDITIONAL, BehaviourOrder, ExploreOrder
 from monstertruck_schemas.roles import AccessRole
 
 LONGEST_MESSAGE: Final = 262_144
-"""Bytes of a command at most: the file of a raceline of some kilometres."""
+"""Maximum size of a command (bytes): enough for the file of a raceline of a few kilometres."""
 
 DeviceFault = Literal["none", "unplugged", "deaf", "noise"]
-"""Of an emulated device: works; its cable is unplugged; it hears nothing; one bit in 50 bytes is wrong."""
+"""Fault of an emulated device: none, cable unplugged, receives nothing, one wrong bit in 50 bytes."""
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Heading = Annotated[float, Field(ge=-math.tau, le=math.tau)]
-"""rad; at most one turn."""
+"""Heading (rad), at most one turn."""
 Place = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
 """x, y (m) and optionally yaw (rad)."""
 Id = Annotated[int, Field(ge=0, lt=2**53)]
@@ -28,42 +28,42 @@ class _Command(BaseModel):
 
 
 class Asked(_Command):
-    """A command whose outcome is answered."""
+    """Command whose outcome is reported to the browser."""
 
     id: Id
 
 
 class Watch(_Command):
-    """Look at a robot."""
+    """Watch a robot or a recording."""
 
     do: Literal["watch"]
     robot: Annotated[str, Field(max_length=200)]
-    """Name of a robot, or of a recording that is shown."""
+    """Name of a robot or of a shown recording."""
 
 
 class LookAtFleet(_Command):
-    """Show where all robots are, or no longer."""
+    """Start or stop showing the whole fleet."""
 
     do: Literal["fleet"]
     on: bool
 
 
 class EchoRequest(_Command):
-    """Answer at once: the browser measures the way to the station."""
+    """Request an immediate answer: the browser measures the latency to the station."""
 
     do: Literal["ping"]
     at: Number
-    """The browser's time, ms."""
+    """Browser's time (ms)."""
 
 
 class Heartbeat(_Command):
-    """One heartbeat of a hand on stick, keys or gamepad: what the input says at this moment."""
+    """One heartbeat of the stick, keys or gamepad, with the current input."""
 
     do: Literal["drive"]
     heard: Number
-    """The station's time in the newest answer to a ``ping``, ms."""
+    """Station's time in the latest answer to a ``ping`` (ms)."""
     since: Number
-    """Time from that answer to reading the input, by the browser's clock, ms."""
+    """Time from that answer to reading the input, by the browser's clock (ms)."""
     input: Literal["stick", "keys", "gamepad"]
     speed: Number = 0.0
     front: Number = 0.0
@@ -86,7 +86,7 @@ class GiveOrder(Asked):
 
 
 class SetGoal(Asked):
-    """Drive to a pose in the frame of the map, by way of others."""
+    """Drive to a pose in the map frame, via intermediate poses."""
 
     do: Literal["goal"]
     goal: tuple[Number, Number, Heading]
@@ -111,36 +111,36 @@ class Behave(Asked):
 
 
 class Explore(Asked):
-    """Start an exploration, or end it."""
+    """Start or end an exploration."""
 
     do: Literal["explore"]
     order: ExploreOrder
 
 
 class DoMission(Asked):
-    """Start a mission, resume one, or end it."""
+    """Start, resume or end a mission."""
 
     do: Literal["mission"]
     order: MissionOrder
     text: Annotated[str, Field(max_length=LONGEST_MESSAGE)] = ""
-    """Of a start: the mission's file, YAML."""
+    """Mission file (YAML), for a start."""
     moved: bool = False
-    """Of a resume: the robot is not where the mission was interrupted, and its pose is right."""
+    """For a resume: the robot is not where the mission was interrupted, and its pose is right."""
 
 
 class Track(Asked):
-    """Follow a path that was drawn on the map, in its frame."""
+    """Follow a path drawn on the map, in the map frame."""
 
     do: Literal["track"]
     points: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=2, max_length=400)]
 
 
 class TrackFile(Asked):
-    """Follow the path of a file, in the frame map."""
+    """Follow the path of a file, in the map frame."""
 
     do: Literal["track_file"]
     name: Annotated[str, Field(max_length=128)]
-    """Of the file; its suffix says whether it is a table or YAML."""
+    """Name of the file; its suffix selects table or YAML."""
     text: Annotated[str, Field(max_length=LONGEST_MESSAGE)]
     closed: bool = False
     """The path is a lap."""
@@ -154,27 +154,27 @@ class StartPath(Asked):
 
 
 class AskToDrive(Asked):
-    """Ask whoever drives to hand over."""
+    """Ask the current driver to hand over."""
 
     do: Literal["ask"]
 
 
 class HandOver(Asked):
-    """Let somebody drive who has asked to."""
+    """Hand over to a client that has asked to drive."""
 
     do: Literal["hand_over"]
     to: Annotated[str, Field(max_length=64)]
 
 
 class Acknowledge(Asked):
-    """A warning was seen."""
+    """Acknowledge a warning."""
 
     do: Literal["acknowledge"]
     text: Annotated[str, Field(max_length=200)]
 
 
 class ListSettings(Asked):
-    """What may be changed while the robot runs."""
+    """List the settings that may be changed while the robot runs."""
 
     do: Literal["settings"]
 
@@ -189,27 +189,27 @@ class ChangeSetting(Asked):
 
 
 class ListRecordings(Asked):
-    """The recordings on the robot."""
+    """List the recordings on the robot."""
 
     do: Literal["recordings"]
 
 
 class DeleteRecording(Asked):
-    """Delete one of them."""
+    """Delete a recording on the robot."""
 
     do: Literal["delete_recording"]
     name: Annotated[str, Field(max_length=128)]
 
 
 class ReplayRecording(Asked):
-    """Fetch a recording from the robot, and show it."""
+    """Fetch a recording from the robot and show it."""
 
     do: Literal["replay"]
     name: Annotated[str, Field(max_length=128)]
 
 
 class InjectFault(Asked):
-    """Let a device of an emulated robot fail, or work again."""
+    """Start or end a fault of an emulated robot's device."""
 
     do: Literal["fault"]
     device: Annotated[str, Field(max_length=64)]
@@ -217,15 +217,15 @@ class InjectFault(Asked):
 
 
 class PlaceObstacle(Asked):
-    """Put an obstacle into the world of an emulated robot."""
+    """Place an obstacle in the world of an emulated robot."""
 
     do: Literal["obstacle"]
     at: tuple[Number, Number] | None
-    """Place, m; None removes all obstacles."""
+    """Position (m); None removes all obstacles."""
 
 
 class ControlReplay(_Command):
-    """Go to a time of the recording that is shown, s since its beginning; play or pause; play at another rate."""
+    """Seek in the shown recording (s since its start), play or pause it, or change its rate."""
 
     do: Literal["seek"]
     at: Number | None = None
@@ -265,7 +265,7 @@ _COMMANDS: Final[TypeAdapter[AnyCommand]] = TypeAdapter(Command)
 
 
 def needed(command: AnyCommand) -> AccessRole:
-    """What a user must be to ask for it: everybody may look, and stop."""
+    """Return the role required for a command: every user may watch and stop."""
     if isinstance(command, GiveOrder) and command.order in UNCONDITIONAL:
         return AccessRole.OBSERVER
     if isinstance(command, Watch | LookAtFleet | EchoRequest | ControlReplay | ListSettings | ListRecordings):
@@ -274,10 +274,10 @@ def needed(command: AnyCommand) -> AccessRole:
 
 
 def parse(data: str) -> AnyCommand:
-    """The command of one message.
+    """Parse the command of one message.
 
     Raises:
-        InputError: it is none; the text names the first wrong field.
+        InputError: the message is not a command; the text names the first wrong field.
     """
     try:
         return _COMMANDS.validate_json(data)

@@ -1,4 +1,4 @@
-"""Robots that appear by their liveliness tokens at a robot or a Zenoh router."""
+"""Discovery of robots by their liveliness tokens, at a robot or a Zenoh router."""
 
 import asyncio
 import json
@@ -19,18 +19,18 @@ from monstertruckd.station.address import RobotAddress
 log = logging.getLogger(__name__)
 
 ROUTER_RETRY: Final = 1.0
-"""Seconds between two attempts to reach a router, and in which it answers."""
+"""Interval between connection attempts to a router, and timeout of each (s)."""
 MOST_ROBOTS: Final = 64
-"""Robots that one router may add; a page cannot show more of them sensibly."""
+"""Maximum number of robots added by one router; a page cannot show more of them sensibly."""
 
 
 class Discovery:
-    """Watches one endpoint for robots; one that is not there is waited for.
+    """Watches one endpoint for robots; waits for an absent endpoint.
 
     Args:
-        endpoint: of a Zenoh router, or of a robot.
-        clock: the station's time.
-        found: called once for every robot that appears, on the event loop.
+        endpoint: endpoint of a Zenoh router or a robot.
+        clock: clock of the station.
+        found: called on the event loop, once for every robot that appears.
     """
 
     def __init__(self, endpoint: str, clock: Clock, found: Callable[[RobotAddress], object]) -> None:
@@ -40,7 +40,7 @@ class Discovery:
         self._known: set[str] = set()
 
     async def run(self) -> None:
-        """Watch until cancelled; why there are no robots from there is logged once."""
+        """Watch until cancelled; logs the reason for a failed connection once."""
         said = ""
         while True:
             try:

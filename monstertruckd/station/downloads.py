@@ -1,4 +1,4 @@
-"""Recordings of a robot as files for a browser, which goes on with a download that was broken off by itself."""
+"""Download of a robot's recordings to a browser, which resumes an interrupted download by itself."""
 
 import base64
 import logging
@@ -19,7 +19,7 @@ from monstertruckd.station.address import RobotAddress
 log = logging.getLogger(__name__)
 
 LARGEST_RECORDING: Final = 2_000_000_000
-"""Size of a recording that is fetched to be shown at most: it is kept in the station's temporary folder."""
+"""Maximum size of a recording fetched for showing (bytes): it is kept in the station's temporary folder."""
 RANGE: Final = re.compile(r"bytes=(\d{1,15})-")
 
 
@@ -32,13 +32,13 @@ async def download(
     headers: Mapping[str, str],
     may: Callable[[], bool],
 ) -> web.StreamResponse:
-    """Answer a request for a recording; the robot says how fast.
+    """Answer a request for a recording; the robot limits the rate.
 
-    A ``Range`` of the kind ``bytes=N-`` gives what comes behind (RFC 9110, 14.2), others are ignored. A user who no
-    longer ``may`` gets no more of it.
+    A ``Range`` of the form ``bytes=N-`` returns the bytes from N (RFC 9110, 14.2); other ranges are ignored. A
+    download stops when its user no longer ``may`` have it.
 
     Raises:
-        web.HTTPException: the robot refuses, is not there, or the range lies behind the end.
+        web.HTTPException: the robot refuses or is absent, or the range starts behind the end.
     """
     async with _session(address, user, clock) as truck:
         offset = _begin(request.headers.get("Range"))
@@ -67,18 +67,18 @@ async def download(
 async def fetch(
     address: RobotAddress, name: str, user: str, clock: Clock, to: Path, progress: Callable[[float], object]
 ) -> None:
-    """Fetch a recording into a file, going on with what is there of it already; ``progress`` gets the share.
+    """Fetch a recording into a file, resuming a partial one; calls ``progress`` with the fraction fetched.
 
     Raises:
-        InputError: it is larger than ``LARGEST_RECORDING``.
-        TruckError: the robot refuses, or is not there.
+        InputError: the recording is larger than ``LARGEST_RECORDING``.
+        TruckError: the robot refuses or is absent.
     """
     async with _session(address, user, clock) as truck:
         await fetch_recording(truck, name, to, progress, LARGEST_RECORDING)
 
 
 def _session(address: RobotAddress, user: str, clock: Clock) -> TruckClient:
-    return address.session(f"{user}{'.' * bool(user)}files", clock, 5.0)  # seconds in which the robot answers
+    return address.session(f"{user}{'.' * bool(user)}files", clock, 5.0)  # timeout of the robot's answer (s)
 
 
 async def _stream(
@@ -90,9 +90,9 @@ async def _stream(
     size: int,
     may: Callable[[], bool],
 ) -> None:
-    """Pass chunks on until the size that was promised; one that fails breaks the connection, for the browser to see.
+    """Forward chunks up to the promised size; a failed chunk breaks the connection, so that the browser notices.
 
-    So does an empty one: the file became shorter, and asking on would never end.
+    An empty chunk does the same: the file became shorter, and further requests would never end.
     """
     while True:
         data = base64.b64decode(answer["data"])[: size - at]

@@ -1,4 +1,4 @@
-"""An emulated robot that runs in the station's own process: faults of its devices, obstacles in its world."""
+"""Emulated robot in the station's process: faults of its devices, obstacles in its world."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
@@ -12,7 +12,7 @@ FAULTS: Final[Mapping[DeviceFault, Sequence[str]]] = {
     "deaf": ("line deaf on",),
     "noise": ("line flip_rate 0.02",),
 }
-"""Commands that make a fault; those of ``none`` end all faults."""
+"""Emulator commands that cause each fault; the commands for ``none`` end all faults."""
 
 
 class EmulatedWorld:
@@ -20,7 +20,7 @@ class EmulatedWorld:
 
     Args:
         devices: roles of its emulated devices.
-        command: carries out one command of the emulator's console; raises InputError.
+        command: executes one command of the emulator's console; raises InputError.
     """
 
     def __init__(self, devices: Sequence[str], command: Callable[[list[str]], None]) -> None:
@@ -29,14 +29,14 @@ class EmulatedWorld:
         self._obstacles: list[tuple[float, float]] = []
 
     def state(self) -> dict[str, Any]:
-        """Present faults by device, and places of obstacles, m."""
+        """Return current faults by device, and positions of obstacles (m)."""
         return {"faults": self._faults, "obstacles": self._obstacles}
 
     def inject(self, device: str, fault: DeviceFault) -> None:
         """Replace the fault of a device.
 
         Raises:
-            InputError: there is no such device, or its emulator refuses.
+            InputError: the device does not exist, or its emulator refuses.
         """
         if device not in self._faults:
             raise InputError(f"device {device!r}: expected one of {', '.join(self._faults)}")
@@ -45,10 +45,10 @@ class EmulatedWorld:
         self._faults[device] = fault
 
     def place(self, at: tuple[float, float] | None) -> None:
-        """Put an obstacle at a place of the world, m; None removes all.
+        """Place an obstacle at a position in the world (m); None removes all obstacles.
 
         Raises:
-            InputError: the robot is there.
+            InputError: the robot is at this position.
         """
         if at is None:
             self._command(["room", "clear"])

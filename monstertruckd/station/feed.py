@@ -1,4 +1,4 @@
-"""What one robot publishes, encoded once for all browsers that look at it."""
+"""Messages of one robot, encoded once for all browsers that watch it."""
 
 import asyncio
 import logging
@@ -30,37 +30,37 @@ log = logging.getLogger(__name__)
 M = TypeVar("M", bound=Message)
 
 FEED_PERIOD: Final = 0.05
-"""Seconds between two checks of what is new."""
+"""Interval between checks for new messages (s)."""
 PING: Final = 1.0
-"""Seconds between two measurements of the round trip to the robot."""
+"""Interval between measurements of the round trip to the robot (s)."""
 KEPT_EVENTS: Final = 200
-"""Events a browser gets when it begins to look at a robot."""
+"""Maximum number of past events sent to a browser that starts to watch a robot."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shown(Generic[M]):
-    """A topic on the page: how it is encoded, and how often at most, s."""
+    """Topic shown on the page, with its encoder and the minimum interval between frames (s)."""
 
     topic: Topic[M]
     kind: str
     encode: Callable[[M], Frame]
     period: float = 0.0
     budget: float | None = None
-    """Bytes a second; a large message makes the next one wait."""
+    """Bandwidth limit (bytes/s); a large message delays the next."""
 
 
 def _whole(topic: Topic[M], kind: str, period: float = 0.0) -> Shown[M]:
     return Shown(topic, kind, partial(frames.message, kind), period)
 
 
-# 300_000.0: bytes a second that pictures of the camera may take
+# 300_000.0: bandwidth limit of camera images (bytes/s)
 SHOWN: Final[tuple[Shown[Any], ...]] = (
     _whole(topics.GATE, "gate"),
     _whole(topics.STOP, "stop"),
     _whole(topics.EXPLORE, "explore", 0.5),
     _whole(topics.MISSION, "mission", 0.5),
     _whole(topics.CALIBRATION, "calibration"),
-    Shown(topics.GROUND, "ground", frames.ground, 2.0, 20_000.0),  # bytes a second that pictures of the ground may take
+    Shown(topics.GROUND, "ground", frames.ground, 2.0, 20_000.0),  # bandwidth limit of ground images (bytes/s)
     Shown(topics.SCAN, "scan", frames.scan, 0.1),
     Shown(topics.TRANSFORMS, "transforms", frames.transforms, 0.2),
     Shown(topics.PATH, "path", frames.path),
@@ -86,7 +86,7 @@ SHOWN: Final[tuple[Shown[Any], ...]] = (
 
 @dataclass
 class MapStore:
-    """The newest whole map of a robot and what changed since; browsers fetch the former by URL."""
+    """Latest full map of a robot and the tiles changed since; browsers fetch the full map by URL."""
 
     version: int = 0
     grid: Grid | None = None
@@ -94,21 +94,21 @@ class MapStore:
     _packed: bytes | None = None
 
     def take(self, grid: Grid) -> str:
-        """A whole map; returns the frame that announces it."""
+        """Store a full map; returns the frame that announces it."""
         self.version += 1
         self.grid, self._packed = grid, None
         self.tiles.clear()
         return frames.text("map", version=self.version, **frames.grid_head(grid))
 
     def change(self, part: Grid) -> tuple[Place, bytes]:
-        """A changed part; returns its place and its frame."""
+        """Store a changed tile; returns its place and its frame."""
         place, frame = (part.origin.x, part.origin.y), frames.tile(part, self.version)
         if place in self.tiles or len(self.tiles) < MOST_TILES:
             self.tiles[place] = frame
         return place, frame
 
     async def packed(self) -> bytes | None:
-        """All cells, compressed (zlib); None before the first map."""
+        """Return all cells, compressed (zlib); None before the first map."""
         grid = self.grid
         if grid is None:
             return None
@@ -121,39 +121,39 @@ class MapStore:
 
 
 class RobotFeed:
-    """Follows one robot for all browsers; a robot that is not there, or goes, is waited for.
+    """Follows one robot for all browsers; waits for a robot that is absent or disappears.
 
     Args:
-        address: which robot.
-        clock: the station's time.
+        address: address of the robot.
+        clock: clock of the station.
     """
 
     def __init__(self, address: RobotAddress, clock: Clock) -> None:
         self.address = address
         self.map = MapStore()
         self.alive = False
-        """Whether the robot answered the last time it was asked."""
+        """Whether the robot answered the latest request."""
         self.round_trip: float | None = None
-        """Seconds there and back, of the last time; None without an answer."""
+        """Latest round-trip time (s); None without an answer."""
         self.gate: GateState | None = None
-        """As the robot answered the last time."""
+        """Gate state in the robot's latest answer."""
         self.client: TruckClient | None = None
-        """While there is a session."""
+        """Client of the open session; None without a session."""
         self._clock = clock
         self._viewers = Viewers()
         self._watched = asyncio.Event()
         self._events: deque[str] = deque(maxlen=KEPT_EVENTS)
         self._facts: str | None = None
         self._known = False
-        """Whether ``_facts`` are those of the robot as it runs."""
+        """Whether ``_facts`` describe the running robot."""
         self._link = frames.text("link", alive=False, round_trip=None, text="")
         self._runs = 0
-        """Of the robot's daemon, so far as they were seen to begin."""
+        """Number of observed restarts of the robot's daemon."""
 
     # Browsers
 
     def attach(self, viewer: Viewer) -> None:
-        """Show this robot in a browser, beginning with all that is known."""
+        """Show this robot in a browser, starting with everything known about it."""
         self._viewers.add(viewer)
         self._watched.set()
         self._send_all(viewer)
@@ -170,7 +170,7 @@ class RobotFeed:
             viewer.patch(place, part)
 
     def detach(self, viewer: Viewer) -> None:
-        """Show it there no longer."""
+        """Stop showing this robot in a browser."""
         self._viewers.discard(viewer)
         if not self._viewers:
             self._watched.clear()
@@ -179,7 +179,7 @@ class RobotFeed:
 
     async def run(self) -> None:
         """Follow until cancelled."""
-        retry = 1.0  # seconds between two attempts to reach a robot, and in which one that is there answers
+        retry = 1.0  # interval between connection attempts, and timeout of each (s)
         while True:
             try:
                 name, endpoint = self.address.name, self.address.endpoint
@@ -188,11 +188,11 @@ class RobotFeed:
                     try:
                         await self._follow(client)
                     finally:
-                        self.client = None  # before the session closes, which takes a while
+                        self.client = None  # first, because closing the session takes a while
             except TruckError as error:
                 self._set_link(None, str(error))
                 await self._clock.sleep(retry)
-            except Exception as bug:  # the other robots are followed all the same
+            except Exception as bug:  # the feeds of the other robots must continue
                 log.exception("robot %s cannot be followed", self.address.name)
                 self._set_link(None, f"{type(bug).__name__}: {bug}")
                 await self._clock.sleep(retry)
@@ -209,7 +209,7 @@ class RobotFeed:
             await asyncio.wait(jobs)
 
     async def _ask(self, client: TruckClient) -> None:
-        """Measure the round trip; ask a robot that appears what it is."""
+        """Measure the round trip; query the facts of a robot that appears."""
         self._known = False
         while True:
             sent = self._clock.now()
@@ -227,7 +227,7 @@ class RobotFeed:
             await self._clock.sleep(PING)
 
     def _begin_anew(self) -> None:
-        """The daemon was started again: what its last run said of itself is true no longer."""
+        """Discard the state of the previous run after a restart of the daemon."""
         self._runs += 1
         self._known = False
         self._facts = None
@@ -239,10 +239,10 @@ class RobotFeed:
             self._send_all(viewer)
 
     async def _learn(self, client: TruckClient) -> bool:
-        """Ask what the robot is; whether it answered."""
+        """Query the robot's facts; returns whether it answered."""
         try:
             self._facts = frames.facts(await client.call("config"), await client.call("versions"))
-        except (TruckError, KeyError, TypeError, AttributeError) as error:  # of another release
+        except (TruckError, KeyError, TypeError, AttributeError) as error:  # the robot runs another release
             log.warning("robot %s does not say what it is: %r", self.address.name, error)
             return False
         for viewer in self._viewers:
@@ -250,7 +250,7 @@ class RobotFeed:
         return True
 
     async def _sample(self, client: TruckClient) -> None:
-        """Subscribe while anybody looks."""
+        """Subscribe while a browser watches."""
         while True:
             await self._watched.wait()
             with ExitStack() as stack:
@@ -271,13 +271,13 @@ class RobotFeed:
                     for event in events.drain():
                         self._take_event(event)
                     await self._clock.sleep(FEED_PERIOD)
-            # Whoever looks next begins with what is published then, not with what was true long ago.
+            # The next browser starts with messages published then, not with stale ones.
             self._viewers.newest.clear()
 
     def _take(self, shown: Shown[M], box: Mailbox[M], taken: dict[str, tuple[Message, int]], now: int) -> None:
         newest = box.latest
         before, due = taken.get(shown.kind, (None, now))
-        # Half a tick of tolerance: the looks themselves come a little early or late.
+        # Half a tick of tolerance: the checks themselves come slightly early or late.
         if newest is None or newest is before or now < due - FEED_PERIOD / 2 * SECOND:
             return
         frame = shown.encode(newest)

@@ -1,4 +1,4 @@
-"""All robots at a glance: where each is, its gate, battery and link, for browsers that look at the fleet."""
+"""Overview of all robots for browsers that watch the fleet: position, gate, battery and link of each."""
 
 import asyncio
 from collections.abc import Mapping
@@ -20,11 +20,11 @@ FLEET_PERIOD: Final = 0.5
 
 
 class RobotSnapshot:
-    """Newest pose and battery of one robot, decoded at every look and not at every message.
+    """Latest pose and battery of one robot, decoded at every check, not at every message.
 
     Args:
         client: session with the robot.
-        clock: the station's time.
+        clock: clock of the station.
     """
 
     def __init__(self, client: TruckClient, clock: Clock) -> None:
@@ -34,10 +34,10 @@ class RobotSnapshot:
         self._pose: Watched[Odometry] = self._stack.enter_context(client.watch(topics.POSE))
         self._battery: Watched[Battery] = self._stack.enter_context(client.watch(topics.BATTERY))
         self._changes: dict[str, tuple[int | None, int]] = {}
-        """Newest stamp of each topic, and when it came, ns of the station's clock."""
+        """Latest stamp of each topic, and its arrival time (ns of the station's clock)."""
 
     def row(self) -> dict[str, Any]:
-        """What the page shows of it; keys are there whatever the robot says."""
+        """Return the robot's row on the page; all keys exist even without messages."""
         now, pose, battery = self._clock.now(), self._pose.latest, self._battery.latest
         old = self._is_old(topics.POSE.name, pose, now)
         if self._is_old(topics.BATTERY.name, battery, now):
@@ -51,11 +51,11 @@ class RobotSnapshot:
         }
 
     def _is_old(self, name: str, message: Message | None, now: int) -> bool:
-        """Whether the newest message of a topic has been that for longer than 2 s."""
+        """Return whether the latest message of a topic has not changed for more than 2 s."""
         stamp = None if message is None else message.stamp
         before, since = self._changes.get(name, (None, now))
         self._changes[name] = stamp, now if stamp != before else since
-        # 2.0: seconds after which a pose that did not change in time is shown as old, and a battery as unknown
+        # 2.0: time without a new message before a pose is shown as old, and a battery as unknown (s)
         return (now - self._changes[name][1]) / SECOND > 2.0
 
     def close(self) -> None:
@@ -64,11 +64,11 @@ class RobotSnapshot:
 
 
 class FleetBoard:
-    """Makes one frame of all robots for all browsers that look at the fleet; nothing is subscribed while none does.
+    """Creates one frame of all robots for all browsers that watch the fleet; without any, it subscribes to nothing.
 
     Args:
-        feeds: of all robots, by name; more may be added.
-        clock: the station's time.
+        feeds: feeds of all robots by name; more may be added.
+        clock: clock of the station.
     """
 
     def __init__(self, feeds: Mapping[str, RobotFeed], clock: Clock) -> None:
@@ -78,10 +78,10 @@ class FleetBoard:
         self._watched = asyncio.Event()
         self._snapshots: dict[str, RobotSnapshot] = {}
         self._rows: dict[str, dict[str, Any]] = {}
-        """The last of each robot, which are shown as old when it is gone."""
+        """Latest row of each robot, shown as old when the robot is gone."""
 
     def show(self, viewer: Viewer, on: bool) -> None:
-        """Show the fleet in a browser, or no longer."""
+        """Start or stop showing the fleet in a browser."""
         (self._viewers.add if on else self._viewers.discard)(viewer)
         if self._viewers:
             self._watched.set()
@@ -89,7 +89,7 @@ class FleetBoard:
             self._watched.clear()
 
     async def run(self) -> None:
-        """Look until cancelled."""
+        """Update the browsers until cancelled."""
         try:
             while True:
                 await self._watched.wait()

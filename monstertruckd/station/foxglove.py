@@ -1,9 +1,8 @@
-"""One robot for Foxglove's app: its topics, configuration and orders over Foxglove's WebSocket protocol.
+"""One robot for the Foxglove app: its topics, configuration and orders over Foxglove's WebSocket protocol.
 
-A topic's bytes are passed on as the robot publishes them, with its schema, and are asked of the robot only while
-somebody looks. Unlike the page's own, this WebSocket does not see of which site's page a connection comes, so every
-page that is open in a browser on this machine may use it: driving and orders other than the emergency stop have to be
-switched on.
+The server forwards each topic's bytes unchanged, with its schema, and subscribes at the robot only while a client
+subscribes. Unlike the page's WebSocket, this one cannot see which site's page opened a connection, so any page open in
+a browser on this machine may use it. Driving, and orders other than the emergency stop, must therefore be enabled.
 """
 
 import asyncio
@@ -32,22 +31,22 @@ from monstertruckd.station.remarks import Remarks
 log = logging.getLogger(__name__)
 
 PORT: Final = 8765
-"""Foxglove's own default."""
+"""Default port of Foxglove."""
 LAYOUT: Final = Path(__file__).parent / "foxglove_layout.json"
 TELEOP: Final = "/teleop"
 """Topic of the layout's teleop panel."""
 ROBOT_RETRY: Final = 1.0
-"""Seconds between two attempts to reach the robot, and in which it answers."""
+"""Interval between connection attempts to the robot, and timeout of each (s)."""
 
 
 def twist(data: bytes) -> tuple[float, float, float]:
-    """Velocities forward and to the left, m/s, and turn rate, rad/s, of a JSON ``geometry_msgs/Twist``.
+    """Return forward and left velocity (m/s) and turn rate (rad/s) of a JSON ``geometry_msgs/Twist``.
 
     Raises:
-        InputError: it is none, or not finite.
+        InputError: ``data`` is not a twist, or not finite.
     """
     try:
-        if len(data) > 4096:  # bytes from which on a message of a client is no twist
+        if len(data) > 4096:  # maximum size of a twist (bytes)
             raise ValueError(f"{len(data)} bytes")
         given = json.loads(data)
         found = given["linear"]["x"], given["linear"]["y"], given["angular"]["z"]
@@ -60,7 +59,7 @@ def twist(data: bytes) -> tuple[float, float, float]:
 
 
 def parameters(config: dict[str, Any], prefix: str = "") -> list[Parameter]:
-    """A configuration as parameters with dotted names; lists are JSON text, for viewers show them so."""
+    """Flatten a configuration to parameters with dotted names; lists become JSON text, as viewers show them."""
     found: list[Parameter] = []
     for key, value in config.items():
         name = f"{prefix}{key}"
@@ -72,18 +71,18 @@ def parameters(config: dict[str, Any], prefix: str = "") -> list[Parameter]:
 
 
 class FoxgloveServer:
-    """Serves one robot; one that is not there is waited for.
+    """Serves one robot; waits for a robot that is absent.
 
     Args:
-        address: which robot.
-        clock: the station's time.
-        port: on the loopback interface; 0 = any that is free.
-        drives: whether clients may drive and give all orders; the emergency stop they always may.
+        address: address of the robot.
+        clock: clock of the station.
+        port: port on the loopback interface; 0 selects a free one.
+        drives: whether clients may drive and give all orders; the emergency stop is always allowed.
     """
 
     def __init__(self, address: RobotAddress, clock: Clock, port: int = PORT, *, drives: bool = False) -> None:
         self.port = port
-        """The one it listens at, once it runs."""
+        """Listening port, once the server runs."""
         self._address = address
         self._clock = clock
         self._drives = drives
@@ -98,7 +97,7 @@ class FoxgloveServer:
         self._remarks = Remarks(log)
 
     async def run(self, ready: Callable[[], object] = lambda: None) -> None:
-        """Serve until cancelled; ``ready`` is called once clients are answered.
+        """Serve until cancelled; calls ``ready`` once clients are answered.
 
         Raises:
             BusyError: the port is taken.
@@ -123,7 +122,7 @@ class FoxgloveServer:
         try:
             ready()
             while True:
-                with suppress(TruckError):  # the page says what is wrong
+                with suppress(TruckError):  # the page shows the error
                     async with self._address.session("foxglove", self._clock, ROBOT_RETRY) as client:
                         await self._follow(client)
                 await self._clock.sleep(ROBOT_RETRY)
@@ -137,7 +136,7 @@ class FoxgloveServer:
         try:
             for topic in self._looks:
                 self._tap(topic)
-            while True:  # until it says what it is
+            while True:  # until the robot returns its configuration
                 with suppress(TruckError):
                     self._parameters = parameters(await client.call("config"))
                     self._server.publish_parameter_values(self._parameters)
@@ -149,15 +148,15 @@ class FoxgloveServer:
             while self._taps:
                 self._taps.popitem()[1].undeclare()
 
-    # What clients look at
+    # Subscriptions of clients
 
     def look(self, topic: str) -> None:
-        """A client subscribed."""
+        """Count a client's subscription, and tap the topic."""
         self._looks[topic] += 1
         self._tap(topic)
 
     def leave(self, topic: str) -> None:
-        """A client looks no longer."""
+        """Drop a client's subscription; the last one ends the tap."""
         self._looks[topic] -= 1
         if self._looks[topic] <= 0:
             del self._looks[topic]
@@ -169,14 +168,14 @@ class FoxgloveServer:
             topic, channel = self._channels[name]
             self._taps[name] = self._client.tap(topic, channel.log)
 
-    # What clients ask
+    # Requests of clients
 
     def known_parameters(self, names: list[str]) -> list[Parameter]:
-        """Of these names; of none, all."""
+        """Return the parameters with these names; all if ``names`` is empty."""
         return [each for each in self._parameters if not names or each.name in names]
 
     def drive(self, data: bytes) -> None:
-        """One message of a teleop panel: one request with a short lease; nothing repeats it."""
+        """Turn one message of a teleop panel into one request with a short lease; nothing repeats it."""
         try:
             motion = twist(data)
         except InputError as error:
@@ -187,12 +186,12 @@ class FoxgloveServer:
             self._driving = asyncio.create_task(self._request(self._client, motion))
 
     def refuse(self, text: str) -> None:
-        """Log what a client may not do."""
+        """Log a refused client request."""
         self._remarks.add("Foxglove", text)
 
     async def _request(self, client: TruckClient, motion: tuple[float, float, float]) -> None:
-        with suppress(TruckError):  # the robot says why on its topics
-            await client.drive_twist(*motion, lease=0.25)  # seconds for which a message of the teleop panel stands
+        with suppress(TruckError):  # the robot publishes the reason on its topics
+            await client.drive_twist(*motion, lease=0.25)  # validity of a teleop panel's message (s)
 
     def _service(self, order: Order, loop: asyncio.AbstractEventLoop) -> Service:
         empty = MessageSchema(encoding="json", schema=Schema(name="none", encoding="jsonschema", data=b"{}"))
@@ -225,13 +224,13 @@ _OUTCOME: Final = json.dumps(
 
 
 class _Listener(ServerListener):
-    """Clients' messages, which come on threads of the server, on the event loop."""
+    """Moves clients' messages from the server's threads to the event loop."""
 
     def __init__(self, server: FoxgloveServer, loop: asyncio.AbstractEventLoop) -> None:
         self._server = server
         self._loop = loop
         self._teleop: set[tuple[int, int]] = set()
-        """Channels on which clients send twists."""
+        """Channels for twists from clients."""
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
         self._loop.call_soon_threadsafe(self._server.look, channel.topic)

@@ -1,7 +1,7 @@
-"""What is sent to browsers: small messages as JSON text, bulky ones as binary frames.
+"""Frames for browsers: small messages as JSON text, bulky ones as binary frames.
 
-A text frame is one object with its ``kind``; the fields of a message stand under ``m``. A binary frame is the length of
-its head (uint32, little-endian), the head (JSON, with the ``kind``), then the payload.
+A text frame is one object with its ``kind`` and, for a message, its fields under ``m``. A binary frame consists of the
+length of its head (uint32, little-endian), the head (JSON, with the ``kind``), and the payload.
 """
 
 import json
@@ -23,12 +23,12 @@ Frame = str | bytes
 
 
 def text(kind: str, **fields: Any) -> str:
-    """A text frame."""
+    """Return a text frame."""
     return _json({"kind": kind, **fields})
 
 
 def _json(fields: dict[str, Any]) -> str:
-    """Return ``fields`` as JSON; a value that is not finite, as a damaged log may hold, becomes null."""
+    """Return ``fields`` as JSON; a non-finite value, possible in a damaged log, becomes null."""
     try:
         return json.dumps(fields, separators=(",", ":"), allow_nan=False)
     except ValueError:
@@ -36,25 +36,25 @@ def _json(fields: dict[str, Any]) -> str:
 
 
 def message(kind: str, of: Message) -> str:
-    """A text frame with all fields of a message."""
+    """Return a text frame with all fields of a message."""
     return f'{{"kind":"{kind}","m":{of.model_dump_json()}}}'
 
 
 def binary(kind: str, payload: bytes, **fields: Any) -> bytes:
-    """A binary frame."""
+    """Return a binary frame."""
     head = _json({"kind": kind, **fields}).encode()
     return struct.pack("<I", len(head)) + head + payload
 
 
 def refusal(number: int, error: TruckError) -> str:
-    """Answer to a command that was refused."""
+    """Return the answer to a refused command."""
     reason = error.refusal if isinstance(error, RequestRefusedError) else error.reason
     return text("answer", id=number, ok=False, reason=reason.value, text=str(error))
 
 
 def scan(of: LaserScan) -> bytes:
-    """A scan; payload: uint16 ranges in mm, little-endian, 0 = none."""
-    # 65.0: ranges travel as millimetres in 16 bits, m
+    """Return a scan; payload: uint16 ranges in mm, little-endian, 0 = none."""
+    # 65.0: maximum range (m), because ranges are sent as millimetres in 16 bits
     ranges = np.where(np.isfinite(of.ranges) & (of.ranges < 65.0), of.ranges * 1000.0, 0.0)
     return binary(
         "scan",
@@ -69,12 +69,12 @@ def scan(of: LaserScan) -> bytes:
 
 
 def picture(of: CompressedImage) -> bytes:
-    """A picture of the camera; payload: the JPEG file."""
+    """Return a camera image; payload: the JPEG file."""
     return binary("camera", of.data, sequence=of.sequence)
 
 
 def pose(of: Odometry) -> str:
-    """Pose and velocity, rounded to a tenth of a millimetre and of a milliradian."""
+    """Return pose and velocity, rounded to 0.1 mm and 0.1 mrad."""
     return text(
         "pose",
         frame=of.frame,
@@ -86,14 +86,14 @@ def pose(of: Odometry) -> str:
 
 
 def path(of: Path) -> str:
-    """A path, rounded as a pose."""
+    """Return a path, rounded like a pose."""
     return text(
         "path", frame=of.frame, name=of.name, poses=np.round(of.poses, 4).tolist(), directions=of.directions.tolist()
     )
 
 
 def transforms(of: Transforms) -> str:
-    """The frame tree."""
+    """Return the frame tree."""
     return text(
         "transforms",
         tree={row.child: [row.parent, *row.translation, *row.rotation] for row in of.transforms},
@@ -101,7 +101,7 @@ def transforms(of: Transforms) -> str:
 
 
 def facts(config: dict[str, Any], versions: dict[str, str]) -> str:
-    """What a robot is and can do, of its configuration; and what software it runs."""
+    """Return a robot's type and capabilities, from its configuration, and its software versions."""
     devices = {role: row for role, row in config.get("devices", {}).items() if row is not None}
     return text(
         "facts",
@@ -121,7 +121,7 @@ def facts(config: dict[str, Any], versions: dict[str, str]) -> str:
 
 
 def grid_head(of: Grid) -> dict[str, Any]:
-    """Where the cells of a grid are."""
+    """Return the geometry of a grid's cells."""
     return {
         "width": of.width,
         "height": of.height,
@@ -132,12 +132,12 @@ def grid_head(of: Grid) -> dict[str, Any]:
 
 
 def tile(of: Grid, version: int) -> bytes:
-    """A part of the map that changed since that version; payload: int8 cells, row 0 at the lowest y."""
+    """Return a map tile changed since that version; payload: int8 cells, row 0 at the lowest y."""
     return binary("tile", of.cells.tobytes(), version=version, **grid_head(of))
 
 
 def ground(of: Ground) -> bytes:
-    """The ground; payload: zlib of the uint8 roughness, mm of standard deviation, 255 = unknown."""
+    """Return the ground; payload: zlib of the uint8 roughness (standard deviation in mm), 255 = unknown."""
     head = {"width": of.width, "height": of.height, "resolution": of.resolution, "frame": of.frame}
     origin = [of.origin.x, of.origin.y, of.origin.yaw]
     return binary("ground", zlib.compress(of.roughness.tobytes(), 1), origin=origin, **head)

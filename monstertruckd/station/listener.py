@@ -1,4 +1,4 @@
-"""Connections to the page's server, with bounds while they are set up (TLS: the handshake): that costs as much."""
+"""Connections to the page's server, with limits during their setup (the TLS handshake), which is expensive."""
 
 import asyncio
 import socket
@@ -13,18 +13,18 @@ from monstertruckd.station.users import network_of
 HANDSHAKE_LIMIT: Final = 5.0
 """Maximum duration of a TLS handshake (s)."""
 MOST_OF_NETWORK: Final = 32
-"""Maximum number of connections of one network that are being set up; further ones are closed at once."""
+"""Maximum number of connections of one network during setup; further connections are closed at once."""
 
 
 class WebListener:
-    """Takes connections to an address while its context lasts.
+    """Accepts connections to an address while its context lasts.
 
     Args:
         host: name or address to listen on.
-        port: of it.
-        tls: certificate and key; None = connections are plain.
-        inside: makes the protocol that gets a connection, once its handshake is done.
-        refused: called with the other end's address and what is wrong, for each that is closed.
+        port: port to listen on.
+        tls: certificate and key; None for plain connections.
+        inside: creates the protocol of a connection after its handshake.
+        refused: called with the peer's address and the reason for each closed connection.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class WebListener:
         loop = asyncio.get_running_loop()
         found = await loop.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         with ExitStack() as made:
-            # 128: connections that wait to be taken
+            # 128: maximum number of connections waiting for accept
             sockets = [
                 made.enter_context(socket.create_server(address[:2], family=family, backlog=128))
                 for family, address in dict.fromkeys((row[0], row[4]) for row in found)
@@ -62,7 +62,7 @@ class WebListener:
             self._begin(self._accept(sock))
 
     async def __aexit__(self, *_: object) -> None:
-        """Take no more; what was under way is cut off."""
+        """Stop accepting; abort connections during setup."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -78,9 +78,9 @@ class WebListener:
         while True:
             try:
                 taken, name = await loop.sock_accept(sock)
-            except OSError as error:  # too many open files, or the other end is gone already
+            except OSError as error:  # too many open files, or the peer is already gone
                 self._refused("?", f"a connection cannot be taken: {error.strerror or error}")
-                # Seconds before connections are taken again after there was no file descriptor for one.
+                # Pause before the next accept after running out of file descriptors (s).
                 descriptor_pause = 0.2
                 await asyncio.sleep(descriptor_pause)
                 continue

@@ -1,7 +1,7 @@
-"""One browser's control of one robot: its own source of requests, so that the robot distinguishes two tabs.
+"""One browser's control of one robot: a separate source of requests, so that the robot distinguishes two tabs.
 
 Nothing here repeats a request. Each heartbeat of the browser becomes one request with a short lease, or none if it was
-delayed: an old input says nothing about the present one.
+delayed: an old input does not show the current one.
 """
 
 import asyncio
@@ -57,33 +57,36 @@ from monstertruckd.station.commands import (
 from monstertruckd.station.viewer import Viewer
 
 LEASE: Final = 0.25
-"""Seconds for which a heartbeat stands."""
+"""Validity of a heartbeat (s)."""
 LATEST: Final = 0.2
-"""A heartbeat that took this much longer than the quickest ones is dropped, s."""
+"""Maximum delay of a heartbeat beyond the quickest ones (s); later ones are dropped."""
 OLDEST: Final = 1.5
-"""A heartbeat whose round trip took this long is dropped, however slow the others were, s."""
+"""Maximum round trip of a heartbeat (s); slower ones are dropped, however slow the others were."""
 MEMORY: Final = 200
-"""Newest heartbeats among which the quickest is found."""
+"""Number of latest heartbeats to find the quickest among."""
 MOST_ASKED: Final = 16
-"""Commands of one browser whose outcome is waited for at once."""
+"""Maximum number of pending commands of one browser."""
 SHORTEST: Final = 0.3
-"""Least length of a drawn path, m."""
+"""Minimum length of a drawn path (m)."""
 LONGEST_DRAWN_PATH: Final = 200.0
-"""Greatest length of a drawn path, m: it is computed in one piece, in about 2 ms."""
+"""Maximum length of a drawn path (m): it is computed in one piece, in about 2 ms."""
 
 
 class DelayWatch:
-    """Finds heartbeats that were delayed, by the newest message of the station that the browser received; s.
+    """Detects delayed heartbeats, from the station's latest message that the browser received. Times are in seconds.
 
-    The browser says which of the station's times it heard, and how long before it read its input: what has passed
-    since, without that, are the ways of both messages. So no clock is compared with another one's.
+    The browser reports the last station time it heard, and the time from then to reading its input. The remaining time
+    is the latency of both messages, so no clock is compared with another.
     """
 
     def __init__(self) -> None:
         self._ways: deque[float] = deque(maxlen=MEMORY)
 
     def late(self, heard: float, since: float, now: float) -> float | None:
-        """How late a heartbeat is, or None if it is not; ``heard`` and ``now`` are of the station's clock."""
+        """Return the lateness of a heartbeat, or None if it is on time.
+
+        ``heard`` and ``now`` are times of the station's clock.
+        """
         way = now - heard - max(since, 0.0)
         self._ways.append(way)
         late = way - min(self._ways)
@@ -94,11 +97,11 @@ class Pilot:
     """Orders and heartbeats of one browser to one robot.
 
     Args:
-        address: which robot.
-        name: of the browser, behind the station's own name.
-        viewer: where answers go.
-        clock: the station's time.
-        spare: another session with the robot, if there is one, for stops while this browser's own is not there.
+        address: address of the robot.
+        name: name of the browser, appended to the station's name.
+        viewer: outbox for answers.
+        clock: clock of the station.
+        spare: returns another session with the robot, if any, for stops while this browser has no session.
     """
 
     def __init__(
@@ -113,9 +116,9 @@ class Pilot:
         self._spare = spare
         self._name = name
         self._client: TruckClient | None = None
-        """While the robot's endpoint answers."""
+        """Client while the robot's endpoint answers; otherwise None."""
         self._ready = False
-        """Whether a heartbeat goes on at once."""
+        """Whether a heartbeat can be forwarded at once."""
         self._viewer = viewer
         self._clock = clock
         self._lateness = DelayWatch()
@@ -124,11 +127,11 @@ class Pilot:
         self._answers: set[asyncio.Task[None]] = set()
 
     async def run(self) -> None:
-        """Keep the session until cancelled; a robot that is not there is waited for."""
-        retry = 1.0  # seconds between two attempts to reach the robot, and in which it answers
+        """Keep the session until cancelled; wait for a robot that is absent."""
+        retry = 1.0  # interval between connection attempts to the robot, and timeout of each (s)
         try:
             while True:
-                with suppress(TruckError):  # the feed says what is wrong
+                with suppress(TruckError):  # the feed reports the error
                     async with self._address.session(self._name, self._clock, retry) as client:
                         self._client = client
                         self._viewer.send(frames.text("pilot", source=client.source))
@@ -146,11 +149,11 @@ class Pilot:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     def drive(self, motion: Heartbeat) -> None:
-        """Pass one heartbeat on, unless it is late or would have to wait for the robot."""
+        """Forward one heartbeat, unless it is late or would have to wait for the robot."""
         now = self._clock.now() / SECOND
         late = self._lateness.late(motion.heard / 1e3, motion.since / 1e3, now)
         if late is not None:
-            if now - self._said_late > 1.0:  # seconds between two remarks on late heartbeats
+            if now - self._said_late > 1.0:  # minimum interval between reports of late heartbeats (s)
                 self._said_late = now
                 self._viewer.send(frames.text("late", seconds=round(late, 3)))
             return
@@ -168,7 +171,7 @@ class Pilot:
             self._viewer.send(frames.text("trouble", text=str(error)))
 
     def ask(self, command: Asked) -> None:
-        """Carry out a command, and send its outcome to the browser. An emergency stop has left when this returns."""
+        """Execute a command, and send its outcome to the browser. An emergency stop has been sent when this returns."""
         stops = isinstance(command, GiveOrder) and command.order in UNCONDITIONAL
         client = self._client or (self._spare() if stops else None)
         if client is None:
@@ -218,7 +221,7 @@ def _call(client: TruckClient, command: Asked, clock: Clock) -> Coroutine[Any, A
 
 
 def _other_call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]:
-    """What moves nothing."""
+    """Return the call of a command that moves nothing."""
     match command:
         case AskToDrive():
             return client.ask_to_drive()
@@ -252,10 +255,11 @@ async def _mission(client: TruckClient, command: DoMission) -> dict[str, Any]:
 
 
 def read_mission(text: str) -> Mission:
-    """Return the mission in a file's text, or one that drives to each of its waypoints.
+    """Return the mission in a file's text, or a mission that drives to each waypoint in it.
 
     Raises:
-        InputError: it is none, or has aliases, of which a few lines can mean gigabytes; names the first mistake.
+        InputError: the text is not a mission, or has aliases (a few lines of them can expand to gigabytes); names the
+            first mistake.
     """
     if has_waypoints(text):
         return mission_from(text, FilePath("mission.yaml"))
@@ -270,10 +274,10 @@ def read_mission(text: str) -> Mission:
 
 
 def drawn_path(points: Sequence[tuple[float, float]]) -> Path:
-    """A drawn line as a path, resampled to 5 cm and smoothed, driven forward; m, in map.
+    """Convert a drawn line to a path in map (m), driven forward: resample it to 5 cm and smooth it.
 
     Raises:
-        InputError: it is too short to be driven, or too long.
+        InputError: the line is too short to be driven, or too long.
     """
     line = np.array(points)
     steps = np.hypot(*np.diff(line, axis=0).T)
@@ -283,11 +287,11 @@ def drawn_path(points: Sequence[tuple[float, float]]) -> Path:
         raise InputError(f"path: {along[-1]:.2f} m are drawn, expected at least {SHORTEST} m")
     if along[-1] > LONGEST_DRAWN_PATH:
         raise InputError(f"path: {along[-1]:.4g} m are drawn, expected at most {LONGEST_DRAWN_PATH:g} m")
-    drawn_spacing = 0.05  # distance between two poses of a drawn path, m
+    drawn_spacing = 0.05  # distance between poses of a drawn path (m)
     places = np.linspace(0.0, along[-1], max(math.ceil(along[-1] / drawn_spacing), 2) + 1)
     even = np.column_stack([np.interp(places, along, line[:, i]) for i in (0, 1)])
-    smoothing = 0.12  # standard deviation of the weights with which a drawn line is smoothed, m: hands tremble
-    # Mirrored at its ends, which stay where they are.
+    smoothing = 0.12  # standard deviation of the smoothing weights (m): hands tremble
+    # Mirror the line at its ends, which stay in place.
     more = min(math.ceil(3 * smoothing / drawn_spacing), len(even) - 1)
     mirrored = np.concatenate((2 * even[0] - even[more:0:-1], even, 2 * even[-1] - even[-2 : -2 - more : -1]))
     weights = np.exp(-0.5 * (np.arange(-more, more + 1) * drawn_spacing / smoothing) ** 2)

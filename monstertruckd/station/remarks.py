@@ -1,4 +1,4 @@
-"""What the log says of those who ask: a few lines of each, so that whoever sends rubbish cannot fill the disk."""
+"""Log lines about clients, limited per address, so that a client sending rubbish cannot fill the disk."""
 
 import asyncio
 import logging
@@ -8,25 +8,25 @@ from typing import Final
 COUNTING_WINDOW: Final = 60.0
 """Time over which lines are counted (s)."""
 BURST: Final = 20
-"""Lines of one address in that time; further ones are counted, and their number is reported at its end."""
+"""Maximum number of lines per address in that time; further lines are counted, and reported at its end."""
 MOST_PEERS: Final = 32
-"""Addresses that are distinguished in that time; all further ones share one count."""
+"""Maximum number of addresses counted separately in that time; all others share one count."""
 OTHERS: Final = "other addresses"
 LONGEST_LINE: Final = 300
-"""Characters of a line."""
+"""Maximum length of a line (characters)."""
 
 
 def printable(text: str) -> str:
-    """One line that a terminal shows as it is: control characters are written as escapes."""
+    """Return one line that a terminal shows unchanged: control characters become escapes."""
     short = text if len(text) <= LONGEST_LINE else f"{text[:LONGEST_LINE]}..."
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in short)
 
 
 class Remarks:
-    """Writes lines about the addresses that they come from; to be used on the event loop.
+    """Writes log lines with a limit per address; use it on the event loop.
 
     Args:
-        log: where to.
+        log: destination of the lines.
     """
 
     def __init__(self, log: logging.Logger) -> None:
@@ -35,7 +35,7 @@ class Remarks:
         self._timer: asyncio.TimerHandle | None = None
 
     def add(self, peer: str | None, text: str, level: int = logging.WARNING) -> None:
-        """Write ``text``, unless ``peer`` has caused many lines already."""
+        """Write ``text``, unless ``peer`` has already caused many lines."""
         known = peer or "?"
         if known not in self._counts and len(self._counts) >= MOST_PEERS:
             known = OTHERS
@@ -46,7 +46,7 @@ class Remarks:
             self._timer = asyncio.get_running_loop().call_later(COUNTING_WINDOW, self.tell)
 
     def tell(self) -> None:
-        """Write how many lines were left out, and count again."""
+        """Write the number of omitted lines, and restart the count."""
         if self._timer is not None:
             self._timer.cancel()
         counts, self._counts, self._timer = self._counts, Counter(), None

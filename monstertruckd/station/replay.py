@@ -1,4 +1,4 @@
-"""A recording on the page, with a time bar: the same frames as of a robot, out of a log."""
+"""Replay of a recording on the page, with a time bar: the same frames as for a robot, read from a log."""
 
 import bisect
 import logging
@@ -21,46 +21,46 @@ AGAIN_KINDS: Final = ("gate", "pose", "scan")
 
 
 class Recorded(Protocol):
-    """One message of a log."""
+    """Message of a log."""
 
     topic: str
     log_time: int
 
     def decode(self) -> Message:
-        """The typed message."""
+        """Return the typed message."""
 
 
 class RecordedLog(Iterable[Any], Protocol):
     """A log file: iterates over its messages."""
 
     def config(self) -> dict[str, Any]:
-        """The configuration it was recorded with."""
+        """Return the robot's configuration at the recording."""
 
     @property
     def fault(self) -> str | None:
-        """What an iteration to the end found wrong, to follow the log's name; None for a sound log."""
+        """Fault found by an iteration to the end, as text to follow the log's name; None for a sound log."""
 
 
 LogOpener = Callable[[Path], RecordedLog]
 
 
 class RecordedTopic:
-    """The messages of one topic in the order of their times."""
+    """Messages of one topic, ordered by time."""
 
     def __init__(self) -> None:
         self.times: list[int] = []
         self.messages: list[Recorded] = []
         self.index = 0
-        """Messages before the present time."""
+        """Number of messages before the current time."""
 
     def up_to(self, at: int) -> Iterator[Message]:
-        """What came since the last time, up to ``at``; what cannot be decoded is left out."""
+        """Return the messages since the last call, up to ``at``; skip undecodable ones."""
         end = bisect.bisect_right(self.times, at)
         begin, self.index = self.index, end
         yield from _decoded(self.messages[begin:end])
 
     def newest(self, at: int) -> Message | None:
-        """The newest of these, or None if none came."""
+        """Return the latest message since the last call, up to ``at``, or None."""
         end = bisect.bisect_right(self.times, at)
         if end == self.index:
             return None
@@ -69,7 +69,7 @@ class RecordedTopic:
 
 
 def _decoded(rows: Iterable[Recorded]) -> Iterator[Message]:
-    """Messages; what cannot be decoded is left out."""
+    """Decode messages; skip undecodable ones."""
     for row in rows:
         try:
             yield row.decode()
@@ -78,16 +78,16 @@ def _decoded(rows: Iterable[Recorded]) -> Iterator[Message]:
 
 
 class ReplayFeed:
-    """A recording that all browsers which look at it see at the same time.
+    """Recording that all its browsers see at the same time.
 
     Args:
-        name: in the page's list of robots.
-        file: the log.
+        name: name in the page's list of robots.
+        file: log file.
         open_log: opens logs.
-        clock: the station's time.
+        clock: clock of the station.
 
     Raises:
-        InputError: it is no log, holds nothing to be shown, or too much.
+        InputError: the file is not a log, holds nothing to show, or is too large.
     """
 
     def __init__(self, name: str, file: Path, open_log: LogOpener, clock: Clock) -> None:
@@ -112,7 +112,7 @@ class ReplayFeed:
 
     def _fill(self, reader: RecordedLog, file: Path) -> tuple[int, int]:
         size = 0
-        most_bytes = 400_000_000  # payload of a recording that is kept in memory
+        most_bytes = 400_000_000  # maximum payload of a recording kept in memory (bytes)
         for row in reader:
             track = self._tracks.get(row.topic)
             if track is None:
@@ -133,20 +133,20 @@ class ReplayFeed:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser shows it."""
+        """Whether a browser shows the recording."""
         return bool(self._viewers)
 
     def attach(self, viewer: Viewer) -> None:
-        """Show it in a browser."""
+        """Show the recording in a browser."""
         self._viewers.add(viewer)
         self._send_all(viewer)
 
     def detach(self, viewer: Viewer) -> None:
-        """Show it there no longer."""
+        """Stop showing the recording in a browser."""
         self._viewers.discard(viewer)
 
     def control(self, at: float | None, playing: bool | None, rate: float | None) -> None:
-        """Go to a time (s since the beginning), play or pause, or play at another rate."""
+        """Seek (s since the start), play or pause, or change the rate."""
         if rate is not None:
             self._rate = min(max(rate, 0.1), 20.0)
         if playing is not None:
@@ -174,7 +174,7 @@ class ReplayFeed:
 
     def _events(self) -> Iterator[Frame]:
         track = self._tracks[topics.EVENT.name]
-        # 50: events shown of the time before the place that was chosen
+        # 50: number of events shown from before the chosen time
         for event in _decoded(track.messages[max(track.index - 50, 0) : track.index]):
             yield frames.message("event", event)
 
@@ -191,7 +191,7 @@ class ReplayFeed:
                 self._play(min(self._at + round((now - before) * self._rate), self._end))
             before = now
             if self._viewers and now >= due:
-                # 0.4: seconds after which what stands still is shown once more: pages detect a silent robot by it
+                # 0.4: interval for repeating unchanged frames (s): pages detect a silent robot by their absence
                 due = now + round(0.4 * SECOND)
                 for kind in AGAIN_KINDS:
                     if kind in self._viewers.newest:
@@ -219,7 +219,7 @@ class ReplayFeed:
         self._look(at)
 
     def _look(self, at: int) -> None:
-        """Show what came up to ``at``."""
+        """Show the messages up to ``at``."""
         for name, row in self._shown:
             if (message := self._tracks[name].newest(at)) is not None:
                 self._viewers.show(row.kind, row.encode(message))
@@ -244,7 +244,7 @@ class ReplayFeed:
 
 
 def _facts(reader: RecordedLog) -> str:
-    """What the robot was; of a log that does not say it, nothing."""
+    """Return the facts of the recorded robot; empty facts if the log does not contain them."""
     try:
         return frames.facts(reader.config(), {})
     except (TruckError, KeyError, TypeError, AttributeError):

@@ -1,4 +1,4 @@
-"""The web server of the station: one page, its files, maps by URL, and one WebSocket for each browser."""
+"""Web server of the station: one page, its files, maps by URL, and one WebSocket per browser."""
 
 import asyncio
 import itertools
@@ -57,25 +57,25 @@ MOST_BROWSERS: Final = 32
 MOST_OF_USER: Final = 8
 """Maximum number of browsers of one user who logs in."""
 MOST_CONNECTIONS: Final = 256
-"""Maximum number of connections of one network, of which a browser keeps about six; later ones are closed."""
+"""Maximum number of connections of one network; later ones are closed. A browser keeps about six."""
 log = logging.getLogger(__name__)
 
 PAGE: Final = Path(__file__).parent / "page"
 FILES: Final = re.compile(r"[a-z_]+\.(?:js|css|svg)")
 MOST_REPLAYS: Final = 4
-"""Recordings that are shown, and kept in memory, at once."""
+"""Maximum number of recordings shown, and kept in memory, at once."""
 RECORDING: Final = re.compile(r"[A-Za-z0-9_.-]{1,120}\.mcap")
 TYPES: Final = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
 END: Final = 5.0
-"""Seconds that sessions with robots may take to close at the end."""
+"""Maximum time to close the sessions with robots at shutdown (s)."""
 LANGUAGE: Final = "en"
 MESSAGES: Final = 200.0
-"""Messages a second of one browser, in bursts of as many; what comes faster waits, without a delay for others."""
+"""Rate limit of one browser (messages/s), and its burst size; faster messages wait without delaying other browsers."""
 USUAL_PORTS: Final = {"http": 80, "https": 443}
-"""Browsers leave these out of a name."""
+"""Default ports, which browsers omit from a host name."""
 
 OWN_SITE: Final = ("same-origin", "none")
-"""Values of the Sec-Fetch-Site header of what the page itself, or the person, asks for."""
+"""Values of the Sec-Fetch-Site header for requests of the page itself or the user."""
 HEADERS: Final = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'; "
     "base-uri 'none'; form-action 'self'",
@@ -91,10 +91,10 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the page is served; beyond this machine only by TLS and to users who log in.
+    """Listening address of the page; beyond this machine only with TLS and users who log in.
 
     Raises:
-        NotPermittedError: another address than the loopback one, without certificate and users.
+        NotPermittedError: ``host`` is not a loopback address, and the certificate or the users are missing.
     """
 
     host: str = "127.0.0.1"
@@ -102,7 +102,7 @@ class Place:
     tls: ssl.SSLContext | None = None
     users: StationUsers | None = None
     aliases: tuple[str, ...] = ()
-    """Further names of this machine by which browsers may ask for the page."""
+    """Further names of this machine that browsers may use for the page."""
 
     def __post_init__(self) -> None:
         if self.host not in LOCAL_HOSTS and (self.tls is None or self.users is None):
@@ -112,18 +112,18 @@ class Place:
 
     @property
     def url(self) -> str:
-        """What to open in a browser."""
+        """Address of the page for a browser."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{self.scheme}://{host}:{self.port}/"
 
     @property
     def scheme(self) -> str:
-        """Of the page's address."""
+        """Scheme of the page's address."""
         return "http" if self.tls is None else "https"
 
     @property
     def names(self) -> frozenset[str]:
-        """Values of the Host header that mean this server: a page of another name that resolves here is refused."""
+        """Accepted values of the Host header: a page of another name that resolves here is refused."""
         own = f"[{self.host}]" if ":" in self.host else self.host
         names = {name.lower() for name in (own, *self.aliases, "localhost", "127.0.0.1", "[::1]")}
         usual = names if self.port == USUAL_PORTS[self.scheme] else ()
@@ -131,20 +131,20 @@ class Place:
 
     @property
     def origins(self) -> frozenset[str]:
-        """Values of the Origin header that mean this server's page: another scheme is another page."""
+        """Accepted values of the Origin header: another scheme is another page."""
         return frozenset(f"{self.scheme}://{name}" for name in self.names)
 
 
 class Station:
-    """The page's server and what it follows.
+    """Server of the page, with the feeds of robots and recordings.
 
     Args:
-        robots: what is shown; the first one at the start.
-        clock: the station's time.
-        place: where to listen.
+        robots: robots to show; the first is shown at the start.
+        clock: clock of the station.
+        place: address to listen on.
         routers: endpoints whose robots are shown as they appear.
-        open_log: opens recordings that are to be replayed; None = none are.
-        emulated: takes faults and obstacles of an emulated robot; None = the robots are not this program's.
+        open_log: opens recordings for replay; None disables replay.
+        emulated: receives faults and obstacles of an emulated robot; None if this program emulates no robot.
     """
 
     def __init__(
@@ -172,17 +172,17 @@ class Station:
         self._numbers = itertools.count(1)
         self._browsers: list[_Browser] = []
         self._run = secrets.token_hex(2)
-        """Distinguishes this run's browsers from those of another, whose sequence numbers the robot remembers."""
+        """Token of this run in browser names: the robot remembers the sequence numbers of other runs' browsers."""
         self._strings = _strings()
         self._open_log = open_log
         self.replays: dict[str, ReplayFeed] = {}
-        """Recordings that are shown, by their name in the list of robots."""
+        """Shown recordings, by their name in the list of robots."""
         self._folder: Path | None = None
-        """Where recordings are fetched to, while it runs."""
+        """Folder of fetched recordings while the server runs."""
         self._fetching = asyncio.Lock()
 
     async def run(self, ready: Callable[[], object] = lambda: None) -> None:
-        """Serve until cancelled; ``ready`` is called once browsers are answered.
+        """Serve until cancelled; calls ``ready`` once browsers are answered.
 
         Raises:
             BusyError: the port is taken.
@@ -204,12 +204,12 @@ class Station:
             except OSError as error:
                 raise BusyError(f"{place.url} cannot be served: {error.strerror or error}") from None
             ready()
-            while True:  # robots may come while others are followed, and users go
+            while True:  # meanwhile robots may appear and users may be removed
                 done, _ = await asyncio.wait(
                     [*self._following.values(), *discovering], return_when=asyncio.FIRST_COMPLETED, timeout=CHECK_PERIOD
                 )
                 for task in done:
-                    if not task.cancelled():  # of a recording that was dropped
+                    if not task.cancelled():  # its recording was dropped
                         task.result()
                 await self._check_users()
                 self._close_crowds(runner.server)
@@ -226,7 +226,7 @@ class Station:
                 shutil.rmtree(self._folder, ignore_errors=True)
 
     async def _check_users(self) -> None:
-        """Let those go who may no longer be here, or not as they are."""
+        """Disconnect browsers whose user was removed or has another role or password."""
         users = self.place.users
         if users is not None and await users.refresh():
             for socket, (user, transport) in self._sockets.items():
@@ -238,7 +238,7 @@ class Station:
                     task.add_done_callback(self._closing.discard)
 
     def _close_crowds(self, server: web.Server) -> None:
-        """Close what one network has too many of, before a login too, so that it does not take all file descriptors."""
+        """Close excess connections of one network, even before a login, so that it cannot use all file descriptors."""
         of_peer: dict[str, int] = {}
         for connection in server.connections:  # the oldest first
             peer = _peer(connection)
@@ -250,16 +250,16 @@ class Station:
                 self._remarks.add(peer, f"{count} connections of {peer}, {count - MOST_CONNECTIONS} are closed")
 
     def _follow(self, feed: RobotFeed | ReplayFeed) -> None:
-        """Follow it, and offer it in every browser."""
+        """Follow a feed, and offer it in every browser."""
         self._following[feed] = asyncio.create_task(feed.run())
         for viewer in self._viewers:
             viewer.send(frames.text("robots", names=self.names))
 
     def _drop_replay(self) -> None:
-        """Make room for another recording: the oldest that nobody looks at goes.
+        """Drop the oldest recording that no browser watches, to make room for another.
 
         Raises:
-            InputError: all are looked at.
+            InputError: all recordings are being watched.
         """
         name = next((name for name, feed in self.replays.items() if not feed.watched), None)
         if name is None:
@@ -268,15 +268,15 @@ class Station:
 
     @property
     def names(self) -> list[str]:
-        """What browsers can look at: robots, then recordings."""
+        """Names that browsers can watch: robots, then recordings."""
         return [*self.feeds, *self.replays]
 
     async def replay(self, address: RobotAddress, name: str, user: str, viewer: Viewer) -> str:
         """Fetch a recording and offer it in every browser; returns its name there.
 
         Raises:
-            InputError: there is no such name, it cannot be shown, or too many are shown already.
-            TruckError: the robot refuses it, or is not there.
+            InputError: the name is invalid, the recording cannot be shown, or too many are shown already.
+            TruckError: the robot refuses, or is absent.
         """
         title = f"{address.name} {name.removesuffix('.mcap')}"
         if self._open_log is None or not RECORDING.fullmatch(name):
@@ -296,7 +296,7 @@ class Station:
             await fetch(address, name, user, self._clock, file, progress)
             try:
                 feed = await in_thread(lambda: ReplayFeed(title, file, open_log, self._clock))
-            finally:  # one that cannot be shown would fill the disk
+            finally:  # recordings that cannot be shown would fill the disk
                 file.unlink(missing_ok=True)
             self.replays[title] = feed
         self._follow(feed)
@@ -313,7 +313,7 @@ class Station:
         """Change the emulated robot or its world.
 
         Raises:
-            InputError: no robot is emulated here, or it refuses that.
+            InputError: this station emulates no robot, or the emulator refuses the change.
         """
         if self._emulated is None:
             raise InputError("no robot of this station is emulated")
@@ -325,7 +325,7 @@ class Station:
         self.show_emulated(self._viewers)
 
     def _found(self, address: RobotAddress) -> None:
-        """A robot appeared: follow it, and offer it in every browser."""
+        """Follow a robot that appeared, and offer it in every browser."""
         if address.name in self.feeds:
             return
         log.info("robot %s appeared at %s", address.name, address.endpoint)
@@ -333,7 +333,7 @@ class Station:
         self._follow(self.feeds[address.name])
 
     def application(self) -> web.Application:
-        """All routes."""
+        """Return the application with all routes."""
         application = web.Application(middlewares=[self._guard], client_max_size=commands.LONGEST_MESSAGE)
         application.add_routes(
             [
@@ -354,14 +354,14 @@ class Station:
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse what other sites make a browser ask."""
+        """Refuse requests that other sites make a browser send."""
         if request.host not in self.place.names:
             raise self._refused(request, f"host {request.host!r} is not this station's name")
         origin = request.headers.get("Origin")
         foreign = origin is not None and origin not in self.place.origins
         if foreign or (request.path == "/socket" and origin is None):
             raise self._refused(request, f"origin {origin!r} is not this station's page")
-        # Pictures and links of other sites come without an origin.
+        # Requests from images and links of other sites have no origin.
         if request.path != "/" and request.headers.get("Sec-Fetch-Site", OWN_SITE[0]) not in OWN_SITE:
             raise self._refused(request, "asked for by the page of another site")
         if self.place.users is None:
@@ -384,7 +384,7 @@ class Station:
         return web.HTTPForbidden(text=why, headers=HEADERS)
 
     def _refuse_rubbish(self, record: logging.LogRecord) -> bool:
-        """Whether a line of aiohttp's is written as it is: what is no request of HTTP gets a short one of ours."""
+        """Log filter for aiohttp: replace its line on a malformed HTTP request by a short one; pass all other lines."""
         fault = record.exc_info[1] if isinstance(record.exc_info, tuple) else None
         if not isinstance(fault, HttpProcessingError):
             return True
@@ -450,8 +450,8 @@ class Station:
 
     async def _converse(self, request: web.Request, browser: "_Browser") -> web.WebSocketResponse:
         name, peer = browser.name, request.remote
-        # 10.0: seconds between two pings of the WebSocket itself; a browser that does not answer for half of it is let
-        # go
+        # 10.0: ping interval of the WebSocket itself (s); a browser that does not answer for half of it is
+        # disconnected
         socket = web.WebSocketResponse(max_msg_size=commands.LONGEST_MESSAGE, heartbeat=10.0, compress=False)
         await socket.prepare(request)
         self._remarks.add(peer, f"browser {name} connected from {peer}", logging.INFO)
@@ -462,7 +462,7 @@ class Station:
         try:
             async for received in socket:
                 if self.place.users is not None and not self.place.users.stands(browser.user):
-                    break  # let go, or about to be
+                    break  # disconnected, or about to be
                 if received.type is not WSMsgType.TEXT:
                     self._remarks.add(peer, f"browser {name} at {peer} refused: {_fault(received)}")
                     break
@@ -483,7 +483,7 @@ class Station:
 
 
 async def _let_go(socket: web.WebSocketResponse, transport: asyncio.Transport | None, code: int) -> None:
-    """Close a browser's WebSocket; one that reads nothing is cut off, as it would hold up its closing forever."""
+    """Close a browser's WebSocket; abort the connection of a browser that reads nothing and would block the close."""
     try:
         async with asyncio.timeout(END):
             await socket.close(code=code)
@@ -493,14 +493,14 @@ async def _let_go(socket: web.WebSocketResponse, transport: asyncio.Transport | 
 
 
 class _Pace:
-    """Holds up a browser that sends more than ``MESSAGES`` a second."""
+    """Slows down a browser that sends more than ``MESSAGES`` per second."""
 
     def __init__(self) -> None:
         self._clock = asyncio.get_running_loop().time
         self._left, self._at = MESSAGES, self._clock()
 
     async def keep(self) -> None:
-        """After each message: wait, if there were too many."""
+        """Wait after a message if there were too many."""
         now = self._clock()
         self._left, self._at = min(self._left + (now - self._at) * MESSAGES, MESSAGES) - 1.0, now
         if self._left < 0.0:
@@ -508,7 +508,7 @@ class _Pace:
 
 
 class _Browser:
-    """One connection: what it looks at, and what it asks."""
+    """Connection of one browser, with its feed and its commands."""
 
     def __init__(self, name: str, user: StationUser, station: Station, board: FleetBoard, clock: Clock) -> None:
         self.viewer = Viewer()
@@ -526,11 +526,11 @@ class _Browser:
         station.show_emulated((self.viewer,))
 
     def take(self, data: str) -> None:
-        """Obey one message.
+        """Execute the command of one message.
 
         Raises:
-            InputError: it is none, or names a robot that is not here.
-            NotPermittedError: the user may not ask for that.
+            InputError: the message is not a command, or names an unknown robot.
+            NotPermittedError: the user may not give this command.
         """
         command = commands.parse(data)
         refused = self._refusal(command)
@@ -571,13 +571,13 @@ class _Browser:
         self._begin(self._replay(command))
 
     def _answered(self, command: commands.AnyCommand, error: TruckError) -> TruckError:
-        """The error, reported as the outcome of a command that has one."""
+        """Report the error as the outcome of a command that has one, and return it."""
         if isinstance(command, commands.Asked):
             self.viewer.send(frames.refusal(command.id, error))
         return error
 
     def _refusal(self, command: commands.AnyCommand) -> NotPermittedError | None:
-        """Why the user may not ask for that now."""
+        """Return why the user may not give this command now."""
         if not self.user.may(needed := commands.needed(command)):
             return NotPermittedError(f"user {self.user.name!r} is {self.user.role.value}: expected {needed.value}")
         if isinstance(self._feed, ReplayFeed) and not _while_replaying(command):
@@ -619,7 +619,7 @@ class _Browser:
         self.viewer.send(frames.text("stops", robot=feed.address.name))
 
     def _show_replay(self, replay: ReplayFeed) -> None:
-        """Show a recording; the session with the robot stays, or begins, so that its emergency stop is at hand."""
+        """Show a recording; keep or open the session with the robot, so that its emergency stop is available."""
         if self._feed is not None:
             self._feed.detach(self.viewer)
         self.viewer.forget()
@@ -640,7 +640,7 @@ class _Browser:
         self._feed = self._pilot = self._session = None
 
     async def close(self) -> None:
-        """End its sessions."""
+        """End the browser's sessions."""
         self._board.show(self.viewer, False)
         self._leave()
         for task in self._ending:
@@ -649,14 +649,14 @@ class _Browser:
 
 
 def _peer(connection: web.RequestHandler) -> str:
-    """Address of the other end, or of IPv6 its network."""
+    """Return the address of the peer, or its network for IPv6."""
     transport = connection.transport
     name = None if transport is None else transport.get_extra_info("peername")
     return network_of(str(name[0])) if name else "?"
 
 
 def _while_replaying(command: commands.AnyCommand) -> bool:
-    """Whether it is obeyed while a recording is shown."""
+    """Return whether a command is executed while a recording is shown."""
     if isinstance(command, commands.GiveOrder):
         return command.order in UNCONDITIONAL
     return isinstance(command, Watch | LookAtFleet | EchoRequest | ControlReplay)
@@ -673,7 +673,7 @@ async def _send(socket: web.WebSocketResponse, viewer: Viewer) -> None:
 
 
 def _fault(received: WSMessage) -> str:
-    """Why a message that is no text ends the connection."""
+    """Return why a message other than text ends the connection."""
     if received.type is WSMsgType.ERROR:
         return str(received.data)
     return f"a message of type {received.type.name.lower()}, expected text"
@@ -685,7 +685,7 @@ def _page_file(name: str) -> web.Response:
 
 
 def _strings(language: str = LANGUAGE) -> bytes:
-    """All texts of the page by key; those of reasons are the robot's own unless the table has better ones."""
+    """Return all texts of the page by key; reasons have the robot's texts unless the table has better ones."""
     table = {f"reason.{reason.value}": reason.text for reason in Reason}
     table |= json.loads((PAGE / "strings" / f"{language}.json").read_text(encoding="utf-8"))
     return json.dumps(table).encode()

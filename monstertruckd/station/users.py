@@ -1,4 +1,4 @@
-"""Who may use a page that is served beyond this machine: names, roles, and passwords as scrypt hashes (RFC 7914)."""
+"""Users of a page served beyond this machine: names, roles, and passwords as scrypt hashes (RFC 7914)."""
 
 import asyncio
 import base64
@@ -25,67 +25,67 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import SOURCE_NAME
 
 WRONG_PASSWORD_PAUSE: Final = 1.0
-"""Delay after a wrong password, one attempt after the other (s)."""
+"""Delay after a wrong password (s); attempts are processed in sequence."""
 log = logging.getLogger(__name__)
 
 COST: Final = {"n": 2**14, "r": 8, "p": 1}
-"""Parameters of scrypt: 16 MB and some 50 ms for each attempt."""
+"""Parameters of scrypt: 16 MB and about 50 ms per attempt."""
 LENGTH: Final = 32
 MOST_ATTEMPTS: Final = 16
-"""Attempts of one address that wait for their turn; further ones are wrong at once."""
+"""Maximum number of waiting attempts of one address; further attempts fail at once."""
 HASH: Final = re.compile(rf"[0-9a-f]{{{2 * LENGTH}}}:[0-9a-f]{{{2 * LENGTH}}}")
 NO_HASH: Final = ":".join(("00" * LENGTH,) * 2)
-"""Compared with for unknown names, so that they take as long as known ones."""
+"""Hash compared for unknown names, so that they take as long as known names."""
 
 
 @dataclass(frozen=True, slots=True)
 class StationUser:
-    """Somebody before a page."""
+    """User of a page."""
 
     name: str
     role: AccessRole
     proof: str = field(default="", repr=False)
-    """Hash of the password that was given."""
+    """Hash of the password at login."""
 
     def may(self, needed: AccessRole) -> bool:
-        """Whether the user may do what takes ``needed``."""
+        """Return whether the user's role covers ``needed``."""
         return self.role.covers(needed)
 
 
 LOCAL: Final = StationUser("", AccessRole.ENGINEER)
-"""Whoever sits at this machine: the page has no login there, as the other commands have none."""
+"""User at this machine: the page has no login there, like the other commands."""
 
 
 class StationUsers:
-    """Users of a file, as it is now.
+    """Current users in a file.
 
     Args:
-        file: to be read.
+        file: file to read.
 
     Raises:
-        NotFoundError: there is none.
-        NotPermittedError: others may read it.
-        InputError: it is no such file.
+        NotFoundError: the file does not exist.
+        NotPermittedError: others may read the file.
+        InputError: the file is not a users file.
     """
 
     def __init__(self, file: Path) -> None:
         self._file = file
         self._version = _version(file)
         self._reported: object = self._version
-        """Version that was found damaged, and reported."""
+        """Damaged version that was reported."""
         self._rows = _read(file)
         self._known: OrderedDict[bytes, StationUser] = OrderedDict()
-        """Headers that were right, by their hash: a page asks for a dozen files."""
+        """Users of valid headers, by hash of the header: a page requests a dozen files."""
         self._secret = secrets.token_bytes(LENGTH)
         self._turns: dict[str, tuple[asyncio.Lock, int]] = {}
-        """Of every address that waits, and how many of its attempts do."""
-        self._hashing = asyncio.Semaphore(2)  # computed at once
+        """Lock and number of waiting attempts of each address."""
+        self._hashing = asyncio.Semaphore(2)  # maximum number of concurrent hash computations
 
     async def refresh(self) -> bool:
-        """Read the file again if it has changed; whether the users have.
+        """Read the file again if it has changed; returns whether the users have changed.
 
-        A file that cannot be read, or names nobody, is reported and tried again, and the users stay as they are: a slip
-        of an editor takes nobody's emergency stop away.
+        A file that cannot be read, or holds no user, is reported and retried, and the users stay unchanged: a slip in
+        an editor must not take the emergency stop from any user.
         """
         version = await in_thread(lambda: _version(self._file))
         if version == self._version:
@@ -106,14 +106,13 @@ class StationUsers:
         return True
 
     def stands(self, user: StationUser) -> bool:
-        """Whether a user who has logged in is still one, with the same role and password."""
+        """Return whether a logged-in user still exists with the same role and password."""
         return self._rows.get(user.name) == (user.role, user.proof)
 
     async def who(self, header: str | None, address: str = "") -> StationUser | None:
-        """The user of an ``Authorization`` header of the scheme Basic (RFC 7617); None = nobody.
+        """Return the user of a Basic ``Authorization`` header (RFC 7617); None for an invalid login.
 
-        Attempts of one address, or network of IPv6, are looked at one after the other: whoever guesses holds up nobody
-        elsewhere.
+        Attempts of one address, or IPv6 network, are checked in sequence: guessing delays no user elsewhere.
         """
         credentials = _credentials(header)
         if credentials is None:
@@ -153,7 +152,7 @@ class StationUsers:
 
 
 def network_of(address: str) -> str:
-    """What guesses of one origin share: an address, or of IPv6 the network of 64 bits that one site has."""
+    """Return the common key of one site's attempts: its address, or its 64-bit network for IPv6."""
     with suppress(ValueError):
         found = ipaddress.ip_address(address.partition("%")[0])
         if found.version == 6 and found.ipv4_mapped is None:
@@ -162,7 +161,7 @@ def network_of(address: str) -> str:
 
 
 def _version(file: Path) -> tuple[int, ...] | None:
-    """What changes whenever a file is written; None = it is not there."""
+    """Return a value that changes whenever a file is written; None if the file does not exist."""
     try:
         found = file.stat()
     except OSError:
@@ -171,12 +170,12 @@ def _version(file: Path) -> tuple[int, ...] | None:
 
 
 def _read(file: Path) -> dict[str, tuple[AccessRole, str]]:
-    """Role and hash of the password by name.
+    """Read role and password hash by name.
 
     Raises:
-        NotFoundError: there is no such file.
-        NotPermittedError: others may read it.
-        InputError: it is no file of users.
+        NotFoundError: the file does not exist.
+        NotPermittedError: others may read the file.
+        InputError: the file is not a users file.
     """
     if not file.is_file():
         raise NotFoundError(f"{file}: not there; expected users (monstertruckd station --add-user NAME --users {file})")
@@ -191,11 +190,11 @@ def add_user(file: Path, name: str, role: AccessRole, password: str) -> None:
     """Add a user to a file, or change one.
 
     Raises:
-        InputError: the name cannot be part of a key, or the password is too short.
+        InputError: the name is not valid in a key, or the password is too short.
     """
     if not SOURCE_NAME.fullmatch(name) or ":" in name or len(name) > 24:
         raise InputError(f"user {name!r}: expected up to 24 letters, digits and . _ - @")
-    shortest = 8  # characters of a password
+    shortest = 8  # minimum length of a password (characters)
     if len(password) < shortest:
         raise InputError(f"password of {name}: expected at least {shortest} characters")
     rows = _rows(file) if file.exists() else {}
@@ -208,7 +207,7 @@ def add_user(file: Path, name: str, role: AccessRole, password: str) -> None:
 
 
 def hash_of(password: str, salt: bytes) -> str:
-    """Salt and scrypt hash, hexadecimal, with a colon between."""
+    """Return salt and scrypt hash, hexadecimal, separated by a colon."""
     return f"{salt.hex()}:{hashlib.scrypt(password.encode(), salt=salt, dklen=LENGTH, **COST).hex()}"
 
 
@@ -217,10 +216,10 @@ def _matches(password: str, kept: str) -> bool:
 
 
 def _rows(file: Path) -> dict[str, Any]:
-    """Users of a file by name.
+    """Read the users of a file by name.
 
     Raises:
-        InputError: it is no such file.
+        InputError: the file is not a users file.
     """
     rows = read_yaml(file) or {}
     if not isinstance(rows, dict) or not all(isinstance(name, str) for name in rows):

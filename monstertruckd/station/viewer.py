@@ -1,4 +1,4 @@
-"""What waits to be sent to browsers: the newest message of each kind and tile of the map, and a few events."""
+"""Outboxes of browsers: the latest frame of each kind and map tile, and a few events."""
 
 import asyncio
 from collections import deque
@@ -7,15 +7,15 @@ from typing import Final
 from monstertruckd.station.frames import Frame
 
 Place = tuple[float, float]
-"""Where a part of the map begins, m."""
+"""Origin of a map tile (m)."""
 MOST_ANSWERS: Final = 256
-"""Events and answers that wait; beyond that the oldest is lost."""
+"""Maximum number of waiting events and answers; then the oldest is dropped."""
 MOST_TILES: Final = 400
-"""Changed parts of the map that wait; beyond that the oldest is lost, until the whole map comes again."""
+"""Maximum number of waiting map tiles; then the oldest is dropped, until the next full map."""
 
 
 class Viewer:
-    """Outbox of one browser. A browser that reads slowly, or not at all, gets fewer pictures and delays nobody."""
+    """Outbox of one browser. A browser that reads slowly, or not at all, gets fewer images and delays no other."""
 
     def __init__(self) -> None:
         self._newest: dict[str, Frame] = {}
@@ -23,15 +23,15 @@ class Viewer:
         self._ordered: deque[Frame] = deque(maxlen=MOST_ANSWERS)
         self._news = asyncio.Event()
         self.lost = 0
-        """Frames of the ordered queue that were dropped."""
+        """Number of frames dropped from the ordered queue."""
 
     def show(self, kind: str, frame: Frame) -> None:
-        """Send ``frame`` unless a newer one of its kind comes before it is sent."""
+        """Queue ``frame``; a newer frame of its kind replaces it before it is sent."""
         self._newest[kind] = frame
         self._news.set()
 
     def patch(self, place: Place, frame: Frame) -> None:
-        """Send a part of the map unless a newer one of its place comes before it is sent."""
+        """Queue a map tile; a newer tile at its place replaces it before it is sent."""
         self._tiles.pop(place, None)
         self._tiles[place] = frame
         if len(self._tiles) > MOST_TILES:
@@ -39,23 +39,23 @@ class Viewer:
         self._news.set()
 
     def send(self, frame: Frame) -> None:
-        """Send ``frame`` behind all that were given so."""
+        """Queue ``frame`` in order of the calls."""
         self.lost += len(self._ordered) == MOST_ANSWERS
         self._ordered.append(frame)
         self._news.set()
 
     def forget(self) -> None:
-        """Drop all that waits: another robot is looked at."""
+        """Drop all waiting frames: the browser switches to another robot."""
         self.forget_states()
         self._ordered.clear()
 
     def forget_states(self) -> None:
-        """Drop what waits of a robot's state: it started again."""
+        """Drop waiting states and tiles of a robot, which was restarted."""
         self._newest.clear()
         self._tiles.clear()
 
     async def next(self) -> Frame:
-        """The next frame to be sent: what is ordered first, then states, parts of the map, pictures of the camera."""
+        """Return the next frame to send: ordered frames first, then states, map tiles, camera images."""
         while not self._ordered and not self._newest and not self._tiles:
             self._news.clear()
             await self._news.wait()
@@ -68,24 +68,24 @@ class Viewer:
 
 
 class Viewers(set[Viewer]):
-    """Browsers that look at the same robot or recording, and the newest frame of each kind that they are shown."""
+    """Browsers that watch the same robot or recording, with the latest frame of each kind shown to them."""
 
     def __init__(self) -> None:
         super().__init__()
         self.newest: dict[str, Frame] = {}
 
     def show(self, kind: str, frame: Frame) -> None:
-        """Show a frame everywhere, and keep it for whoever comes later."""
+        """Show a frame in all browsers, and keep it for browsers that join later."""
         self.newest[kind] = frame
         for viewer in self:
             viewer.show(kind, frame)
 
     def send(self, frame: Frame) -> None:
-        """Send a frame everywhere, behind all that were given so."""
+        """Send a frame to all browsers, in order of the calls."""
         for viewer in self:
             viewer.send(frame)
 
     def patch(self, place: Place, frame: Frame) -> None:
-        """Send a part of the map everywhere, unless a newer one of its place comes before."""
+        """Queue a map tile for all browsers; a newer tile at its place replaces it."""
         for viewer in self:
             viewer.patch(place, frame)
