@@ -1,1 +1,1 @@
-"""Calibration of a truck: guided wizards, and the dated file of what they measured."""
+"""Calibration of a truck: guided wizards, and the dated file of their results."""

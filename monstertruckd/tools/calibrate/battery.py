@@ -49,7 +49,7 @@ class BatteryWizard:
     meter_share: float = 0.005
     """Greatest error of the multimeter as a share of its reading"""
     meter_digits: float = 0.02
-    """Greatest constant error of the meter, V"""
+    """Maximum constant error of the meter (V)"""
     samples: int = 50
     fresh: bool = False
     """Forget the readings of earlier runs"""

@@ -1,7 +1,7 @@
-"""What the camera saw of a board that somebody holds, and what is still missing: pure, picture by picture.
+"""Camera views of a hand-held board, and the views still missing; free of side effects, image by image.
 
-A view counts when the board was held still for a moment: its corners are averaged over that time, and the lidar's scans
-of the same time belong to it.
+A view is valid if the board was held still for a moment: its corners are averaged over that time, and it includes the
+lidar scans of the same time.
 """
 
 import math
@@ -21,11 +21,11 @@ from monstertruck_schemas.sensor import LaserScan
 from monstertruckd.tools.calibrate.beams import bearings_of, stacked_ranges
 
 HOLD: Final = round(0.7 * SECOND)
-"""Time for which the board is held still, ns."""
+"""Hold time of the board (ns)."""
 BLURRED: Final = 2.0
-"""Pixels: standard deviation of the step of an edge."""
+"""Standard deviation of an edge step above which an image is blurred (px)."""
 LEAST_SCANS: Final = 3
-"""Scans of a view, at least."""
+"""Minimum scans per view."""
 ROWS: Final = ("upper", "middle", "lower")
 COLUMNS: Final = ("left", "middle", "right")
 TILT: Final = math.radians(12.0)
@@ -38,17 +38,17 @@ class BoardView:
     """The board, held still."""
 
     sighting: BoardSighting
-    """Corners averaged over its pictures"""
+    """Corners, averaged over the images of the view"""
     pose: BoardPose
-    """Pose by the lens that was configured then"""
+    """Pose by the lens configured at that time"""
     angles: Array
-    """Angles of the lidar's beams, rad, left positive; (n,); empty: it sent too few scans"""
+    """Lidar beam angles (rad), left positive; (n,); empty if there were too few scans"""
     ranges: Array
-    """Medians over the same time, m; inf = nothing; (n,)"""
+    """Median ranges over the same time (m); inf: no return; (n,)"""
 
 
 def of_scans(scans: Sequence[LaserScan]) -> tuple[Array, Array]:
-    """Angles of the beams, rad, and medians of their ranges, m; empty where there are too few."""
+    """Return beam angles (rad) and median ranges (m); empty if there are too few scans."""
     if len(scans) < LEAST_SCANS:
         return np.empty(0), np.empty(0)
     return bearings_of(scans[0]), np.median(stacked_ranges(scans, np.inf), axis=0)
@@ -56,26 +56,26 @@ def of_scans(scans: Sequence[LaserScan]) -> tuple[Array, Array]:
 
 @dataclass
 class BoardAttempts:
-    """Pictures since the last view, by what was wrong with them."""
+    """Image counts since the last view, by defect."""
 
     pictures: int = 0
     unseen: int = 0
     blurred: int = 0
     blur: float = 0.0
-    """Blur of the last blurred view, pixels"""
+    """Blur of the last blurred view (px)"""
     moved: int = 0
     damaged: int = 0
 
 
 @dataclass
 class BoardGuide:
-    """Takes pictures, keeps views, and says what is missing.
+    """Takes images, keeps views, and lists the missing ones.
 
     Args:
         reader: of the board.
-        lens: as configured: only tilts and distances are judged by it.
-        beams: whether a view is one that the lidar sees, too; None = there is no lidar.
-        patience: s without a new view that end it.
+        lens: as configured; used only to judge tilts and distances.
+        beams: whether the lidar also sees the board in a view; None without a lidar.
+        patience: timeout without a new view (s).
     """
 
     reader: BoardReader
@@ -92,16 +92,16 @@ class BoardGuide:
     def take(
         self, stamp: int, sighting: BoardSighting | None, scans: Iterable[LaserScan] = (), *, damaged: bool = False
     ) -> BoardView | None:
-        """Take the next picture in; returns a view that has come of it.
+        """Take the next image; return the view that it completes, if any.
 
         Args:
-            stamp: of the picture, ns.
-            sighting: of the board in it; None = it is not seen, or the picture is ``damaged``.
-            scans: that have come since the last call.
-            damaged: the picture cannot be decoded.
+            stamp: image time (ns).
+            sighting: the board in the image; None if it is not visible, or the image is ``damaged``.
+            scans: scans since the last call.
+            damaged: the image cannot be decoded.
 
         Raises:
-            InputError: nothing new for too long: says what is wrong, or missing.
+            InputError: no new view for too long; the message names the fault or the missing views.
         """
         self._scans.extend(scans)
         self.attempts.damaged += damaged
@@ -130,17 +130,17 @@ class BoardGuide:
             else:
                 attempts.blurred, attempts.blur = attempts.blurred + 1, sighting.blur
             return None
-        # 1.0: pixels that four corners of five move meanwhile, at most: a single one may be found wrong
+        # 1.0: maximum motion of four corners of five during the hold (px): a single corner may be detected wrongly
         if self._held and moved(self._held[0][1], sighting) > 1.0:
             attempts.moved += 1
             self._held = []
         self._held.append((stamp, sighting))
         first = self._held[0][0]
-        if stamp - first < HOLD or len(self._held) < 3:  # pictures of a view, at least
+        if stamp - first < HOLD or len(self._held) < 3:  # minimum images per view
             return None
         mean = averaged([seen for _, seen in self._held])
         self._held = self._held[-1:]
-        # 12.0: pixels by which corners differ from those of every other view, on average
+        # 12.0: minimum mean distance of the corners from the corners of every other view (px)
         if any(apart(view.sighting, mean).mean() < 12.0 for view in self.views if _shared(view.sighting, mean)):
             return None
         pose = board_pose(mean, self.reader, self.lens)
@@ -152,26 +152,26 @@ class BoardGuide:
     # What is missing
 
     def missing(self) -> list[str]:
-        """What has to be shown yet, in words."""
+        """Describe the views still needed."""
         found = [f"the board in the {cell} of the picture" for cell in self.uncovered()]
         if self.views and not self.uncovered():
             distances = [view.pose.place[2] for view in self.views]
-            if max(distances) < 1.3 * min(distances):  # distance of the farthest view over that of the nearest
+            if max(distances) < 1.3 * min(distances):  # ratio of the farthest to the nearest view distance
                 found.append(f"the board nearer and farther than {min(distances):.2f} to {max(distances):.2f} m")
-        found += self._tilts(self.views, 3, "")  # views needed that are tilted by more, to each of four sides
+        found += self._tilts(self.views, 3, "")  # views needed with a larger tilt, to each of four sides
         found += _more(24 - len(self.views), "view of it", "views of it")
         if self.beams is not None:
-            # 3: views needed that the lidar sees as well
+            # 3: views needed that the lidar also sees
             found += self._tilts(self.seen_by_lidar, 3, ", across the lidar's beam")
             found += self._steep()
             if self.views and not any(view.ranges.size for view in self.views):
                 found.insert(0, f"scans of the lidar: {LEAST_SCANS} or more in {HOLD / SECOND:g} s")
-            more = 16 - len(self.seen_by_lidar)  # views in which the lidar sees the board, too
+            more = 16 - len(self.seen_by_lidar)  # views needed in which the lidar also sees the board
             found += _more(more, "view across the lidar's beam", "views across the lidar's beam")
         return found
 
     def uncovered(self) -> list[str]:
-        """Ninths of the picture in which too few corners were seen."""
+        """Ninths of the image with too few corners."""
         width, height = self.lens.size
         counts = np.zeros((3, 3), np.int64)
         for view in self.views:
@@ -183,21 +183,21 @@ class BoardGuide:
             "middle" if i == j == 1 else f"{row} {column}".removeprefix("middle ")
             for i, row in enumerate(ROWS)
             for j, column in enumerate(COLUMNS)
-            if counts[i, j] < 6  # corners in each ninth of the picture
+            if counts[i, j] < 6  # corners needed in each ninth of the image
         ]
 
     def _steep(self) -> list[str]:
         poses = [view.pose for view in self.seen_by_lidar]
         steep = f"by {math.degrees(STEEP):.0f} degrees or more, across the lidar's beam"
-        # 8: views that the lidar sees, tilted by more than ``STEEP``, upper and lower edge nearer each: by these alone
-        # height and pitch of the camera are known, and pitch to 0.5 degrees
+        # 8: views seen by the lidar, tilted by more than ``STEEP``, for each of upper and lower edge nearer: only these
+        # determine the camera's height and pitch, the pitch to 0.5 degrees
         found = [
             f"its {side} {steep} ({more} more)"
             for side, sign in zip(SIDES[2:], (1, -1), strict=True)
             if (more := 8 - sum(sign * pose.lean > STEEP for pose in poses)) > 0
         ]
         distances = [float(pose.place[2]) for pose in poses if abs(pose.lean) > STEEP]
-        # 1.5: distance of the farthest of them over that of the nearest: it tells height from pitch
+        # 1.5: ratio of their farthest to their nearest distance: it separates height from pitch
         if not found and max(distances) < 1.5 * min(distances):
             found.append(f"it so nearer and farther than {min(distances):.2f} to {max(distances):.2f} m")
         return found
@@ -209,12 +209,12 @@ class BoardGuide:
         return [f"its {side}{how} ({more} more)" for side, more in zip(SIDES, short.tolist(), strict=True) if more > 0]
 
     def progress(self) -> tuple[float, float]:
-        """How much of how much is done."""
+        """Progress and total."""
         left = len(self.missing())
         return (1.0, 1.0) if not left else (len(self.views), len(self.views) + left)
 
     def trouble(self) -> str:
-        """Why nothing new came, in a sentence."""
+        """Describe why no new view was accepted, in a sentence."""
         a, board = self.attempts, self.reader.board
         shape = f"{board.columns} x {board.rows} squares"
         within = f"in {self.patience:g} s"
@@ -236,19 +236,19 @@ class BoardGuide:
 
 
 def apart(one: BoardSighting, other: BoardSighting) -> Array:
-    """Distances of the corners that both have, pixels; (n,)."""
+    """Distances of the common corners (px); (n,)."""
     _, a, b = np.intersect1d(one.ids, other.ids, return_indices=True)
     return np.asarray(np.hypot(*(one.corners[a] - other.corners[b]).T))
 
 
 def moved(one: BoardSighting, other: BoardSighting) -> float:
-    """What four of five corners that both have moved by at most, pixels; inf where they have none."""
+    """Maximum motion of four of five common corners (px); inf without common corners."""
     distances = apart(one, other)
     return float(np.percentile(distances, 80)) if distances.size else math.inf
 
 
 def averaged(sightings: Sequence[BoardSighting]) -> BoardSighting:
-    """Means of the corners that most of them have."""
+    """Means of the corners that most sightings share."""
     ids = np.concatenate([s.ids for s in sightings])
     corners = np.concatenate([s.corners for s in sightings])
     numbers, counts = np.unique(ids, return_counts=True)

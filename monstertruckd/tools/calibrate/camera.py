@@ -1,7 +1,8 @@
-"""Lens of the camera, and its mount against the lidar's, from a board that somebody holds before both.
+"""Camera lens, and camera mount relative to the lidar, from a board held in view of both.
 
-The lens by Zhang's method (``monstertruck_estimation.vision.lens``), the mount by Zhang and Pless's (``board_mount``).
-Nothing drives; the board is held still for a moment, again and again another way, and the wizard says what is missing.
+The lens uses Zhang's method (``monstertruck_estimation.vision.lens``), the mount the method of Zhang and Pless
+(``board_mount``). The robot does not drive. The operator holds the board still for a moment in one pose after another,
+and the wizard lists the missing views.
 """
 
 import math
@@ -33,9 +34,9 @@ from monstertruckd.tools.calibrate.wizard import WizardContext
 
 ROOM: Final = "a printed board on something flat (`stand print`), 0.4 to 1 m before the camera; light; nothing drives"
 FIRST: Final = 3
-"""Pictures from which the size is taken."""
+"""Number of images that determine the image size."""
 KEPT: Final = math.radians(0.7)
-"""Turn of the lidar's joints that is tolerated meanwhile, rad: two steps of their servos."""
+"""Tolerated rotation of the lidar's joints during the run (rad): two servo steps."""
 UNITS: Final = {"focal_x": "px", "focal_y": "px", "centre_x": "px", "centre_y": "px"}
 
 _BOARD: Final = Confirm(
@@ -45,20 +46,20 @@ _BOARD: Final = Confirm(
 
 @dataclass(frozen=True, slots=True)
 class CameraWizard:
-    """Pictures and scans of a board, until enough was seen."""
+    """Collects images and scans of a board until they suffice."""
 
     name: ClassVar[WizardName] = "camera"
     doc: ClassVar[str] = "lens of the camera, and where it sits against the lidar, from a board held before both"
     room: ClassVar[str] = ROOM
     board: BoardConfig = field(default_factory=BoardConfig)
     lidar: bool = True
-    """Fit the mount, too, where the robot has a lidar"""
+    """Also fit the mount if the robot has a lidar"""
     patience: float = 60.0
-    """Seconds without anything new that end it"""
+    """Timeout without a new view (s)"""
 
     @classmethod
     def of(cls, columns: int, rows: int, square: float, marker: float, lens_only: bool, patience: float) -> Self:
-        """With the command's options; lengths in m.
+        """Create from the command's options; lengths in m.
 
         Raises:
             InputError: a marker does not lie in its square.
@@ -111,7 +112,7 @@ class CameraWizard:
         return result_of(found, len(views), placed)
 
     async def _lidar(self, context: WizardContext) -> LidarPlace | None:
-        """Where it is; with the joints of its mount as they are now."""
+        """Return the lidar's pose, from the current angles of its mount joints."""
         devices = context.config.devices
         if devices.lidar is None:
             return None
@@ -119,7 +120,7 @@ class CameraWizard:
 
 
 def decoded(message: CompressedImage) -> Picture | None:
-    """A picture, grey, (height, width); None = it is damaged, as some of a webcam's are."""
+    """Decode to a grey image, (height, width); None if it is damaged, as some webcam images are."""
     if not message.data:
         return None
     grey: Picture | None = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -127,10 +128,10 @@ def decoded(message: CompressedImage) -> Picture | None:
 
 
 def check_kept(before: LidarPlace, after: LidarPlace | None) -> None:
-    """Refuse views of a lidar whose joints have turned meanwhile: the truck was leant on, or its ground gave way.
+    """Refuse views whose lidar joints have turned during the run: the truck was leant on, or its ground gave way.
 
     Raises:
-        InputError: so they have.
+        InputError: the joints have turned.
     """
     turn = 0.0 if after is None else float(np.linalg.norm(cv2.Rodrigues(before.axes.T @ after.axes)[0]))
     if turn > KEPT:
@@ -141,19 +142,19 @@ def check_kept(before: LidarPlace, after: LidarPlace | None) -> None:
 
 
 def lens_of(views: Sequence[BoardView], reader: BoardReader, size: tuple[int, int]) -> tuple[LensFit, list[BoardView]]:
-    """The lens, and the views it rests on: without those whose corners are far off.
+    """Fit the lens; return it with the views used. Views with corners far off are dropped.
 
     Raises:
-        InputError: corners that no lens explains.
+        InputError: no lens explains the corners.
     """
     found = fit_lens([view.sighting for view in views], reader, size)
     kept = list(views)
     off = np.array(found.by_view)
-    stray = 3.0  # times the median by which the corners of a view may be off
+    stray = 3.0  # maximum corner error of a view, as a multiple of the median
     if (off > stray * np.median(off)).any():
         kept = [view for view, one in zip(views, off.tolist(), strict=True) if one <= stray * np.median(off)]
         found = fit_lens([view.sighting for view in kept], reader, size)
-    worst = 1.0  # pixels: root mean square by which corners may be off
+    worst = 1.0  # maximum RMS corner error (px)
     if found.rms > worst:
         raise InputError(
             f"corners are off by {found.rms:.1f} pixels (expected {worst:g} at most): the board is not flat, it "
@@ -164,12 +165,12 @@ def lens_of(views: Sequence[BoardView], reader: BoardReader, size: tuple[int, in
 
 @dataclass(frozen=True, slots=True)
 class PlacedMount:
-    """The camera's mount as measured."""
+    """Measured camera mount."""
 
     values: dict[str, Interval]
-    """Mount by ``NAMES``."""
+    """Mount values, by ``NAMES``."""
     size: Interval
-    """Size of the board as a share of the stated one."""
+    """Board size, as a fraction of the stated size."""
     lines: int
 
 
@@ -181,15 +182,15 @@ def mount_of(
     lidar: LidarPlace,
     lidar_mount: dict[str, float],
 ) -> PlacedMount:
-    """The mount, with what is known of lens and lidar.
+    """Fit the mount, given the lens and the lidar.
 
     Args:
         views: of the board.
-        reader: that found them.
+        reader: source of the views.
         found: the lens.
         mount: as configured, ``NAMES``.
-        lidar: where it is.
-        lidar_mount: half-widths of its own mount's intervals, by name.
+        lidar: its pose.
+        lidar_mount: half-widths of the intervals of the lidar mount, by name.
 
     Raises:
         InputError: see ``fit_mount``; or the views do not determine the mount.
@@ -200,7 +201,7 @@ def mount_of(
     halves = known_errors(fit, 2 * len(lines) - len(NAMES))
     if not np.isfinite(halves).all():
         raise InputError("mount not determined by the views: it is more than half a metre off, or never tilted")
-    # The axis of the lens is known as well as its centre in the picture.
+    # The lens axis is known as accurately as its centre in the image.
     axis = {"yaw": NORMAL * found.sigmas[2] / fx, "pitch": NORMAL * found.sigmas[3] / fy}
     values = {
         name: Interval(float(value), float(half)).joined(axis.get(name, 0.0)).joined(lidar_mount.get(name, 0.0))
@@ -210,14 +211,14 @@ def mount_of(
 
 
 def lidar_halves(context: WizardContext) -> dict[str, float]:
-    """Half-widths of the lidar's own mount by its calibration, m and rad; none where it was not calibrated."""
+    """Half-widths of the lidar mount from its calibration (m and rad); empty if it was not calibrated."""
     known = context.known.get("lidar")
     estimates = () if known is None else known.estimates
     return {e.name: (e.high - e.low) / 2 for e in estimates if e.low is not None and e.high is not None}
 
 
 def result_of(found: LensFit, views: int, placed: PlacedMount | None = None) -> Result:
-    """Put together; without ``placed`` it is the lens alone."""
+    """Assemble the result; without ``placed`` for the lens alone."""
     lens, (width, height) = found.lens, found.lens.size
     sized = "pictures for which the lens holds"
     estimates = [

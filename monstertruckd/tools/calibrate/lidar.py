@@ -45,9 +45,9 @@ ROOM: Final = (
 )
 QUARTER: Final = math.pi / 2
 LEAST_OVERLAP: Final = 0.5
-"""Least overlap of two scans that are registered."""
+"""Minimum overlap of two registered scans."""
 LEAST_SCANS: Final = 3
-"""Scans at each rest, at least."""
+"""Minimum scans at each rest."""
 CRAB: Final = 0.005
 """Standard deviation of the direction of travel on one leg, by tyres, rad."""
 LEG_DRIFT: Final = 0.006

@@ -1,4 +1,4 @@
-"""Moves of a wizard: drive requests of an ordinary operator, through the safety gate."""
+"""Moves of a wizard: drive requests as an ordinary operator, through the safety gate."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -20,27 +20,27 @@ from monstertruck_schemas.state import GateMode, GateState
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 
 REQUEST_PERIOD: Final = 0.05
-"""Seconds between two requests."""
+"""Request period (s)."""
 MOVE_LEASE: Final = 0.5
-"""Requested, s; the gate may grant less."""
+"""Requested lease (s); the gate may grant less."""
 ARMING: Final = 3.0
-"""Seconds in which the truck must be armed."""
+"""Time limit for arming (s)."""
 RESTING_TURN: Final = 0.1
-"""Turn of the motor, rad, that counts as rest: an encoder may alternate between two counts."""
+"""Motor rotation tolerated at rest (rad): an encoder may alternate between two counts."""
 RESTING_TIME: Final = 0.5
-"""Seconds of an unchanged drive position that count as rest."""
+"""Time of unchanged drive position that is rest (s)."""
 REST_LIMIT: Final = 5.0
-"""Seconds in which it must come to rest."""
+"""Time limit for coming to rest (s)."""
 LATE: Final = (
     "requests came too late: end what else keeps this computer or the link to the robot busy, or run the command on "
     "the robot's own computer, and repeat it; nothing was saved"
 )
-"""What to do about a lease that expired."""
+"""Advice for an expired lease."""
 SILENT: Final = (
     "a device was silent (`monstertruckd status` names it), or the robot's computer is too busy: end what keeps it so, "
     "and repeat the command; nothing was saved"
 )
-"""What to do about measurements or ticks that came too late."""
+"""Advice for late measurements or ticks."""
 ADVICE: Final = {
     Reason.LEASE_EXPIRED: LATE,
     Reason.SCAN_STALE: SILENT,
@@ -49,16 +49,16 @@ ADVICE: Final = {
     Reason.ATTITUDE_STALE: SILENT,
     Reason.TICK_STALLED: SILENT,
 }
-"""Advice by transient reason: a move that one of them stopped is driven again."""
+"""Advice by transient reason; a move stopped for one of these reasons is repeated."""
 
 
 class Mover:
-    """Drives moves.
+    """Executes moves.
 
     Args:
-        truck: link to it.
+        truck: link to the truck.
         clock: time.
-        chassis: for the distance.
+        chassis: drivetrain data, to compute distances.
     """
 
     def __init__(self, truck: TruckClient, clock: Clock, chassis: Chassis) -> None:
@@ -69,16 +69,16 @@ class Mover:
     async def move(
         self, move: MoveStep, report: Callable[[float], None], say: Callable[[str], None] = lambda _: None
     ) -> MoveRecord:
-        """Drive ``move`` and return what was measured; ``report`` is called with the metres driven.
+        """Drive ``move`` and return its record; ``report`` is called with the distance travelled (m).
 
-        However it ends, the truck is stopped and disarmed. After a stop that passed, such as a late request, it drives
-        back to where the move began and once more, twice at most, and reports by ``say``.
+        The truck is always stopped and disarmed at the end. After a transient stop, such as a late request, the mover
+        reports through ``say``, drives back to the start of the move and repeats it, at most twice.
 
         Raises:
-            RequestRefusedError: the gate refused, stopped the truck, or holds it; with its reason.
-            NoAnswerError: the truck does not move though nothing holds it, or sends no feedback.
+            RequestRefusedError: the gate refused, stopped or holds the truck; carries the gate's reason.
+            NoAnswerError: the truck does not move although nothing holds it, or sends no feedback.
         """
-        unmoved = 0.01  # distance, m, up to which a truck still stands where its move began
+        unmoved = 0.01  # distance up to which a truck is still at the start of its move (m)
         depth = 4096
         with (
             ExitStack() as besides,
@@ -91,7 +91,7 @@ class Mover:
         ):
             feeds = drive, steering, attitude, gate, steering_commands, drive_commands
             also = {t.name: besides.enter_context(self._truck.subscribe(t, fifo(depth))) for t in move.also}
-            for left in (2, 1, 0):  # times that a move starts again after a stop that passed
+            for left in (2, 1, 0):  # restarts left after a transient stop
                 run = _Run(self._truck, self._clock, feeds, also)
                 try:
                     await self._once(run, move, report)
@@ -107,7 +107,7 @@ class Mover:
 
     async def _once(self, run: "_Run", move: MoveStep, report: Callable[[float], None]) -> None:
         async with self._armed(run):
-            steering = 1.0  # seconds for turning the wheels while the truck stands
+            steering = 1.0  # time to turn the wheels while the truck stands (s)
             if move.approach:
                 await run.hold(0.0, move.approach, move.approach, steering)
             await run.hold(0.0, move.front, move.rear, steering)
@@ -121,7 +121,7 @@ class Mover:
         run.track.left = run.robot_time
         distance, since = 0.0, self._clock.now()
         began = since
-        stuck = 3.0  # seconds without progress after which a move is cancelled
+        stuck = 3.0  # time without progress after which a move is cancelled (s)
         while True:
             side = move.side((self._clock.now() - began) / SECOND)
             await run.hold(move.speed, side * move.front, side * move.rear, REQUEST_PERIOD)
@@ -129,7 +129,7 @@ class Mover:
             report(new)
             if new >= move.metres or (move.done is not None and move.done(run.track)):
                 return
-            if new - distance > 0.01:  # distance, m, that counts as progress
+            if new - distance > 0.01:  # minimum progress (m)
                 distance, since = new, self._clock.now()
             elif self._clock.now() - since > stuck * SECOND:
                 text = f"{move.name}: no progress for {stuck:g} s ({run.state.why if run.state else 'silent'})"
@@ -138,13 +138,13 @@ class Mover:
 
     @asynccontextmanager
     async def _armed(self, run: "_Run") -> AsyncIterator[None]:
-        """Armed inside; stopped and disarmed afterwards, also after errors."""
+        """Keep the truck armed inside the context; stop and disarm it afterwards, also after errors."""
         await run.free()
         try:
             await run.arm()
             yield
         finally:
-            # Without a link the gate stops the truck itself: the lease of the last request expires.
+            # Without a link the gate stops the truck: the lease of the last request expires.
             with suppress(TruckError):
                 await self._truck.disarm()
 
@@ -169,7 +169,7 @@ class _Run:
         self.track = MoveRecord()
         self.state: GateState | None = None
         self._heard = clock.now()
-        """When its state came, ns."""
+        """Arrival time of the latest gate state (ns)."""
         self._truck = truck
         self._clock = clock
         self._feeds = feeds
@@ -177,19 +177,19 @@ class _Run:
 
     @property
     def robot_time(self) -> int:
-        """The newest stamp that was heard, ns: the robot's clock is another one than this computer's."""
+        """Latest stamp received from the robot (ns), whose clock differs from this computer's."""
         stamps = [0 if self.state is None else self.state.stamp, *(reading.stamp for reading in self.track.drive[-1:])]
         return max(stamps)
 
     def begin(self) -> None:
-        """Discard what was read so far."""
+        """Discard the readings so far."""
         self.track = MoveRecord()
 
     async def free(self) -> None:
         """Make sure that no other operator uses the truck.
 
         Raises:
-            RequestRefusedError: it is armed.
+            RequestRefusedError: the truck is armed.
             NoAnswerError: the gate publishes no state.
         """
         end = self._clock.now() + round(ARMING * SECOND)
@@ -203,7 +203,7 @@ class _Run:
             raise RequestRefusedError(Reason.BUSY, f"the robot is armed already{holder}: disarm it first")
 
     async def arm(self) -> None:
-        """Request standstill for a moment, and arm without planners, so that nobody else sets off.
+        """Request standstill for a moment, and arm without planners, so that nothing else moves the truck.
 
         Raises:
             RequestRefusedError: the gate refused.
@@ -221,7 +221,7 @@ class _Run:
                 requests += 1
                 if arming is not None and arming.done():
                     refusal, arming = arming.result(), None
-                # 3: requests for standstill before the order to arm
+                # 3: standstill requests before the arm order
                 elif arming is None and requests >= 3 and self.state and not self.state.mode.active:
                     arming = asyncio.create_task(self._try_to_arm())
                 await self._clock.sleep(REQUEST_PERIOD)
@@ -231,7 +231,7 @@ class _Run:
                 arming.cancel()
 
     async def _try_to_arm(self) -> TruckError | None:
-        """None, or why it failed."""
+        """Arm the truck; return the error, or None on success."""
         try:
             await self._truck.arm(hold=True, calibrates=True)
         except TruckError as error:
@@ -274,10 +274,10 @@ class _Run:
         self.track.arrived = still
 
     async def coasted(self, drivetrain: DriveTrain) -> float | None:
-        """Wait until a truck that was stopped rests, and what stopped it has passed.
+        """Wait until a stopped truck is at rest and the reason for the stop has cleared.
 
         Returns:
-            Metres that it has come; None: the one or the other does not happen.
+            Distance travelled (m); None if the truck does not come to rest or the reason does not clear.
         """
         end = self._clock.now() + round(REST_LIMIT * SECOND)
         since: DriveFeedback | None = None
@@ -292,7 +292,7 @@ class _Run:
         return None
 
     def _lasting(self) -> bool:
-        """Whether the gate still names a reason that stopped the truck."""
+        """Whether the gate still reports a transient stop reason."""
         return self.state is None or any(reason in ADVICE for reason in self.state.reasons)
 
     def _take(self) -> None:
@@ -316,7 +316,7 @@ class _Run:
         reasons = state.hindrances
         if not reasons and state.mode is GateMode.DRIVING:
             raise RequestRefusedError(Reason.BUSY, f"{state.holder} drives the robot")
-        if not reasons and state.mode.active:  # armed still, but this wizard's requests hold it no longer
+        if not reasons and state.mode.active:  # still armed, but no longer held by this wizard's requests
             reasons = (Reason.LEASE_EXPIRED,)
         text = in_words(reasons) or f"the robot is {state.mode}"
         advice = "".join(f"; {text}" for text in dict.fromkeys(ADVICE[r] for r in reasons if r in ADVICE))

@@ -1,9 +1,9 @@
-"""Dead time and lag of what follows commands that are piecewise constant, from what they brought about.
+"""Dead time and lag of an actuator with piecewise constant commands, from the measured effect.
 
-``s`` seconds after the dead time a change of the command by ``k`` has added ``k (s - lag (1 - exp(-s / lag)))`` to its
-integral over time, which a sensor sees: turns of the truck by the steering, distance by the drive. Fitted are the delay
-(dead time and lag together) and the square of the lag: the delay is all that slow commands show, and the lag shows by
-its square in how they are rounded off.
+``s`` seconds after the dead time, a command step of ``k`` has added ``k (s - lag (1 - exp(-s / lag)))`` to the time
+integral of the response. A sensor measures this integral: the truck's turn for the steering, its distance for the
+drive. The fit parameters are the delay (dead time plus lag) and the square of the lag: slow commands show only the
+delay, and the lag appears as its square in the rounding of the response.
 """
 
 import math
@@ -26,23 +26,23 @@ class Steps:
     first: float
     """Value before the first change."""
     times: Array
-    """Times of the changes, s; (k,)."""
+    """Times of the changes (s); (k,)."""
     changes: Array
     """Size of the changes; (k,)."""
 
     @classmethod
     def of(cls, stamps: Array, values: Array) -> "Steps":
-        """From commands, s and any unit; (n,) each, n > 0."""
+        """Create from stamps (s) and command values (any unit); (n,) each, n > 0."""
         changes = np.diff(values)
         return cls(float(values[0]), stamps[1:][changes != 0.0], changes[changes != 0.0])
 
     def integral(self, at: Array, delay: float, squared: float) -> Array:
-        """Of what follows it, over time, up to a constant; (n,).
+        """Time integral of the response, up to a constant; (n,).
 
         Args:
-            at: s; (n,).
-            delay: dead time and lag, s.
-            squared: square of the lag, s^2; below 0, where nothing can be, it is extrapolated from 0.
+            at: times (s); (n,).
+            delay: dead time plus lag (s).
+            squared: square of the lag (s^2); values below 0, which are unphysical, are extrapolated from 0.
         """
         lag = math.sqrt(abs(squared))
         found = self._lagged(at, delay - lag, lag)
@@ -56,36 +56,36 @@ class Steps:
 
 
 def unexplained(measured: Array, *causes: Array) -> Array:
-    """What the best sum of the causes leaves of a measurement; (n,) each."""
+    """Residual of a measurement after the best linear combination of the causes; (n,) each."""
     basis = np.column_stack(causes)
     return np.asarray(measured - basis @ np.linalg.lstsq(basis, measured, rcond=None)[0])
 
 
 @dataclass(frozen=True, slots=True)
 class ResponseFit:
-    """How something follows commands."""
+    """Fitted response to commands."""
 
     delay: Interval
-    """Dead time and lag together, s."""
+    """Dead time plus lag (s)."""
     squared: Interval
-    """Square of the lag, s^2; may be below 0 by the noise."""
+    """Square of the lag (s^2); noise may make it negative."""
     samples: int
-    """Residuals that it rests on."""
+    """Number of residuals in the fit."""
 
     @classmethod
     def of(cls, residuals: Callable[[float, float], Array], wait: float, rounded: float = 0.0) -> "ResponseFit":
-        """Least squares.
+        """Fit by least squares.
 
         Args:
             residuals: from the delay (s) and the square of the lag (s^2), in the order of time; (n,).
-            wait: half the range of a time, s, for which commands may have to wait, another one after each start; as
-                likely anywhere in it.
-            rounded: greatest square of a lag, s^2, that anything else may look like.
+            wait: half the range of the time that commands may have to wait (s); it differs after each start and is
+                uniformly distributed.
+            rounded: maximum apparent squared lag of any other effect (s^2).
 
         Raises:
-            InputError: the measurement does not depend on them.
+            InputError: the measurement does not depend on the parameters.
         """
-        bounds = np.array((0.5, 0.2**2))  # greatest delay (s) and square of the lag (s^2)
+        bounds = np.array((0.5, 0.2**2))  # maximum delay (s) and squared lag (s^2)
         fit = least_squares(
             lambda parameters: residuals(*parameters.tolist()), np.array((0.08, 0.03**2)), -bounds, bounds
         )
@@ -96,13 +96,13 @@ class ResponseFit:
         return cls(delay.joined(CONFIDENCE * wait), squared.widened(rounded), fit.residuals.size)
 
     def estimates(self, meanings: tuple[str, str, str], covers: str, prefix: str = "", key: str = "") -> list[Estimate]:
-        """Dead time, lag and delay, as they are saved.
+        """Estimates of dead time, lag and delay, as saved.
 
         Args:
-            meanings: of each.
-            covers: what their intervals cover.
-            prefix: of their names.
-            key: section of the configuration that takes dead time and lag; none: for information only.
+            meanings: meaning of each.
+            covers: errors covered by their intervals.
+            prefix: prefix of their names.
+            key: configuration section for dead time and lag; none if for information only.
         """
         roots = (math.sqrt(max(x, 0.0)) for x in (self.squared.value, self.squared.low, self.squared.high))
         lag, least, greatest = roots

@@ -33,11 +33,11 @@ ROOM: Final = "ten lengths of the robot around it"
 RADII: Final = (4.0, 2.0, 0.0)
 """Radii of the arcs, in tracks; 0 = straight."""
 SLIDING: Final = 0.004
-"""Share of the distance by which a body that skids differs from its model, along and across; and of its turn."""
+"""Relative error of a skidding body's model: of the distance, along and across, and of the turn."""
 POSITION_FLOOR: Final = 0.0005
-"""Least standard deviation of a position at rest, m."""
+"""Minimum standard deviation of a position at rest (m)."""
 AIM: Final = 0.001
-"""Least standard deviation of a heading at rest, rad."""
+"""Minimum standard deviation of a heading at rest (rad)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +191,7 @@ def _check_sides(left: Array, right: Array, seen: Array) -> None:
     """Raise where the sides are swapped, or one turns the other way.
 
     Raises:
-        InputError: so it is; which.
+        InputError: the sides are swapped, or one is reversed; the message names the case.
     """
     ahead, turned = np.sign(seen[0]), seen[2]
     sides = {"left": float(ahead @ left), "right": float(ahead @ right)}

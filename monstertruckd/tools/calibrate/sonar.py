@@ -46,7 +46,7 @@ FIRST_RANGE_ERROR: Final = 0.2
 BEYOND: Final = 0.3
 """Past the cone's edge the wall is still heard, rad: grazing sound is reflected away."""
 LEAST_ECHOES: Final = 12
-"""Echoes of a sonar that its place rests on, at least."""
+"""Minimum echoes per sonar for the fit of its place."""
 COMMON: Final = 5
 """Parameters before those of the arcs: distance and direction of the wall, half the cone, factors of the ranges and of
 the distance by odometry."""
@@ -333,7 +333,7 @@ class SonarModel:
         return np.concatenate((np.zeros(2), parameters[COMMON : self.first])).reshape(-1, len(ARC_DRIFT))
 
     def _drifted(self, drift: Array) -> Array:
-        """As ``ARC_DRIFT``: what of nearer and turned has come since the arc before ended, and the share; (n, 3)."""
+        """Drift as in ``ARC_DRIFT``: changes in nearer and turned since the last arc ended, and the share; (n, 3)."""
         nearer, turned, swung = drift.T
         ends = self._ends + swung[:, None] * self._swings
         at_end = nearer + np.sin(turned) * ends[:, 0] + np.cos(turned) * ends[:, 1]

@@ -36,9 +36,9 @@ ROOM: Final = (
     "right; two blocks, 4 to 6 cm high"
 )
 TILT: Final = math.radians(0.2)
-"""Standard deviation of the compass's tilt, rad."""
+"""Standard deviation of the compass tilt (rad)."""
 BLOCKS: Final = (math.radians(4.0), math.radians(15.0))
-"""Tilt of a body on blocks, rad."""
+"""Tilt range of a body on blocks (rad)."""
 FOLLOWS: Final = math.radians(2.0)
 """Difference between a joint and the tilt that it takes out, rad, up to which it follows."""
 SECTOR: Final = math.radians(20.0)
@@ -59,12 +59,12 @@ class RollPitch(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RestMeasurement:
-    """What was measured while the truck stood."""
+    """Measurements while the truck stood."""
 
     body: RollPitch
     """Tilt of the body by the compass"""
     joints: RollPitch
-    """As the driver says"""
+    """Joint angles reported by the driver"""
     angles: Array
     """Angles of the beams, rad, left positive; (n,)"""
     ranges: Array
@@ -90,7 +90,7 @@ class RestMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class Heights:
-    """Of the beam over the floor, m."""
+    """Heights of the beam over the floor (m)."""
 
     centre: float
     ahead: float

@@ -1,4 +1,4 @@
-"""Steps of a wizard: what it may ask of the operator and the truck, and what the sensors measured during a move."""
+"""Steps of a wizard: requests to the operator and the truck, and the readings recorded during a move."""
 
 import itertools
 import math
@@ -27,49 +27,49 @@ class MoveRecord:
     drive: list[DriveFeedback] = field(default_factory=list)
     steering: list[SteeringFeedback] = field(default_factory=list)
     steering_commands: list[SteeringCommand] = field(default_factory=list)
-    """What the gate sent to the servos"""
+    """Commands from the gate to the servos"""
     drive_commands: list[DriveCommand] = field(default_factory=list)
     """Commands to the drive"""
     attitude: list[Attitude] = field(default_factory=list)
     others: dict[str, list[Any]] = field(default_factory=dict)
-    """What was requested in addition (``MoveStep.also``), by name of the topic"""
+    """Messages of the additional topics (``MoveStep.also``), by topic name"""
     left: int = 0
-    """Newest stamp of the robot when the command to set off was given, ns"""
+    """Latest robot stamp at the command to start (ns)"""
     arrived: int = 0
-    """When it was at rest again, ns of the robot's clock"""
+    """Time at which the truck was at rest again (ns, robot's clock)"""
 
     # Time series
 
     def of(self, topic: Topic[M]) -> list[M]:
-        """Messages of a topic that was requested in addition, in their order."""
+        """Return the messages of an additional topic, in order."""
         return list(self.others.get(topic.name, ()))
 
     def at_rest(self, topic: Topic[M]) -> tuple[list[M], list[M]]:
-        """Those before it set off, and those after it had arrived."""
+        """Return the topic's messages before the start and after the arrival."""
         found = self.of(topic)
         return [m for m in found if m.stamp < self.left], [m for m in found if m.stamp > self.arrived]
 
     def distance(self, drivetrain: DriveTrain) -> float:
-        """Distance rolled by the wheels, m, by the drive's count; negative backwards."""
+        """Distance rolled by the wheels, from the drive's position (m); negative backwards."""
         if len(self.drive) < 2:
             return 0.0
         return float(drivetrain.distance(self.drive[-1].position - self.drive[0].position))
 
     @property
     def turns(self) -> float:
-        """Turns of the motor between the two rests, forward positive."""
+        """Motor turns between the two rests, forward positive."""
         return (self.drive[-1].position - self.drive[0].position) / (2 * math.pi)
 
     def headings(self) -> Array:
-        """Headings, clockwise, rad, unwrapped; (n,)."""
+        """Unwrapped headings, clockwise (rad); (n,)."""
         return np.unwrap([reading.heading for reading in self.attitude])
 
     def turned(self) -> float:
-        """How far the heading has turned since the first reading, rad, left positive."""
+        """Heading change since the first reading (rad), left positive."""
         return float(-(self.headings()[[0, -1]] @ (-1, 1))) if len(self.attitude) > 1 else 0.0
 
     def turn(self) -> tuple[float, float]:
-        """Turn between the rests, rad, left positive, and its standard error by the noise alone.
+        """Turn between the rests (rad, left positive), and its standard error from noise alone.
 
         Raises:
             InputError: too few headings at rest.
@@ -86,17 +86,17 @@ class MoveRecord:
         return float(before.mean() - after.mean()), noise
 
     def currents_at(self, stamps: Array) -> Array:
-        """Motor current, A, at instants in ns; 0 where none was read for half a second; (n,)."""
+        """Motor current (A) at instants (ns); 0 where the nearest reading is half a second or more away; (n,)."""
         known = [(reading.stamp, reading.current) for reading in self.drive if reading.current is not None]
         if not known:
             return np.zeros(stamps.shape)
         times, values = np.array(known, dtype=np.float64).T
         nearest = np.abs(times[:, None] - stamps[None, :]).min(axis=0)
-        # 0.5: seconds for which a motor current counts: not every feedback carries one
+        # 0.5: validity of a motor current (s): not every feedback carries one
         return np.where(nearest < 0.5 * SECOND, np.interp(stamps, times, values), 0.0)
 
     def steps(self) -> tuple[Array, Array, Array]:
-        """Motor turned between readings, rad, and both servo angles then, rad: (n,) each."""
+        """Motor rotation between readings (rad), and both servo angles at that time (rad); (n,) each."""
         stamps = np.array([reading.stamp for reading in self.drive], dtype=np.float64)
         motor = np.diff([reading.position for reading in self.drive])
         middle = (stamps[1:] + stamps[:-1]) / 2
@@ -110,64 +110,64 @@ class MoveRecord:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """The operator reads something off a tape or a meter."""
+    """A value that the operator reads off a tape or a meter."""
 
     name: str
-    """Short, for answers given beforehand"""
+    """Short name, for answers given beforehand"""
     question: str
-    """The question, with the unit that is expected"""
+    """The question, with the expected unit"""
     low: float
     high: float
-    """Anything outside is asked again, or refused when it was given beforehand"""
+    """Upper bound. A value out of bounds is asked again, or refused if it was given beforehand"""
 
 
 @dataclass(frozen=True, slots=True)
 class Confirm:
-    """The operator does something, or says what happened."""
+    """A question that the operator confirms: an action done, or an observation."""
 
     name: str
     question: str
     fact: bool = False
-    """The answer decides what is measured, so ``--yes`` is none; otherwise anything but yes ends the wizard"""
+    """The answer decides the measurement, so ``--yes`` does not give it; otherwise any answer but yes ends it"""
 
 
 @dataclass(frozen=True, slots=True)
 class MoveStep:
-    """The truck drives with fixed or weaving steering, from rest to rest; it is disarmed before and after.
+    """A drive from rest to rest, with fixed or weaving steering; the truck is disarmed before and after.
 
-    The wheels are turned while it stands, and it rests for a moment at both ends so that what is measured there can be
+    The wheels are turned while the truck stands. It rests for a moment at both ends, so that readings there can be
     averaged.
     """
 
     name: str
-    """What for, in a word or two"""
+    """Purpose, in a word or two"""
     speed: float
-    """m/s, negative backwards"""
+    """Speed (m/s), negative backwards"""
     front: float = 0.0
     rear: float = 0.0
-    """Axle angles, rad, left positive"""
+    """Axle angles (rad), left positive"""
     metres: float = 1.0
-    """Distance by the drive's own count, at most"""
+    """Maximum distance, by the drive's position (m)"""
     rest: float = 1.0
-    """Seconds of standing still at each end"""
+    """Standstill at each end (s)"""
     approach: float = 0.0
-    """Axle angle from which straight wheels are turned to where they shall be, rad: servos stop short of their goal"""
+    """Axle angle from which the wheels turn to their set-point (rad): servos stop short of their goal"""
     weave: tuple[float, ...] = ()
-    """Seconds after which the axle angles change their sign while it drives, in turn, again and again; none: never"""
+    """Times between sign changes of the axle angles during the drive, repeated cyclically (s); empty: no changes"""
     done: Callable[[MoveRecord], bool] | None = None
-    """Ends the move earlier"""
+    """Condition that ends the move early"""
     also: tuple[Topic[Any], ...] = ()
-    """Topics that are recorded besides"""
+    """Additional topics to record"""
     marked: bool = False
-    """The operator measures from where it begins, so that it cannot start again once the truck has moved"""
+    """The operator measures from the start point, so the move cannot restart once the truck has moved"""
 
     def back(self, distance: float) -> "MoveStep":
-        """Back over the first ``distance`` of it, m; of a weaving move straight back."""
+        """Return the move back over the first ``distance`` (m); straight back for a weaving move."""
         back = replace(self, name=f"{self.name}, back", speed=-self.speed, metres=distance, done=None, also=())
         return replace(back, front=0.0, rear=0.0, weave=()) if self.weave else back
 
     def side(self, seconds: float) -> int:
-        """Sign of the axle angles so long after the truck set off."""
+        """Sign of the axle angles, ``seconds`` after the start."""
         if not self.weave:
             return 1
         ends = list(itertools.accumulate(self.weave))
@@ -178,46 +178,46 @@ class MoveStep:
 
 @dataclass(frozen=True, slots=True)
 class Collect(Generic[M]):
-    """So many messages of a topic, while the truck stands."""
+    """Collects ``count`` messages of a topic while the truck stands."""
 
     name: str
     topic: Topic[M]
     count: int
     timeout: float = 10.0
-    """Seconds in which they must have come"""
+    """Time limit for all messages (s)"""
 
 
 @dataclass(frozen=True, slots=True)
 class WatchStep(Generic[M]):
-    """Messages of a topic as they come, while the operator does something, until enough was seen.
+    """Follows the messages of a topic while the operator acts, until the data suffices.
 
-    Of messages that come while one is looked at, the newest counts.
+    If several messages arrive while one is processed, only the latest is used.
     """
 
     name: str
     topic: Topic[M]
     take: Callable[[M, dict[str, list[Any]]], tuple[float, float]]
-    """Gets a message, and those of ``also`` since the last call, by topic; returns how much of how much is done"""
+    """Gets a message, and the messages of ``also`` since the last call, by topic; returns progress and total"""
     also: tuple[Topic[Any], ...] = ()
     timeout: float = 10.0
-    """Seconds without a message that end it"""
+    """Timeout without a message (s)"""
 
 
 class Panel(Protocol):
-    """The operator's side of a wizard: a terminal, a script, or a simulated operator."""
+    """Operator interface of a wizard: a terminal, a script, or a simulated operator."""
 
     def say(self, text: str) -> None:
         """Show a sentence."""
 
     def progress(self, name: str, done: float, total: float) -> None:
-        """Show how far a step has come."""
+        """Show the progress of a step."""
 
     async def number(self, step: Number) -> float:
-        """Ask.
+        """Ask for a number.
 
         Raises:
             InputError: there is no answer.
         """
 
     async def confirm(self, step: Confirm) -> bool:
-        """Ask. Raises as ``number`` does."""
+        """Ask for a confirmation. Raises as ``number`` does."""

@@ -37,7 +37,7 @@ class Wizard(Protocol):
 
     name: ClassVar[WizardName]
     doc: ClassVar[str]
-    """What it finds, in a sentence"""
+    """Purpose, in a sentence"""
     room: ClassVar[str]
     """Free space that the truck needs"""
 
@@ -94,7 +94,7 @@ class WizardContext:
         return value
 
     async def ask(self, step: Number) -> float:
-        """A number within its bounds.
+        """Ask for a number within its bounds.
 
         Raises:
             InputError: there is no usable answer.

@@ -1,10 +1,10 @@
-"""A drill of families: any signal of a device may be falsified, any command ignored; judged by the world.
+"""Fault-family drill: any device signal may be falsified, any command ignored; the world's true state is the judge.
 
-An operator drives at random, in both directions and with all ways to steer, or a tracker follows its path. A trial has
-one fault, or two, the second while the robot recovers from the first. Faults are drawn from the families that the
-robot's own devices have (``monstertruck_sim.families``) and from the catalog of what is known to happen.
+An operator drives at random, in both directions and all steering modes, or a tracker follows its path. A trial has
+one fault, or two, the second while the robot recovers from the first. Faults are drawn from the families of the
+robot's devices (``monstertruck_sim.families``) and from the catalog of known faults.
 
-As in ``random_drill`` a drill consists of legs, each with a truck, a clock and a stream of the seed of its own.
+As in ``random_drill``, a drill consists of legs, each with its own truck, clock and random stream of the seed.
 """
 
 import asyncio
@@ -42,66 +42,66 @@ from monstertruckd.tools.drill.truck import DrillTruck, Wanderer
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 
 LEG: Final = 20
-"""Trials of one truck."""
+"""Trials per truck."""
 MOVES: Final = 0.03
-"""True speed of a robot that drives, m/s; slower than it backs into ground that it knows little of."""
+"""Minimum true speed of a driving robot (m/s); below its reverse speed into scarcely known ground."""
 BY_HAND: Final[dict[str, Any]] = {
     "explorer": None,
     "planner": None,
     "tracker": None,
     "path": None,
 }
-"""Overlay of a truck that an operator drives."""
+"""Overlay for an operator-driven truck."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What is to be tried: one fault, or two."""
+    """One or two faults to inject."""
 
     faults: tuple[Fault[SimContext], ...]
     families: tuple[str, ...]
-    """Of the faults: names without their drawn numbers."""
+    """Fault families: fault names without their drawn numbers."""
     backwards: bool
-    """The operator begins in reverse."""
+    """The operator starts in reverse."""
     between: float
-    """Seconds from the end of the first to the second."""
+    """Time from the end of the first fault to the second (s)."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrialOutcome:
-    """What came of one trial; seconds count from the first fault unless said otherwise."""
+    """Outcome of one trial; times are measured from the first fault unless stated otherwise."""
 
     number: int
-    """In the drill, from 0 on."""
+    """Index in the drill, from 0."""
     faults: tuple[str, ...]
     families: tuple[str, ...]
     followed: bool
     """The tracker drove."""
     reverse: bool
-    """It drove backwards when the first fault began."""
+    """The robot drove backwards at the start of the first fault."""
     reason: Reason | None = None
-    """First one that gate, services or events gave for it."""
+    """First reason that gate, services or events reported."""
     reason_s: float | None = None
     travelled: float = 0.0
-    """m, from the order to disarm or stop on."""
+    """Distance travelled after the disarm or stop order (m)."""
     standstill_s: float | None = None
-    """From that order."""
+    """Time to standstill after the disarm or stop order (s)."""
     recovered_s: float | None = None
-    """From the end of the last fault until everything is ready."""
+    """Time from the end of the last fault until everything is ready (s)."""
     stuck: tuple[str, ...] = ()
-    """Services that did not recover, or reasons that keep it from driving."""
+    """Services that did not recover, or reasons that still prevent driving."""
     violations: tuple[Violation, ...] = ()
     confirmed_contacts: int = 0
     """Contacts while the operator confirmed unseen ground."""
 
     @property
     def unsafe(self) -> bool:
-        """Whether the judge found anything."""
+        """Whether the judge found a violation."""
         return bool(self.violations)
 
     @property
     def contact(self) -> bool:
-        """Whether it ran into something."""
+        """Whether the robot hit something."""
         return any(violation.rule == "contact" for violation in self.violations)
 
 
@@ -110,7 +110,7 @@ OUTCOMES: Final = TypeAdapter(list[TrialOutcome])
 
 @dataclass(frozen=True, slots=True)
 class CampaignReport:
-    """A drill of families, or a part of one."""
+    """Report of a fault-family drill, or of a part of one."""
 
     seed: int
     outcomes: tuple[TrialOutcome, ...]
@@ -149,16 +149,16 @@ class CampaignReport:
 
 
 class Campaign:
-    """A drill of families.
+    """Fault-family drill.
 
     Args:
-        seed: everything random comes from it.
-        count: of trials, those before ``first`` included.
+        seed: source of all randomness.
+        count: number of trials, including those before ``first``.
         config: the simulated robot.
-        first: trials before it are left out; a multiple of ``LEG``.
+        first: index of the first trial to run; a multiple of ``LEG``.
 
     Raises:
-        InputError: nothing drives the robot, or ``first`` is no beginning of a leg.
+        InputError: nothing drives the robot, or ``first`` is not the start of a leg.
     """
 
     def __init__(self, seed: int, count: int, config: SimulatedTruckConfig, *, first: int = 0) -> None:
@@ -184,15 +184,15 @@ class Campaign:
         resume: Path | None = None,
         report: Callable[[list[TrialOutcome]], None] = lambda _: None,
     ) -> CampaignReport:
-        """Run all of it; arguments and errors as of ``run_legs``. Files of several parts add up when joined."""
+        """Run the whole drill; arguments and errors as in ``run_legs``. Files of several parts can be concatenated."""
         return CampaignReport(self.seed, run_legs(self.legs(), run_trials, OUTCOMES, jobs, cluster, resume, report))
 
 
 def run_trials(leg: DrillLeg) -> list[TrialOutcome]:
-    """All trials of one leg, on the virtual clock.
+    """Run all trials of one leg on the virtual clock.
 
     Raises:
-        InputError: it comes from another version of the program.
+        InputError: the leg comes from another version of the program.
     """
     check_version(leg)
     with leg_alone(), TemporaryDirectory(prefix="monstertruck-") as folder:
@@ -200,7 +200,7 @@ def run_trials(leg: DrillLeg) -> list[TrialOutcome]:
 
 
 class _Leg:
-    """Trial by trial on one truck; one that is stuck or has run into something is replaced by a new one."""
+    """Runs trial after trial on one truck; replaces a truck that is stuck or has hit something."""
 
     def __init__(self, leg: DrillLeg, clock: VirtualClock, folder: str) -> None:
         self._leg = leg
@@ -208,7 +208,7 @@ class _Leg:
         self._rng = np.random.default_rng([leg.seed, leg.number, 1])
         base = wired(SimulatedTruckConfig.model_validate(leg.config))
         driven = base.tracker is not None and (base.path is not None or base.planner is not None)
-        # of so many trucks one is driven by its tracker, along its path or to goals of its planner, where it has one
+        # one truck in this many is driven by its tracker, along its path or to goals of its planner if it has one
         follows = 4
         self._follows = driven and leg.number % follows == follows - 1
         self._workers: tuple[str, ...] = ()
@@ -216,12 +216,12 @@ class _Leg:
             base = with_overlay(base, BY_HAND)
         elif leg.number // follows % 2:
             base, self._workers = with_overlay(base, TRACKER_IN_WORKER), (TRACKING,)
-        records = None if leg.number % 5 else folder  # one of so many trucks records, and its disk may become full
+        records = None if leg.number % 5 else folder  # one truck in this many records, and its disk may become full
         self._config = truck_of_leg(base, int(self._rng.integers(2**31)), records)
         self._outcomes: list[TrialOutcome] = []
 
     async def run(self) -> list[TrialOutcome]:
-        """All trials."""
+        """Run all trials."""
         while len(self._outcomes) < self._leg.count:
             before = len(self._outcomes)
             wander, by_hand = self._rng.spawn(1)[0], not self._follows
@@ -238,12 +238,12 @@ class _Leg:
         return self._leg.number * LEG + len(self._outcomes)
 
     async def _drive_on(self, truck: DrillTruck) -> None:
-        """Trials of one truck."""
+        """Run the trials of one truck."""
         if not await truck.until(lambda: not truck.blockers(), RECOVERY_LIMIT) or not await _arm(truck):
             return
         usual = set(
             QUIET | OBSTACLE | {Reason.ESTOP_REQUESTED, Reason.ESTOPPED, Reason.LEASE_EXPIRED}
-        )  # what is said while nothing is wrong
+        )  # reasons reported without a fault
         draw = _Draw(truck, self._rng, self._workers)
         while len(self._outcomes) < self._leg.count:
             if truck.by_hand is self._follows or not await _arm(truck):
@@ -256,7 +256,7 @@ class _Leg:
 
 
 class _Draw:
-    """Draws trials for a truck that has driven: its devices' signals are known then."""
+    """Draws trials for a truck that has driven, so that the signals of its devices are known."""
 
     def __init__(self, truck: DrillTruck, rng: np.random.Generator, workers: tuple[str, ...]) -> None:
         config = truck.rig.config
@@ -276,35 +276,35 @@ class _Draw:
         self._without = frozenset[FaultKind]()
 
     def __call__(self) -> Trial:
-        count = 2 if self._rng.random() < 0.45 else 1  # share of trials with two faults
+        count = 2 if self._rng.random() < 0.45 else 1  # fraction of trials with two faults
         drawn = [self._fault() for _ in range(count)]
         backwards = self._backwards and bool(self._rng.random() < 0.5)
         names, faults = tuple(name for name, _ in drawn), tuple(fault for _, fault in drawn)
-        # (0.0, 1.0): seconds from the end of the first fault of a pair to the second
+        # (0.0, 1.0): time from the end of the first fault of a pair to the second (s)
         return Trial(faults, names, backwards, float(self._rng.uniform(0.0, 1.0)))
 
     def _fault(self) -> tuple[str, Fault[SimContext]]:
-        if self._rng.random() < 0.35:  # share of faults that are drawn from the catalog
+        if self._rng.random() < 0.35:  # fraction of faults drawn from the catalog
             fault = self._catalog.draw(self._rng, without=self._without)
-            if fault.kind is FaultKind.DISK_FULL:  # a disk becomes full once
+            if fault.kind is FaultKind.DISK_FULL:  # a disk becomes full only once
                 self._without = frozenset({FaultKind.DISK_FULL})
             return fault.kind.value, fault
         roles = sorted(self._by_role)
         of_role = self._by_role[roles[self._rng.integers(len(roles))]]
         family = of_role[self._rng.integers(len(of_role))]
-        # (1.0, 4.0): seconds for which a signal is falsified
+        # (1.0, 4.0): duration of a falsified signal (s)
         return family.name, family.draw(self._rng, float(self._rng.uniform(1.0, 4.0)))
 
 
 async def _arm(truck: DrillTruck) -> bool:
-    """Arm; whether it sets off."""
+    """Arm the truck; return whether it starts to move."""
     assert truck.judge is not None
     truck.judge.arm()
     return await truck.until(lambda: abs(truck.speed) > MOVES, RECOVERY_LIMIT, Order.ARM)
 
 
 async def drives_again(truck: DrillTruck) -> bool:
-    """Whether it sets off; an operator takes over where something is in the way of a tracker."""
+    """Return whether the truck starts to move; an operator takes over if the tracker's path is blocked."""
     if await _arm(truck):
         return True
     if truck.by_hand or not _blocked(truck):
@@ -314,20 +314,20 @@ async def drives_again(truck: DrillTruck) -> bool:
 
 
 async def _turn(truck: DrillTruck, trial: Trial) -> None:
-    """Let the operator drive in the direction of the trial, if it can."""
+    """Let the operator drive in the direction of the trial, if possible."""
     station, judge = truck.station, truck.judge
     assert judge is not None
     if not truck.by_hand or not isinstance(station, Wanderer):
         return
-    run_up_time = 6.0  # seconds after which it reverses without
+    run_up_time = 6.0  # time after which the operator reverses without that run-up (s)
     if trial.backwards:
         station.run_up(run_up_time)
         begin = judge.place
-        # 0.7: distance that the operator drives straight ahead before it reverses, m: a robot that has just been armed
+        # 0.7: distance that the operator drives straight ahead before reversing (m): a robot that has just been armed
         # knows nothing of the ground behind it
         await truck.until(lambda: math.dist(judge.place, begin) > 0.7 or _blocked(truck), run_up_time, Order.ARM)
     station.choose(backwards=trial.backwards)
-    # 2.0: seconds in which the operator tries to drive in the direction of the trial
+    # 2.0: time limit for driving in the direction of the trial (s)
     await truck.until(lambda: abs(truck.speed) > MOVES and (truck.speed < 0) is trial.backwards, 2.0, Order.ARM)
     station.backwards = None
 
@@ -339,19 +339,19 @@ def _blocked(truck: DrillTruck) -> bool:
 async def _try(
     truck: DrillTruck, trial: Trial, rng: np.random.Generator, usual: Iterable[Reason], number: int
 ) -> TrialOutcome:
-    """Drive, have the faults, give an order that stops while the last one lasts, end it, recover, drive again."""
+    """Drive, inject the faults, give a stop order during the last one, end it, recover, drive again."""
     clock, judge = truck.clock, truck.judge
     assert judge is not None
     await _turn(truck, trial)
     followed = not truck.by_hand
-    await clock.sleep(float(rng.uniform(0.1, 0.7)))  # seconds of driving before the first fault
+    await clock.sleep(float(rng.uniform(0.1, 0.7)))  # driving time before the first fault (s)
     truck.reports()
     judge.begin()
     began, reverse = clock.now(), judge.speed < 0
-    # 5: every so many trials end with an emergency stop, the others with a disarm order
+    # 5: every fifth trial ends with an emergency stop, the others with a disarm order
     order = Order.DISARM if (number + 1) % 5 else Order.ESTOP
     for fault in trial.faults:
-        context = truck.rig.context  # of the present daemon
+        context = truck.rig.context  # context of the current daemon
         await apply(fault.start, context)
         await clock.sleep(fault.hold)
         if fault is trial.faults[-1]:
@@ -359,7 +359,7 @@ async def _try(
             stopping = asyncio.create_task(truck.order(order), name="stopping")
             assert truck.station is not None
             truck.station.silent = True
-            # 1.5: seconds from the order that stops to the end of the faults; more than the judge lets a robot move
+            # 1.5: time from the stop order to the end of the faults (s); longer than the judge lets a robot move
             await clock.sleep(1.5)
             travelled, standstill = judge.travelled, judge.standstill
         await apply(fault.end, context)
@@ -395,9 +395,9 @@ async def _try(
 
 
 async def recovers(truck: DrillTruck) -> bool:
-    """Whether the robot can be driven again; the operator resets what the gate has stopped.
+    """Return whether the robot can be driven again; the operator resets the gate's stops.
 
-    A pack that once was critical, if only by a false reading, has to be better for ``clear_after``.
+    A pack that was critical, even by a false reading, must read better for ``clear_after``.
     """
     if await truck.until(lambda: not truck.blockers(), RECOVERY_LIMIT, Order.RESET):
         return True
@@ -407,7 +407,7 @@ async def recovers(truck: DrillTruck) -> bool:
 
 
 def _first_reason(truck: DrillTruck, usual: set[Reason], began: int) -> tuple[Reason | None, float | None]:
-    """The first reason since ``began``, ns, that is not usual, and after how many seconds."""
+    """Return the first unusual reason since ``began`` (ns), and the time to it (s)."""
     for report in truck.reports():
         if report.stamp >= began:
             for reason in reasons_of(report):

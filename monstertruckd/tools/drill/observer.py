@@ -1,7 +1,7 @@
-"""The observer of a drill: checks invariants by the bytes on two wires and the world's truth, not by the daemon's word.
+"""Observer of a drill: checks invariants against the bytes on the wires and the true state, not the daemon's reports.
 
-It sees the wires of all motor controllers, of steering, lidar and compass, the true state of the robot and the
-operator's orders. A hundred times a second each rule says what is unsafe in an ``Observation``.
+Its inputs are the wires of all motor controllers, of steering, lidar and compass, the true state of the robot and the
+operator's orders. Each rule reports the violations in an ``Observation`` at 100 Hz.
 """
 
 import math
@@ -35,52 +35,52 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 TRUTH_PERIOD: Final = SECOND // 100
 STANDING_SPEED: Final = 0.01
-"""True speed of a truck that stands, m/s."""
+"""True speed up to which a truck stands (m/s)."""
 STOPS_WITHIN: Final = 0.6
-"""Seconds from any fault that must stop the truck, or from a disarm order, to standstill."""
+"""Maximum time to standstill, from a fault that must stop the truck or from a disarm order (s)."""
 SPEED_MARGIN: Final = 1.05
-"""True speed over the greatest commanded one: the motor's overshoot."""
+"""Allowed ratio of the true speed to the maximum commanded speed: the motor's overshoot."""
 FAN: Final = np.linspace(-1.2, 1.2, 49)
-"""Directions of the distances that are checked ahead, rad."""
+"""Directions of the range checks ahead (rad)."""
 ROOM: Final = np.linspace(0.0, 0.5, 26)
-"""Ways ahead of which the ground is looked at, m."""
+"""Distances along the arc at which the path is checked (m)."""
 REVERSES_BELOW: Final = 0.05
-"""True speed, m/s, from which on a motor may not be asked to turn the other way."""
+"""True speed above which no motor may be commanded to reverse (m/s)."""
 MOTORS: Final = (*SHAFTS, DeviceRole.WHEELS, DeviceRole.ACTUATORS)
 """Roles of motor controllers."""
 WIRES: Final = (*MOTORS, DeviceRole.STEERING, DeviceRole.LIDAR, DeviceRole.COMPASS)
 EPOS: Final = "epos"
-"""Kind of motor controller whose wire is read, and whose quick-stop input the deadman line is wired to."""
+"""Kind of motor controller whose wire is decoded, and whose quick-stop input is wired to the deadman line."""
 MAESTRO: Final = "maestro"
-"""Kind of servo controller whose wire is read, and whose output is the deadman line."""
+"""Kind of servo controller whose wire is decoded, and whose output is the deadman line."""
 STOP_CONTROLS: Final = frozenset((Control.QUICK_STOP, Control.DISABLE_VOLTAGE, Control.HALT))
 
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """Something unsafe."""
+    """A broken rule."""
 
     seconds: float
-    """Since the fault."""
+    """Time since the fault (s)."""
     rule: str
     text: str
 
 
 class WireTap:
-    """Everything that passes a device's cable; stays with the device when it is plugged in elsewhere.
+    """Tap of all bytes on a device's cable; it stays with the device when it is plugged in elsewhere.
 
     Args:
-        port: where the device is plugged in.
+        port: port of the device.
         clock: time.
     """
 
     def __init__(self, port: MemoryPort, clock: Clock) -> None:
         self.to_device: list[tuple[int, bytes]] = []
-        """(ns, bytes) as the last of them reached the device."""
+        """(ns, bytes), stamped when the last byte reached the device."""
         self.to_host: list[tuple[int, bytes]] = []
-        """(ns, bytes) as the last of them reached the host."""
+        """(ns, bytes), stamped when the last byte reached the host."""
         self.heard: int | None = None
-        """When the host last got any, ns."""
+        """Time of the last bytes to the host (ns)."""
         self._clock = clock
         port.device.on_bytes = self._pass
 
@@ -100,7 +100,7 @@ class Received(Protocol):
 
 
 def written(tap: Received, since: int = 0) -> list[tuple[int, int, int]]:
-    """Objects the host wrote to an EPOS: (ns, index, raw value); whatever is not a whole frame is skipped."""
+    """Return the objects the host wrote to an EPOS: (ns, index, raw value); incomplete frames are skipped."""
     return _writes(item for item in tap.to_device if item[0] >= since)
 
 
@@ -115,7 +115,7 @@ def _writes(received: Iterable[tuple[int, bytes]]) -> list[tuple[int, int, int]]
 
 
 class MotorWire(ABC):
-    """What the bytes to a motor controller ask its motors for; takes every item of a tap once."""
+    """Motor speeds commanded by the bytes to a motor controller; consumes each item of a tap once."""
 
     def __init__(self, tap: WireTap) -> None:
         self.tap = tap
@@ -128,22 +128,22 @@ class MotorWire(ABC):
 
     @abstractmethod
     def read(self) -> Iterator[tuple[int, int, float]]:
-        """(ns, shaft, m/s over ground) of what has come since the last call; 0 = any stop."""
+        """Return the commands since the last call: (ns, shaft, m/s over ground); 0 is any stop."""
 
     def forget(self) -> None:
-        """What has come before does not count."""
+        """Discard all bytes so far."""
         self._read = 0
         self.tap.to_device.clear()
         self.tap.to_host.clear()
 
 
 class _EposWire(MotorWire):
-    """One shaft.
+    """Wire of one shaft's EPOS.
 
     Args:
         tap: its cable.
         shaft: index.
-        rpm: of the motor at 1 m/s, in the controller's sign.
+        rpm: motor speed at 1 m/s, in the controller's sign (rpm).
     """
 
     def __init__(self, tap: WireTap, shaft: int, rpm: float) -> None:
@@ -161,7 +161,7 @@ class _EposWire(MotorWire):
 
 
 class _StepperWire(MotorWire):
-    """All shafts of a body with steppers.
+    """Wire of all shafts of a body with steppers.
 
     Args:
         tap: the controller's cable.
@@ -174,7 +174,7 @@ class _StepperWire(MotorWire):
         self._lines = Splitter()
         step = drivetrain.speed(config.turn) / 1000
         self._speeds = [-step if inverted else step for inverted in config.inverted[: config.motors]]
-        """Over ground at a rate of 1, m/s."""
+        """Speeds over ground at a rate of 1 (m/s)."""
 
     def read(self) -> Iterator[tuple[int, int, float]]:
         """See ``MotorWire``."""
@@ -188,13 +188,13 @@ class _StepperWire(MotorWire):
 
 
 class _ObeyedOrders(MotorWire):
-    """Shafts of a controller whose protocol is not known here: what it asks its motors for, by the world.
+    """Shafts of a controller with a protocol unknown here: its motor commands, read from the world.
 
     Args:
         tap: the controller's cable.
-        world: of the motors.
-        shafts: that it drives, by index.
-        rpm: of a motor at 1 m/s, in the controller's sign.
+        world: source of the motor commands.
+        shafts: indices of the driven shafts.
+        rpm: motor speed at 1 m/s, in the controller's sign (rpm).
         clock: time.
     """
 
@@ -204,7 +204,7 @@ class _ObeyedOrders(MotorWire):
         self._newest = dict.fromkeys(shafts, 0.0)
 
     def read(self) -> Iterator[tuple[int, int, float]]:
-        """See ``MotorWire``; the instant is that of the call."""
+        """See ``MotorWire``; stamped with the time of the call."""
         self.forget()
         now = self._clock.now()
         for shaft in self._shafts:
@@ -240,19 +240,19 @@ def _motor_wires(
 
 
 class ServoWire(Protocol):
-    """What a servo controller is asked for; takes every request once."""
+    """Pulses commanded from a servo controller; consumes each request once."""
 
     def read(self) -> Iterator[tuple[int, float]]:
-        """(channel, us) of what has come since the last call."""
+        """Return the pulses since the last call: (channel, us)."""
 
 
 class _MaestroWire:
-    """The bytes to a Maestro.
+    """Wire of a Maestro.
 
     Args:
         tap: its cable.
         crc: whether commands have a check sum.
-        asked: called with the channel and the instant, ns, of each request for a position or voltage.
+        asked: called with the channel and the time (ns) of each request for a position or voltage.
     """
 
     def __init__(self, tap: WireTap, *, crc: bool, asked: Callable[[int, int], None]) -> None:
@@ -273,12 +273,12 @@ class _MaestroWire:
 
 
 class _SentPulses:
-    """A servo controller whose protocol is not known here: the pulses that it sends, by the world.
+    """Servo controller with a protocol unknown here: its pulses, read from the world.
 
     Args:
         tap: its cable.
-        world: of the servos.
-        channels: of its servos.
+        world: source of the pulses.
+        channels: servo channels.
         clock: time.
     """
 
@@ -302,70 +302,70 @@ class _SentPulses:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What is seen at one instant."""
+    """Observed state at one instant."""
 
     now: int
-    """Ns."""
+    """Time (ns)."""
     truth: TruthState
     twist: Twist2
-    """True one, of the body: m/s, m/s, rad/s."""
+    """True body twist (m/s, m/s, rad/s)."""
     targets: tuple[tuple[int, int, float], ...]
-    """Speeds that bytes since the one before ask motors for: (ns, shaft, m/s over ground); 0 = any stop."""
+    """Motor speeds commanded since the previous observation: (ns, shaft, m/s over ground); 0 is any stop."""
     target: tuple[float, ...]
-    """Speed of every shaft that the newest bytes ask for, m/s."""
+    """Speed of every shaft in the latest commands (m/s)."""
     pulses: tuple[tuple[int, float], ...]
-    """Pulses that bytes since the one before ask the servos for: (channel, us)."""
+    """Servo pulses commanded since the previous observation: (channel, us)."""
 
 
 Broken = Iterator[tuple[str, str]]
-"""Names of the rules that an observation breaks, each with what was seen."""
+"""Names of the rules that an observation breaks, each with a description."""
 
 Rule = Callable[[Observation], Broken]
-"""One subject of the observer; gets every observation once, in order."""
+"""A check of the observer; gets every observation once, in order."""
 
 
 class Duration:
-    """For how long something has been so without a break."""
+    """Time for which a condition has held without a break."""
 
     def __init__(self) -> None:
         self._since: int | None = None
 
     def update(self, now: int, *, so: bool) -> float:
-        """Seconds at ``now`` (ns); 0 while it is not so."""
+        """Return the duration at ``now`` (ns) in seconds; 0 while the condition does not hold."""
         self._since = (now if self._since is None else self._since) if so else None
         return 0.0 if self._since is None else (now - self._since) / SECOND
 
 
 class _Standstill:
-    """The truck stands where operator or fault demand it; and how far and for how long it went on."""
+    """The truck stands when the operator or a fault requires it; also measures how far and how long it kept moving."""
 
     def __init__(self) -> None:
         self.began = 0
-        """Start of the fault, ns."""
+        """Start of the fault (ns)."""
         self.must_stop = False
         """The fault must stop the truck."""
         self.disarms = False
-        """After the fault the truck may not set off again by itself."""
+        """The truck may not restart by itself after the fault."""
         self.disarmed: int | None = None
-        """When the operator disarmed it, ns."""
+        """Time of the operator's disarm order (ns)."""
         self.estopped: int | None = None
-        """When the operator stopped it, ns, until the reset."""
+        """Time of the operator's emergency stop (ns), until the reset."""
         self.stood: int | None = None
-        """When it first stood after the fault, ns."""
+        """Time of the first standstill after the fault (ns)."""
         self.top_speed = 0.0
-        """Greatest true speed since the fault, m/s."""
+        """Maximum true speed since the fault (m/s)."""
         self._path: list[tuple[float, float]] = []
         self._rest: tuple[float, float] | None = None
-        """Where it last was at rest, m."""
+        """Position of the last rest (m)."""
 
     def begin(self, now: int, *, must_stop: bool, disarms: bool) -> None:
-        """A fault begins."""
+        """Start a fault."""
         self.began, self.must_stop, self.disarms = now, must_stop, disarms
         self.stood, self.top_speed = None, 0.0
         self._path.clear()
 
     def metres(self) -> float:
-        """Truly travelled since the fault, m, to standstill or until the call."""
+        """True distance travelled since the fault, to standstill or until the call (m)."""
         return sum(math.dist(a, b) for a, b in pairwise(self._path))
 
     def __call__(self, seen: Observation) -> Broken:
@@ -378,13 +378,13 @@ class _Standstill:
                 self.stood = now
         if resting:
             self._rest = here
-        # 0.003: distance from where it came to rest within which a truck still stands, m: braked, it rocks on tyres and
+        # 0.003: distance from its rest within which a truck still stands (m): a braked truck rocks on tyres and
         # springs
         if self._rest is not None and math.dist(here, self._rest) <= 0.003:
             return
         ordered = min((at for at in (self.disarmed, self.estopped) if at is not None), default=now)
         asked = max((abs(each) for *_, each in seen.targets), default=0.0)
-        # 0.1: seconds after an order that stops from which on no bytes ask a moving truck for a speed
+        # 0.1: time after a stop order from which no bytes may command a moving truck to a speed (s)
         if now > ordered + 0.1 * SECOND and asked > 0:
             yield "stopping bytes", f"{asked:.3f} m/s asked for at {speed:.3f} m/s though it was ordered to stop"
         limit = round(STOPS_WITHIN * SECOND)
@@ -399,12 +399,12 @@ class _Standstill:
 
 
 class _Speeds:
-    """Speeds, true and requested, stay within the limits; nobody asks for the other direction before standstill.
+    """True and commanded speeds stay within the limits; no command reverses the direction before standstill.
 
     Args:
         chassis: of the body.
-        backwards: limit, m/s.
-        forwards: limit, m/s.
+        backwards: reverse speed limit (m/s).
+        forwards: forward speed limit (m/s).
     """
 
     def __init__(self, chassis: Chassis, backwards: float, forwards: float) -> None:
@@ -435,25 +435,25 @@ class _Speeds:
 
 
 class _Ramp:
-    """Bytes ask for a speed no sooner than the ramp from the one before.
+    """Commanded speeds do not rise faster than the ramp from the previous speed.
 
     Args:
-        accelerations: of each shaft's ramp, m/s^2.
+        accelerations: ramp of each shaft (m/s^2).
     """
 
     def __init__(self, accelerations: Iterable[float]) -> None:
         self._accelerations = tuple(accelerations)
         self._newest: list[tuple[float, int] | None] = [None] * len(self._accelerations)
-        """Greatest speed that the ramp allows the bytes to command, m/s, and its time, ns; None = it starts again."""
+        """Maximum commanded speed by the ramp (m/s) and its time (ns); None if the ramp restarts."""
 
     def __call__(self, seen: Observation) -> Broken:
         for instant, shaft, speed in seen.targets:
-            if speed == 0:  # a drive that was stopped for a moment may go on as fast as before
+            if speed == 0:  # a drive stopped for a moment may resume its previous speed
                 self._newest[shaft] = None
                 continue
             acceleration = self._accelerations[shaft]
-            # 0.1: seconds by which the bytes on the wire may be ahead of the ramp: ticks and exchanges have no common
-            # beat
+            # 0.1: time by which the bytes on the wire may be ahead of the ramp (s): ticks and exchanges are not
+            # synchronised
             ramp = abs(speed) + acceleration * 0.1
             if (newest := self._newest[shaft]) is not None:
                 before, then = newest
@@ -465,10 +465,10 @@ class _Ramp:
 
 
 def _accelerations(chassis: Chassis, config: GateConfig) -> tuple[float, ...]:
-    """Greatest acceleration of each shaft within the limits of the body's, m/s^2."""
+    """Maximum acceleration of each shaft within the body's limits (m/s^2)."""
     if len(chassis.shafts) == 1:
         return (config.acceleration,)
-    if chassis.steered:  # each wheel rolls along where it is turned to
+    if chassis.steered:  # each wheel rolls in its steered direction
         reach = math.hypot(chassis.bicycle.wheelbase, chassis.bicycle.track) / 2
         return (config.acceleration + config.yaw_acceleration * reach,) * len(chassis.shafts)
     forward, turned = chassis.shafts_along((1.0, 0.0, 0.0)), chassis.shafts_along(chassis.possible((0.0, 0.0, 1.0)))
@@ -481,7 +481,7 @@ def _accelerations(chassis: Chassis, config: GateConfig) -> tuple[float, ...]:
 
 
 class _HeldShaft:
-    """A motor that cannot turn is not driven on."""
+    """A blocked motor is not driven further."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -489,13 +489,13 @@ class _HeldShaft:
 
     def __call__(self, seen: Observation) -> Broken:
         held = [asked for shaft, asked in enumerate(seen.target) if asked and self._world.shaft_blocked(shaft)]
-        # 1.0: seconds for which a motor may be commanded to turn a shaft that is held
+        # 1.0: time for which a motor may be commanded to turn a held shaft (s)
         if self._held.update(seen.now, so=bool(held)) > 1.0:
             yield "held shaft", f"{held[0]:.3f} m/s asked for though the shaft is held"
 
 
 class _PulsedSteering:
-    """The steering angles that the newest pulses ask for; straight ahead for a body without servos.
+    """Steering angles commanded by the latest pulses; straight ahead for a body without servos.
 
     Args:
         config: of the robot.
@@ -506,25 +506,25 @@ class _PulsedSteering:
         self.chassis = truck.chassis()
         self._models = {servo.channel: servo for servo in truck.servos}
         self._arms = dict.fromkeys(self._models, 0.0)
-        """Servo angles, rad."""
+        """Servo angles (rad)."""
 
     def take(self, channel: int, pulse_us: float) -> None:
-        """A pulse is requested."""
+        """Take a commanded pulse."""
         if (model := self._models.get(channel)) is not None:
             self._arms[channel] = math.radians((pulse_us - model.centre_us) / model.us_per_degree)
 
     @property
     def angles(self) -> tuple[float, ...]:
-        """Of the axles or wheels, rad."""
+        """Angles of the axles or wheels (rad)."""
         return self.chassis.steering(*self._arms.values())
 
 
 class _Pulses:
-    """Requested servo angles are within their limits and those of the axles.
+    """Commanded servo angles stay within the limits of servos and axles.
 
     Args:
         config: of the truck, with a steering device.
-        steering: what the pulses steer.
+        steering: steering model of the pulses.
     """
 
     def __init__(self, config: SimulatedTruckConfig, steering: _PulsedSteering) -> None:
@@ -532,7 +532,7 @@ class _Pulses:
         self._steering = steering
         self._limits = {servo.channel: servo for servo in config.devices.steering.driver.servos}
         wheels = len(steering.chassis.straight) > 2
-        self._angle = (WHEEL_REACH if wheels else config.gate.angle) + 0.01  # rounding of pulses, rad
+        self._angle = (WHEEL_REACH if wheels else config.gate.angle) + 0.01  # rounding of pulses (rad)
 
     def __call__(self, seen: Observation) -> Broken:
         for channel, pulse_us in seen.pulses:
@@ -545,10 +545,10 @@ class _Pulses:
 
 
 class _Turning:
-    """The robot turns as the bytes ask: pulses, and the motors where it has several.
+    """The robot turns as the bytes command: by the pulses, and by the motors if it has several.
 
-    A held shaft turns a robot with several motors, whatever its bytes ask: for how long they may is the rule of
-    ``_HeldShaft``.
+    A held shaft turns a robot with several motors, whatever its bytes command. ``_HeldShaft`` limits the time for which
+    they may.
 
     Args:
         steering: of the pulses.
@@ -559,18 +559,18 @@ class _Turning:
         self._steering = steering
         self._world = world
         self._course: Twist2 = STILL
-        """The newest requested motion of several motors."""
+        """Latest commanded motion of several motors."""
         self._turn_errors: deque[tuple[int, float]] = deque()
 
     def begin(self) -> None:
-        """Turns before do not count."""
+        """Discard earlier turns."""
         self._turn_errors.clear()
 
     def __call__(self, seen: Observation) -> Broken:
         now = seen.now
         turned = 0.0 if self._held(seen) else (seen.truth.wz - self._asked(seen)) * TRUTH_PERIOD / SECOND
         self._turn_errors.append((now, turned))
-        # Largest difference between the true turn and the commanded one (rad), and the time over which both count (s).
+        # Maximum difference between the true and the commanded turn (rad), and the time window of both (s).
         turn_limit, turn_window = 0.5, 2.0
         while now - self._turn_errors[0][0] > turn_window * SECOND:
             self._turn_errors.popleft()
@@ -581,7 +581,7 @@ class _Turning:
         return len(seen.target) > 1 and any(map(self._world.shaft_blocked, range(len(seen.target))))
 
     def _asked(self, seen: Observation) -> float:
-        """Rate of turn that is requested at the true pace, rad/s."""
+        """Commanded yaw rate at the true pace (rad/s)."""
         chassis, angles = self._steering.chassis, self._steering.angles
         if len(seen.target) == 1:
             return chassis.bicycle.body_twist(seen.truth.v, *angles)[2]
@@ -591,15 +591,15 @@ class _Turning:
         return self._course[2] * min(self._pace(seen.twist) / asked, 1.0) if asked > 0 else 0.0
 
     def _pace(self, twist: Twist2) -> float:
-        """Size of a motion: speed of the base, or of the wheels that turn it, m/s."""
+        """Magnitude of a motion: speed of the base, or of the wheels that turn it (m/s)."""
         return max(math.hypot(*twist[:2]), abs(twist[2]) * self._steering.chassis.bicycle.track / 2)
 
 
 class _Silence:
-    """A truck stops when a device is silent without which it may not drive.
+    """A truck stops when an indispensable device is silent.
 
     Args:
-        devices: (role, wire, for how long it may be silent, s) of those devices.
+        devices: (role, wire, maximum silence in s) of the indispensable devices.
     """
 
     def __init__(self, devices: Iterable[tuple[str, WireTap, float]]) -> None:
@@ -613,12 +613,12 @@ class _Silence:
 
 
 class _Battery:
-    """A truck whose battery was measured, and is no longer, drives slowly, or not at all.
+    """A truck with a stale battery measurement drives slowly or not at all.
 
     Args:
-        tap: wire of the servo controller, whose analog input measures it.
-        channel: of that input.
-        limits: how long it may be unmeasured, s, and the speed limit then, m/s.
+        tap: wire of the servo controller, whose analog input measures the battery.
+        channel: channel of the input.
+        limits: maximum age of the measurement (s), and the speed limit after that (m/s).
     """
 
     def __init__(self, tap: WireTap, channel: int, limits: tuple[float, float]) -> None:
@@ -628,7 +628,7 @@ class _Battery:
         self._measured: int | None = None
 
     def ask(self, channel: int, instant: int) -> None:
-        """The host asks for the position or voltage of a channel at ``instant``, ns."""
+        """Record that the host requests the position or voltage of a channel at ``instant`` (ns)."""
         if channel == self._channel:
             self._asked = instant
 
@@ -643,11 +643,11 @@ class _Battery:
 
 
 class _Ahead:
-    """Driving forwards: what is before the width of the truck, and what is in its way on its arc.
+    """Forward driving: obstacles ahead within the truck's width, and obstacles on its arc.
 
     Args:
         config: of the truck.
-        world: whose obstacles are looked at from the camera's place.
+        world: its obstacles are checked from the camera's position.
     """
 
     def __init__(self, config: SimulatedTruckConfig, world: World) -> None:
@@ -661,24 +661,24 @@ class _Ahead:
 
     def __call__(self, seen: Observation) -> Broken:
         self._count += 1
-        if self._count % 5 != 1:  # samples from one look ahead to the next: it casts rays
+        if self._count % 5 != 1:  # samples between two checks ahead: a check casts rays
             return
         now, truth = seen.now, seen.truth
         if truth.v <= 2 * STANDING_SPEED:
             self._fast.update(now, so=False)
             return
-        ranges = np.minimum(self._world.view.ranges(now, FAN), 100.0)  # distance of what is not there, m
+        ranges = np.minimum(self._world.view.ranges(now, FAN), 100.0)  # range without a return (m)
         ahead, aside = self._camera + ranges * np.cos(FAN), ranges * np.sin(FAN)
         room = float(ahead[np.abs(aside) < self._width / 2].min(initial=math.inf)) - self._half
-        if room < 0.03:  # least distance, m, of anything that is driven towards
+        if room < 0.03:  # minimum distance to an obstacle ahead (m)
             yield "obstacle", f"{truth.v:.3f} m/s towards something {room:.3f} m ahead"
         room = self._room(truth.wz / truth.v, ahead, aside)
-        # 0.4: seconds for which a truck may be too fast for the room before it: something may step in its way
+        # 0.4: time for which a truck may be too fast for the free distance ahead (s): an obstacle may enter its path
         if self._fast.update(now, so=truth.v**2 / (2 * self._braking) > room) > 0.4:
             yield "braking", f"{truth.v:.3f} m/s with something on its way in {room:.3f} m"
 
     def _room(self, curvature: float, ahead: Array, aside: Array) -> float:
-        """Distance along the present arc to the first of these points, m."""
+        """Distance along the current arc to the first of these points (m)."""
         turn = ROOM * curvature
         at_x, at_y = ROOM * np.sinc(turn / math.pi), ROOM * np.sinc(turn / 2 / math.pi) * np.sin(turn / 2)
         dx, dy = ahead - at_x[:, None], aside - at_y[:, None]
@@ -689,7 +689,7 @@ class _Ahead:
 
 
 def _contact(seen: Observation) -> Broken:
-    """The truck runs into nothing."""
+    """The truck does not hit anything."""
     if seen.truth.stuck:
         yield "contact", "ran into something"
 
@@ -697,7 +697,7 @@ def _contact(seen: Observation) -> Broken:
 def _servo_wire(
     config: SimulatedTruckConfig, tap: WireTap, world: World, clock: Clock
 ) -> tuple[ServoWire, tuple[Rule, ...]]:
-    """Wire of the servo controller, and the rules on what else it measures."""
+    """Wire of the servo controller, and the rules for its other measurements."""
     assert config.devices.steering is not None
     driver, gate = config.devices.steering.driver, config.gate
     if kind_of(driver).name != MAESTRO:
@@ -710,12 +710,12 @@ def _servo_wire(
 
 
 class Observer:
-    """Checks the invariants of one truck, and measures how it reacts; ``begin`` and ``end_fault`` bound one fault.
+    """Checks the invariants of one truck, and measures its reactions; ``begin`` and ``end_fault`` enclose one fault.
 
     Args:
         config: of the truck, for its limits.
         world: the simulated world.
-        ports: whose wires are tapped: those of the motors, and of steering, lidar and compass where it has them.
+        ports: ports to tap: of the motors, and of steering, lidar and compass if present.
         clock: time.
     """
 
@@ -728,9 +728,9 @@ class Observer:
         self._taps = taps
         self._motors = _motor_wires(config, taps, world, clock)
         self._fresh: list[tuple[int, int, float]] = []
-        """Targets that no rule has seen yet."""
+        """Targets not yet passed to the rules."""
         self._stops: dict[int, int] = {}
-        """Instant of the first bytes since the fault that stop each shaft, ns."""
+        """Time of the first stop bytes of each shaft since the fault (ns)."""
         gate = config.gate
         self._steering = _PulsedSteering(config)
         chassis = self._steering.chassis
@@ -754,7 +754,7 @@ class Observer:
         self._rules = tuple(rules)
         self._violations: dict[str, Violation] = {}
         self.speed = 0.0
-        """True speed, m/s."""
+        """True speed (m/s)."""
 
     @property
     def drive(self) -> WireTap:
@@ -762,7 +762,7 @@ class Observer:
         return self._motors[0].tap
 
     async def run(self) -> None:
-        """Observe a hundred times a second until cancelled."""
+        """Observe at 100 Hz until cancelled."""
         due = self._clock.now()
         while True:
             self._observe()
@@ -772,23 +772,23 @@ class Observer:
     # Called by the drill
 
     def disarm(self) -> None:
-        """The operator disarms: the truck must stand soon."""
+        """Record that the operator disarms: the truck must stand soon."""
         self._standstill.disarmed = self._clock.now()
 
     def arm(self) -> None:
-        """The operator arms: the truck may move."""
+        """Record that the operator arms: the truck may move."""
         self._standstill.disarmed = None
 
     def estop(self) -> None:
-        """The operator stops: the truck must stand soon, until ``reset``."""
+        """Record the operator's emergency stop: the truck must stand soon, until ``reset``."""
         self._standstill.estopped = self._standstill.estopped or self._clock.now()
 
     def reset(self) -> None:
-        """The operator resets the emergency stop: an armed truck may move."""
+        """Record the reset of the emergency stop: an armed truck may move."""
         self._standstill.estopped = None
 
     def begin(self, *, stops: bool, disarms: bool = False) -> None:
-        """A fault begins; with ``stops`` the truck must stand soon, with ``disarms`` not set off again by itself."""
+        """Start a fault; with ``stops`` the truck must stand soon, with ``disarms`` it may not restart by itself."""
         self._observe()
         self._standstill.begin(self._clock.now(), must_stop=stops, disarms=disarms)
         self._turning.begin()
@@ -798,40 +798,40 @@ class Observer:
             motors.forget()
 
     def end_fault(self) -> None:
-        """The fault is over."""
+        """End the fault."""
         self._standstill.must_stop = self._standstill.disarms = False
 
     def violations(self) -> tuple[Violation, ...]:
-        """What was unsafe since ``begin``: the first case of every rule."""
+        """Violations since ``begin``: the first of each rule."""
         return tuple(self._violations.values())
 
     @property
     def top_speed(self) -> float:
-        """Greatest true speed since the fault began, m/s."""
+        """Maximum true speed since the start of the fault (m/s)."""
         return self._standstill.top_speed
 
     def stop_bytes_after(self) -> float | None:
-        """Seconds from the fault to the first bytes that stop the last one of the motors."""
+        """Time from the fault until stop bytes have reached every motor (s)."""
         self._read_motors()
         if len(self._stops) < len(self._target):
             return None
         return (max(self._stops.values()) - self._standstill.began) / SECOND
 
     def standstill_after(self) -> float | None:
-        """Seconds from the fault to standstill."""
+        """Time from the fault to standstill (s)."""
         stood = self._standstill.stood
         return None if stood is None else (stood - self._standstill.began) / SECOND
 
     def before_something(self) -> bool:
-        """Whether an obstacle in front is so near that the truck may rightly not start."""
-        # 0.6: distance from the camera, m, within which an obstacle may keep the truck from starting
+        """Whether an obstacle ahead is so near that the truck may rightly refuse to start."""
+        # 0.6: distance from the camera within which an obstacle may keep the truck from starting (m)
         return bool(self._world.view.ranges(self._clock.now(), FAN).min() < 0.6)
 
     def metres(self) -> float:
-        """Truly travelled since the fault, m, to standstill or until the call."""
+        """True distance travelled since the fault, to standstill or until the call (m)."""
         return self._standstill.metres()
 
-    # What is seen
+    # Observations
 
     def _observe(self) -> None:
         now = self._clock.now()
@@ -857,9 +857,9 @@ class Observer:
 
 
 def _indispensable(config: SimulatedTruckConfig, taps: Mapping[str, WireTap]) -> Iterator[tuple[str, WireTap, float]]:
-    """Wires of what the truck may not drive without: role, wire, and for how long it may be silent, s.
+    """Wires of the devices that the truck may not drive without: role, wire and maximum silence (s).
 
-    Without the deadman line nothing stops an EPOS that cannot be reached; steppers have a watchdog of their own.
+    Without the deadman line nothing stops an unreachable EPOS; stepper controllers have their own watchdog.
     """
     gate = config.gate
     limits: dict[str, SensorLimit | None] = {

@@ -1,4 +1,4 @@
-"""What a drill of families found, family by family."""
+"""Results of a fault-family drill, by family."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
@@ -18,12 +18,12 @@ class FamilySummary:
     family: str
     trials: int
     noticed: int
-    """Trials with a reason of its own: as the first fault of a trial."""
+    """Trials with a reason, counted only for the first fault of a trial."""
     reason: Reason | None
-    """The most frequent one of them."""
+    """Most frequent reason."""
     reason_p50_s: float | None
     reason_max_s: float | None
-    """Seconds from the fault to the reason."""
+    """Maximum time from the fault to the reason (s); ``reason_p50_s`` is the median."""
     unsafe: int
     stuck: int
 

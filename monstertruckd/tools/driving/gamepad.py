@@ -1,8 +1,7 @@
-"""Gamepads: bytes of a Linux input device to stick positions and orders, by a mapping. Pure.
+"""Gamepads: decode bytes of a Linux input device to stick positions and orders, using a mapping. Pure.
 
-Records are those of ``struct input_event`` (linux/input.h) on a 64-bit kernel, codes those of
-linux/input-event-codes.h, places of buttons and sticks those of the kernel's gamepad specification
-(Documentation/input/gamepad.rst).
+Records are ``struct input_event`` (linux/input.h) of a 64-bit kernel, with the codes of linux/input-event-codes.h.
+Buttons and sticks are placed as in the kernel's gamepad specification (Documentation/input/gamepad.rst).
 """
 
 import math
@@ -54,7 +53,7 @@ AXES: Final = {
     "hat_y": 17,
 }
 HALF: Final = 0.5
-"""Share of a hat's, or a trigger's, way from which on it is pressed."""
+"""Fraction of its travel beyond which a hat or a trigger is pressed."""
 
 Action = Literal["arm", "stop", "estop", "reset", "next_mode", "previous_mode", "faster", "slower"]
 Button = Literal[
@@ -70,9 +69,9 @@ KEYS: Final[dict[str, str]] = {
     "faster": "+",
     "slower": "-",
 }
-"""Keys of the keyboard that do the same."""
+"""Keyboard keys with the same action."""
 HATS: Final[dict[tuple[int, int], str]] = {(16, -1): "left", (16, 1): "right", (17, -1): "up", (17, 1): "down"}
-"""Buttons that a hat stands for."""
+"""Buttons by hat axis and direction."""
 
 
 USUAL: Final[dict[Button, Action]] = {
@@ -86,36 +85,36 @@ USUAL: Final[dict[Button, Action]] = {
     "up": "faster",
     "down": "slower",
 }
-"""What the buttons do without a mapping."""
+"""Button actions without a mapping."""
 
 
 class PadMapping(Schema):
-    """What the sticks and buttons of a gamepad do."""
+    """Functions of a gamepad's sticks and buttons."""
 
     name: str = "*"
-    """Devices it is for: their name, with * and ?"""
+    """Name of the devices that the mapping applies to; may contain * and ?"""
     speed: Axis = "left_y"
     steer: Axis = "left_x"
     side: Axis = "right_x"
     """Sideways by twist, drift in hybrid steering"""
     inverted: Annotated[tuple[Literal["speed", "steer", "side"], ...], Field(strict=False)] = ()
-    """Axes that count the other way; without this, up is ahead and left is left"""
+    """Axes with reversed sign; by default up is ahead and left is left"""
     deadman: Annotated[tuple[Button, ...], Field(strict=False, min_length=1)] = ("right_shoulder", "right_trigger")
-    """Buttons of which one has to be held for the truck to move"""
+    """Deadman buttons; the truck moves only while one is held"""
     unseen: tuple[Button, ...] = Field(("left_shoulder",), strict=False)
-    """Buttons of which one has to be held, too, to drive into unseen ground; deadman buttons do not count"""
+    """Buttons, one of which must also be held to drive into unseen ground; deadman buttons are ignored here"""
     buttons: dict[Button, Action] = Field(default_factory=lambda: dict(USUAL))
 
     def fits(self, name: str) -> bool:
-        """Whether it is for a device of this name."""
+        """Return whether the mapping applies to a device of this name."""
         return fnmatch(name, self.name)
 
 
 def read_mapping(file: Path) -> PadMapping:
-    """A mapping from YAML.
+    """Read a mapping from YAML.
 
     Raises:
-        InputError: it cannot be read, or is none; names the first wrong field.
+        InputError: the file cannot be read or is not a mapping; names the first wrong field.
     """
     content: Any = read_yaml(file) or {}
     try:
@@ -126,12 +125,14 @@ def read_mapping(file: Path) -> PadMapping:
 
 @dataclass(slots=True)
 class Pad:
-    """What one gamepad says at this moment; it counts as released until its deadman button was seen released.
+    """Current state of one gamepad.
+
+    After ``release`` the deadman is off until its button has been seen released.
 
     Args:
-        name: of the device.
-        mapping: what its parts do.
-        ranges: least and greatest value of every axis, by code.
+        name: name of the device.
+        mapping: functions of its sticks and buttons.
+        ranges: minimum and maximum value of every axis, by code.
     """
 
     name: str
@@ -141,10 +142,10 @@ class Pad:
     _pressed: set[int] = field(default_factory=set)
     _rest: bytes = b""
     _trusted: bool = True
-    """The deadman button counts."""
+    """The deadman button is valid."""
 
     def feed(self, data: bytes) -> list[Action]:
-        """Take bytes of the device; returns the actions that its buttons give."""
+        """Process bytes from the device; returns the actions of its buttons."""
         data = self._rest + data
         whole = len(data) - len(data) % EVENT.size
         self._rest = data[whole:]
@@ -154,15 +155,15 @@ class Pad:
                 actions += self._key(code, value)
             elif kind == EV_ABS:
                 actions += self._move(code, value)
-            elif kind == EV_SYN and code == 3:  # the kernel's queue overflowed: what was held is not known
+            elif kind == EV_SYN and code == 3:  # the kernel's queue overflowed: held buttons are unknown
                 self.release()
         self._trusted |= not self._deadman
         return actions
 
     def release(self) -> None:
-        """Let go: the deadman button counts again once it was released, sticks once they move."""
+        """Let go: the deadman button is valid again once released, a stick once it moves."""
         self._trusted = False
-        # What of them was released meanwhile is not known: the next press must not be taken for one that went on.
+        # Other buttons may have been released meanwhile: their next press must not pass for a continued one.
         self._pressed &= {BUTTONS[name] for name in self.mapping.deadman}
         triggers = {AXES[name] for name in self.mapping.deadman if name in AXES}
         self._axes = {code: value for code, value in self._axes.items() if code in triggers}
@@ -172,7 +173,7 @@ class Pad:
         return self._any_of(self.mapping.deadman)
 
     def _any_of(self, names: tuple[Button, ...]) -> bool:
-        """Whether one of some buttons is held."""
+        """Return whether any of these buttons is held."""
         held = any(BUTTONS[name] in self._pressed for name in names)
         return held or any(self._axes.get(AXES[name], -1.0) > HALF for name in names if name in AXES)
 
@@ -182,12 +183,12 @@ class Pad:
         return self._trusted and self._deadman
 
     def motion(self, mode: SteeringMode, speed: float, angle: float) -> TeleopRequest:
-        """What the sticks ask for; standstill unless the deadman button is held.
+        """Return the motion that the sticks request; standstill unless the deadman button is held.
 
         Args:
-            mode: which axles steer.
-            speed: with the stick at its end, m/s.
-            angle: full lock of an axle, rad.
+            mode: steering mode, which selects the axles that steer.
+            speed: speed at full stick deflection (m/s).
+            angle: full lock of an axle (rad).
         """
         if not self.held:
             return TeleopRequest(0.0, 0.0, 0.0, (0.0, 0.0, 0.0) if mode is SteeringMode.TWIST else None)
@@ -201,7 +202,7 @@ class Pad:
     def _stick(self, what: Literal["speed", "steer", "side"]) -> float:
         axis: Axis = getattr(self.mapping, what)
         value = self._axes.get(AXES[axis], 0.0)
-        if abs(value) < 0.08:  # share of a stick's way around its middle that counts as the middle
+        if abs(value) < 0.08:  # dead zone of a stick, as a fraction of its deflection
             return 0.0
         return -value if what in self.mapping.inverted else value
 
@@ -228,7 +229,7 @@ class Pad:
 
 
 def key_for(action: Action, mode: SteeringMode) -> str:
-    """The key of the keyboard that does the same, with the steering ``mode`` of now."""
+    """Return the keyboard key with the same action in the current steering ``mode``."""
     if action in KEYS:
         return KEYS[action]
     modes = list(MODE_KEYS.values())

@@ -1,6 +1,6 @@
-"""The gamepad of this computer: found, read, shaken, and found again when it was unplugged.
+"""Gamepad of this computer: find it, read it, make it rumble, and find it again after it was unplugged.
 
-Numbers of the requests to the kernel are those of linux/input.h; ``struct ff_effect`` has 48 bytes on 64-bit kernels.
+Kernel request numbers are from linux/input.h; ``struct ff_effect`` has 48 bytes on 64-bit kernels.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ GAMEPAD_LOOK_PERIOD: Final = 1.0
 """Time between searches for a gamepad (s)."""
 FOLDER: Final = Path("/dev/input")
 STOPPING: Final = frozenset({"stop", "estop"})
-"""Actions that count however late they are read."""
+"""Actions that remain valid however late they are read."""
 EFFECT: Final = struct.Struct("HhHHHHHxxHH28x")
 """Type, number, direction, trigger (2), replay (length and delay, ms), strong and weak motor."""
 
@@ -30,29 +30,29 @@ class PadLink:
     """Keeps the link to a gamepad that fits a mapping.
 
     Args:
-        mapping: which gamepads, and what their parts do.
-        clock: time.
+        mapping: device names and functions of sticks and buttons.
+        clock: clock of the session.
         act: called with every action of a button.
-        folder: where the kernel has its input devices.
+        folder: folder of the kernel's input devices.
     """
 
     def __init__(
         self, mapping: PadMapping, clock: Clock, act: Callable[[Action], object], folder: Path = FOLDER
     ) -> None:
         self.pad: Pad | None = None
-        """The gamepad; None while there is none."""
+        """Connected gamepad, or None."""
         self.hint = ""
-        """Why there is none."""
+        """Reason for the missing gamepad."""
         self._mapping = mapping
         self._clock = clock
         self._act = act
         self._folder = folder
         self._file: int | None = None
         self._effect = -1
-        """Number of the effect in the kernel; -1 = none yet."""
+        """Kernel's number of the rumble effect; -1 before its first upload."""
 
     async def run(self) -> None:
-        """Look for a gamepad, read it until it is gone, look again; until cancelled."""
+        """Search for a gamepad, read it until it is gone, and search again, until cancelled."""
         try:
             while True:
                 if self._file is None:
@@ -62,7 +62,7 @@ class PadLink:
             self._close()
 
     def rumble(self, strength: float, seconds: float) -> None:
-        """Shake the hand, 0..1; a gamepad that cannot stays quiet."""
+        """Rumble with a strength of 0 to 1; a gamepad without rumble does nothing."""
         if self._file is None:
             return
         size = round(0xFFFF * strength)
@@ -73,7 +73,7 @@ class PadLink:
             os.write(self._file, EVENT.pack(0, 0, 0x15, self._effect, 1))  # EV_FF
 
     def flush(self) -> None:
-        """Throw away what was not read in time, but for orders to stop, and let go."""
+        """Discard late input except for stop orders, and let go."""
         while self.pad is not None and self._read(act=False):
             pass
         if self.pad is not None:
@@ -96,7 +96,7 @@ class PadLink:
             os.close(file)
 
     def _read(self, *, act: bool = True) -> bool:
-        """Take what waits, up to a few records; False if nothing did."""
+        """Read a few waiting records; returns False if there were none."""
         assert self._file is not None
         assert self.pad is not None
         try:
@@ -121,7 +121,7 @@ class PadLink:
 
 
 def described(file: int, mapping: PadMapping) -> Pad | None:
-    """The gamepad behind an open input device; None if it is another device, or not one that the mapping is for."""
+    """Return the gamepad behind an open input device; None for another device or one outside the mapping."""
     try:
         name = fcntl.ioctl(file, _read_request(0x06, 256), bytes(256)).split(b"\0")[0].decode(errors="backslashreplace")
         keys = fcntl.ioctl(file, _read_request(0x20 + EV_KEY, 96), bytes(96))
@@ -131,7 +131,7 @@ def described(file: int, mapping: PadMapping) -> Pad | None:
         return None
     ranges = {}
     for code in AXES.values():
-        with suppress(OSError):  # it has no such axis
+        with suppress(OSError):  # the device lacks this axis
             _, low, high, *_ = struct.unpack("6i", fcntl.ioctl(file, _read_request(0x40 + code, 24), bytes(24)))
             if low < high:
                 ranges[code] = (low, high)
@@ -139,5 +139,5 @@ def described(file: int, mapping: PadMapping) -> Pad | None:
 
 
 def _read_request(number: int, size: int) -> int:
-    """Number of a reading request of the input subsystem (``_IOC(_IOC_READ, 'E', number, size)``)."""
+    """Return the number of a read request to the input subsystem (``_IOC(_IOC_READ, 'E', number, size)``)."""
     return 2 << 30 | size << 16 | ord("E") << 8 | number

@@ -1,4 +1,4 @@
-"""Session of ``drive``: keys of a terminal to drive requests, the robot's state back onto it."""
+"""Session of ``drive``: sends a terminal's keys as drive requests, and shows the robot's state on the terminal."""
 
 import asyncio
 import math
@@ -37,9 +37,9 @@ from monstertruckd.tools.status.watch import SCREEN_PERIOD, Follower
 REQUEST_RATE: Final = 20.0
 """Drive requests per second."""
 NEUTRAL_REQUESTS: Final = 6
-"""Neutral requests after the gamepad was let go, so that the truck stops by its ramp."""
+"""Number of neutral requests after the gamepad was let go, so that the truck stops by its ramp."""
 QUIET: Final = frozenset({Reason.CLIPPED, Reason.SERVO_LIMIT})
-"""Limits of the driver's own request: the hand knows."""
+"""Limits caused by the driver's request, which the driver already knows."""
 HELP = "Enter arm  WASD drive  space E-STOP  Esc stop  r reset  x straight  q end"
 ARROWS = {1: "▲ forward", -1: "▼ back", 0: "standing"}
 HINTS = {
@@ -48,7 +48,7 @@ HINTS = {
     GateMode.ESTOPPED: "emergency stop: r resets, then Enter arms",
 }
 REPORT_ON: Final = b"\x1b[?1004h\x1b[?2004h"
-"""Report focus, mark what is pasted (xterm; terminals that cannot do it ignore it)."""
+"""Enable focus reports and bracketed paste (xterm; other terminals ignore it)."""
 REPORT_OFF: Final = b"\x1b[?1004l\x1b[?2004l"
 
 _LOCAL, _INPUT, _CHARACTERS = 3, 0, 6
@@ -59,26 +59,26 @@ class Stream:
     """State of the requests to the robot."""
 
     request: TeleopRequest | None = None
-    """Sent last; None = no request."""
+    """Latest request sent; None without a request."""
     round_trip: float | None = None
-    """Seconds to the robot and back; None = no answer."""
+    """Round-trip time to the robot (s); None without an answer."""
     trouble: str = ""
-    """Why nothing can be sent."""
+    """Reason why requests cannot be sent."""
     refusal: str = ""
-    """Why the newest order was refused."""
+    """Reason for the refusal of the latest order."""
     pad: str = ""
-    """Name of the gamepad, or why there is none; empty = none is wanted."""
+    """Name of the gamepad, or why it is missing; empty if the session uses no gamepad."""
 
 
 class DriveSession:
-    """One terminal driving one robot.
+    """Session of one terminal that drives one robot.
 
     Args:
-        teleop: what the keys mean.
-        clock: time.
-        keyboard: terminal that is read.
-        screen: terminal that is drawn on.
-        gamepad: what its parts do; None = keys only.
+        teleop: state of keyboard driving.
+        clock: clock of the session.
+        keyboard: terminal to read from.
+        screen: terminal to draw on.
+        gamepad: mapping of the gamepad; None for keys only.
     """
 
     def __init__(
@@ -94,13 +94,13 @@ class DriveSession:
         self._arming: asyncio.TimerHandle | None = None
         self._gamepad = None if gamepad is None else PadLink(gamepad, clock, self._act)
         self._resting = 0
-        """Neutral requests that are still sent after the gamepad was let go."""
+        """Number of neutral requests still to send after the gamepad was let go."""
 
     async def run(self, robot: str, endpoint: str) -> None:
-        """Drive until the user ends it or the terminal is gone; the terminal is restored, the truck stopped.
+        """Drive until the user quits or the terminal is gone; then restore the terminal and stop the truck.
 
         Raises:
-            NotFoundError: no robot answers there.
+            NotFoundError: no robot answers at the endpoint.
         """
         loop = asyncio.get_running_loop()
         async with TruckClient(robot, endpoint, role=Role.KEYBOARD, clock=self._clock) as client:
@@ -144,7 +144,7 @@ class DriveSession:
             command = self._teleop.press(key, self._clock.now())
             if command is Order.ARM:
                 if self._arming is None:
-                    # 0.15: seconds of neutral requests before an order to arm: they keep a tracker from driving off
+                    # 0.15: duration of neutral requests before an arm order (s), so that no tracker starts to drive
                     self._arming = asyncio.get_running_loop().call_later(0.15, self._arm)
             elif command is not None:
                 self._hold_arming()
@@ -157,18 +157,18 @@ class DriveSession:
         self._commands.put_nowait(Order.ARM)
 
     def _hold_arming(self) -> None:
-        """Cancel an order to arm that was not sent yet."""
+        """Cancel an arm order that was not sent yet."""
         if self._arming is not None:
             self._arming.cancel()
             self._arming = None
 
     async def _obey(self, client: TruckClient) -> None:
-        """Give the keys' orders, each without waiting for the outcome of the one before; returns at the end."""
+        """Send the keys' orders, each without waiting for the previous outcome; returns when the user quits."""
         outcomes: set[asyncio.Task[GateState]] = set()
         try:
             while (command := await self._commands.get()) != "end":
                 self._stream.refusal = ""
-                # The order itself leaves here: a task that is cancelled at the end may never begin.
+                # Send the order itself here: a task cancelled at the end may never start.
                 outcome = asyncio.create_task(client.order(command))
                 outcomes.add(outcome)
                 outcome.add_done_callback(partial(self._show_outcome, command))
@@ -187,7 +187,7 @@ class DriveSession:
         while True:
             await self._clock.sleep(1.0 / REQUEST_RATE)
             now = self._clock.now()
-            # 0.3: after a longer pause of this program, s, keys that are read late may have been released meanwhile
+            # 0.3: maximum pause of this program (s); after a longer one, keys read late may already be released
             if now - before > 0.3 * SECOND:
                 self._forget()
             before = now
@@ -195,7 +195,7 @@ class DriveSession:
             await self._request(client, *self._input(now))
 
     def _input(self, now: int) -> tuple[TeleopRequest | None, Role]:
-        """What the hands say at this moment: a gamepad that is held goes before the keys."""
+        """Return the current input: a held gamepad has priority over the keys."""
         link = self._gamepad
         pad = None if link is None else link.pad
         self._stream.pad = "" if link is None else link.hint or ("" if pad is None else pad.name)
@@ -213,7 +213,7 @@ class DriveSession:
         self._press([key_for(action, self._teleop.mode)])
 
     async def _feel(self, link: PadLink, follower: Follower) -> None:
-        """Shake the hand when a limit begins, harder when the truck stops."""
+        """Rumble when a limit starts, harder when the truck stops."""
         before: frozenset[Reason] = frozenset()
         mode: GateMode | None = None
         while True:
@@ -233,7 +233,7 @@ class DriveSession:
         if request is None:
             return
         client.role = role
-        lease = 0.25  # seconds a request stands
+        lease = 0.25  # validity of a request (s)
         try:
             if request.twist is None:
                 await client.drive(request.speed, request.front, request.rear, lease=lease, unseen=request.unseen)
@@ -260,10 +260,10 @@ class DriveSession:
                 self._stream.round_trip = (self._clock.now() - sent) / SECOND
             except TruckError:
                 self._stream.round_trip = None
-            await self._clock.sleep(1.0)  # seconds between two measurements of the round trip
+            await self._clock.sleep(1.0)  # interval between measurements of the round trip (s)
 
     async def _draw(self, follower: Follower) -> None:
-        """Show the state; returns when the terminal is gone, which the keyboard may notice later."""
+        """Show the state; returns when the terminal is gone, even if the keyboard notices it later."""
         console = Console(file=self._screen)
         with suppress(OSError), Live(console=console, screen=True, auto_refresh=False) as live:
             while True:
@@ -272,12 +272,12 @@ class DriveSession:
 
     async def _stop(self, client: TruckClient) -> None:
         with suppress(TruckError, TimeoutError):
-            async with self._clock.deadline(1.0):  # seconds to wait at the end for the truck to stop
+            async with self._clock.deadline(1.0):  # maximum wait for the truck to stop at the end (s)
                 await client.stop()
 
 
 def draw(state: ScreenState, teleop: Teleop, stream: Stream, width: int) -> RenderableType:
-    """The whole screen."""
+    """Return the whole screen."""
     layout = Layout()
     layout.split_column(
         Layout(_controls(state, teleop, stream), size=6), Layout(screen.draw(state, width, events=4), ratio=1)
@@ -299,7 +299,7 @@ def _controls(state: ScreenState, teleop: Teleop, stream: Stream) -> Panel:
 
 
 def _message(state: ScreenState, stream: Stream) -> Text:
-    """What is wrong, or the key to press before anything moves."""
+    """Return the current error, or the key to press before anything moves."""
     if text := stream.trouble or stream.refusal:
         return Text(text, style="bold red", no_wrap=True, overflow="ellipsis")
     mode = None if state.gate is None else state.gate.mode
@@ -346,7 +346,7 @@ def _modes(teleop: Teleop) -> Text:
 
 @contextmanager
 def every_key(keyboard: IO[Any], screen: IO[Any]) -> Iterator[None]:
-    """Keys come one by one and unechoed; Ctrl-C still interrupts, Ctrl-Z and Ctrl-S neither suspend nor freeze.
+    """Deliver keys one by one without echo; Ctrl-C still interrupts, Ctrl-Z and Ctrl-S neither suspend nor freeze.
 
     Args:
         keyboard: terminal to read from.
@@ -369,11 +369,11 @@ def _restore(keyboard: IO[Any], screen: IO[Any], before: list[Any]) -> None:
     with suppress(OSError):  # a terminal that is gone took its settings along
         os.write(screen.fileno(), REPORT_OFF)
     with suppress(termios.error):
-        # Keys that were held are not for the shell.
+        # Held keys must not reach the shell.
         termios.tcsetattr(keyboard, termios.TCSAFLUSH, before)
 
 
 def forget_input(keyboard: IO[Any]) -> None:
-    """Throw away what was typed but not read yet."""
+    """Discard typed keys that were not read yet."""
     with suppress(termios.error):
         termios.tcflush(keyboard, termios.TCIFLUSH)

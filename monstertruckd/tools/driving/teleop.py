@@ -1,8 +1,8 @@
-"""Keyboard driving: bytes of a terminal to keys, keys to drive requests and orders. Pure.
+"""Keyboard driving: convert terminal bytes to keys, and keys to drive requests and orders. Pure.
 
-A terminal reports a key press and repeats it while the key is held, but never its release. So every driving key is
-valid for a short time only; after the last one there is one neutral request and then none: the truck stops even if this
-program hangs or its link breaks, because nothing renews the lease.
+A terminal reports a key press and repeats it while the key is held, but never reports its release. So every driving key
+is valid for a short time only. After the last key there is one neutral request and then none. The truck stops even if
+this program hangs or its link breaks, because nothing renews the lease.
 """
 
 import math
@@ -30,10 +30,10 @@ _FINALS: Final = {
 _NAMES: Final = {"\r": "enter", "\n": "enter", " ": "space", "\x1b": "escape", "\x04": "end"}
 
 STEERING_KEY_STEPS: Final = 8
-"""Key presses from straight to full lock."""
+"""Number of key presses from straight to full lock."""
 
 TURN_RADIUS: Final = 0.2
-"""A turning key asks for the rate at which a point this far from the base has the present speed, m."""
+"""Distance from the base of a point that moves at the current speed when a turning key is held (m)."""
 
 MODE_KEYS: Final = {str(number): mode for number, mode in enumerate(SteeringMode, start=1)}
 
@@ -42,7 +42,7 @@ STEERING: Final = {"left": 1, "a": 1, "right": -1, "d": -1}
 DRIFTING: Final = {"z": 1, "c": -1}
 CENTRE: Final = "x"
 UNSEEN: Final = "v"
-"""Drives on, by default in reverse, into ground that no sensor has seen."""
+"""Key that keeps driving, by default in reverse, into ground that no sensor has seen."""
 ORDERS: Final = {"enter": Order.ARM, "space": Order.ESTOP, "escape": Order.STOP, "e": Order.ESTOP, "r": Order.RESET}
 ENDS: Final = frozenset({"q", "end"})
 
@@ -50,14 +50,14 @@ Command = Order | Literal["end"]
 
 
 class KeyReader:
-    """Cuts a stream of bytes into keys; what was pasted is no key."""
+    """Cuts a stream of bytes into keys; ignores pasted text."""
 
     def __init__(self) -> None:
         self._rest = b""
         self._pasting = False
 
     def feed(self, data: bytes) -> list[str]:
-        """Names of the keys that ``data`` completes; letters come as lower case."""
+        """Return the names of the keys completed by ``data``; letters are in lower case."""
         self._rest += data
         keys = []
         while (part := self._next()) is not None:
@@ -70,16 +70,16 @@ class KeyReader:
         return keys
 
     def flush(self) -> list[str]:
-        """The escape key, if that was all: to be called when nothing has followed for a moment."""
+        """Return the escape key if only its byte is pending; call this when no byte has followed for a moment."""
         rest, self._rest = self._rest, b""
         return ["escape"] if rest == ESCAPE and not self._pasting else []
 
     def clear(self) -> None:
-        """Forget what has come so far."""
+        """Forget all bytes so far."""
         self._rest, self._pasting = b"", False
 
     def _next(self) -> bytes | None:
-        """Cut the first whole key off; None if there is none yet."""
+        """Cut off the first complete key; None without one."""
         length = _length(self._rest)
         if length is None:
             return None
@@ -88,7 +88,7 @@ class KeyReader:
 
 
 def _length(data: bytes) -> int | None:
-    """Bytes of the first key; None while it may go on."""
+    """Return the length of the first key (bytes); None while it may be incomplete."""
     if not data or data == ESCAPE:
         return None
     if not data.startswith(ESCAPE):
@@ -119,23 +119,23 @@ class TeleopRequest:
     """Requested motion, in one of the two forms."""
 
     speed: float
-    """m/s."""
+    """Speed (m/s)."""
     front: float
-    """rad, left positive."""
+    """Front axle angle (rad), left positive."""
     rear: float
     twist: tuple[float, float, float] | None = None
-    """Velocity of the base, vx, vy, wz (m/s, m/s, rad/s), in place of the others."""
+    """Velocity of the base vx, vy, wz (m/s, m/s, rad/s), which replaces speed and angles."""
     unseen: bool = False
-    """The operator drives into unseen ground knowingly."""
+    """Whether the operator knowingly drives into unseen ground."""
 
 
 def axles(mode: SteeringMode, steer: float, drift: float) -> tuple[float, float]:
-    """Front and rear axle angle, rad, left positive; ``steer`` > 0 turns, or in crab moves, to the left.
+    """Return front and rear axle angle (rad), left positive; ``steer`` > 0 turns, or moves in crab mode, to the left.
 
     Args:
-        mode: which axles steer; ``hybrid`` adds a drift to the counter-steered rear axle.
-        steer: rad.
-        drift: rad; counts in ``hybrid`` only.
+        mode: steering mode; ``hybrid`` adds a drift to the counter-steered rear axle.
+        steer: steering angle (rad).
+        drift: drift angle (rad), used in ``hybrid`` mode only.
     """
     match mode:
         case SteeringMode.FRONT:
@@ -154,16 +154,16 @@ def axles(mode: SteeringMode, steer: float, drift: float) -> tuple[float, float]
 
 @dataclass(slots=True)
 class Teleop:
-    """State of keyboard driving. Times are ns."""
+    """State of keyboard driving. Times are in ns."""
 
     angle: float = 0.4
-    """Full lock of an axle, rad."""
+    """Full lock of an axle (rad)."""
     first_hold: float = 0.6
-    """Seconds a first press is valid: longer than the keyboard's delay before it repeats."""
+    """Validity of a first press (s): longer than the keyboard's delay before it repeats."""
     hold: float = 0.25
-    """Seconds a repetition is valid."""
+    """Validity of a repetition (s)."""
     arm_hold: float = 2.0
-    """Seconds of neutral requests after arming, so that no tracker starts to drive."""
+    """Duration of neutral requests after arming (s), so that no tracker starts to drive."""
     level: int = 1
     """Index into ``SPEEDS``."""
     mode: SteeringMode = SteeringMode.FRONT
@@ -172,33 +172,33 @@ class Teleop:
     _throttle: int = 0
     _turn: int = 0
     _side: int = 0
-    """Turn of a twist: 1 to the left, -1 to the right, 0 none."""
+    """Turning direction of a twist: 1 left, -1 right, 0 none."""
     _last: str = ""
     _until: int = 0
-    """The driving keys are valid until then."""
+    """End of the driving keys' validity."""
     _resting: int = 0
-    """Until then standstill is requested without a key."""
+    """End of standstill requests without a key."""
     _asking: bool = False
     _unseen: bool = False
-    """The newest driving key was that for unseen ground."""
+    """Whether the latest driving key was the key for unseen ground."""
 
     @property
     def speed(self) -> float:
-        """Speed of the present step, m/s."""
+        """Speed of the current step (m/s)."""
         return SPEEDS[self.level]
 
     @property
     def steer(self) -> float:
-        """Steering, rad, left positive."""
+        """Steering angle (rad), left positive."""
         return self._steer / STEERING_KEY_STEPS * self.angle
 
     @property
     def drift(self) -> float:
-        """Drift of the hybrid mode, rad, left positive."""
+        """Drift angle of the hybrid mode (rad), left positive."""
         return self._drift / STEERING_KEY_STEPS * self.angle
 
     def press(self, key: str, now: int) -> Command | None:
-        """Take a key; returns the command it gives, if any."""
+        """Process a key; returns its command, if any."""
         if key in ENDS:
             self.release()
             return "end"
@@ -221,7 +221,7 @@ class Teleop:
         return None
 
     def _drive(self, key: str, now: int) -> None:
-        """Take a driving key: it sets its own part and extends the rest."""
+        """Process a driving key: it sets its part of the motion and extends the validity of the rest."""
         standing = now <= self._until
         if not standing:
             self._turn = self._side = 0
@@ -247,7 +247,7 @@ class Teleop:
         self._unseen = False
 
     def request(self, now: int) -> TeleopRequest | None:
-        """The present request: the keys' motion, one standstill after it, then none."""
+        """Return the current request: the keys' motion, then one standstill, then none."""
         if now <= self._until:
             self._asking = True
             return self._motion()
@@ -257,7 +257,7 @@ class Teleop:
         return self._motion() if asked or self._asking else None
 
     def _motion(self) -> TeleopRequest:
-        """What the keys ask for."""
+        """Return the motion that the keys request."""
         ahead = self._throttle * self.speed
         if self.mode is SteeringMode.TWIST:
             twist = (ahead, self._side * self.speed, self._turn * self.speed / TURN_RADIUS)

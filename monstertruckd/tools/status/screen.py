@@ -1,4 +1,4 @@
-"""The live screen: the estimates of the truck, its limits, its services. Pure: messages in, picture out."""
+"""Live screen with the truck's estimates, limits and services. Pure: messages in, screen out."""
 
 import math
 from collections import deque
@@ -56,30 +56,30 @@ STATE_STYLE = {
 }
 EVENT_STYLE = {Severity.INFO: "green", Severity.WARNING: "yellow", Severity.ERROR: "bold red"}
 HORIZON = 0.72
-"""Where the truck stands in the scan view, from the top: the lidar looks ahead."""
+"""Vertical position of the truck in the scan view, as a fraction from the top: the lidar looks ahead."""
 
 
 SILENCE: Final = 2.0
-"""Seconds without any message after which a robot counts as gone: it speaks several times a second."""
+"""Maximum time without a message before a robot is gone (s); it publishes several times a second."""
 GONE: Final = Style(color="bright_black")
-"""Style of all values of a robot that is silent."""
+"""Style of all values of a silent robot."""
 
 
 @dataclass(slots=True)
 class ScreenState:
-    """Newest message of everything the screen shows."""
+    """Latest message of every kind that the screen shows."""
 
     robot: str
     heard: int
-    """When the newest message came, ns of the station's clock; before the first one: since when it is awaited."""
+    """Arrival time of the latest message, or start of the wait for the first (ns of the station's clock)."""
     silence: float = 0.0
-    """Seconds since then."""
+    """Time since ``heard`` (s)."""
     trouble: str = ""
-    """Why there is no link to the robot."""
+    """Reason for the missing link to the robot."""
     began: int | None = None
-    """Stamp of the first message, ns of the robot's clock."""
+    """Stamp of the first message (ns of the robot's clock)."""
     now: int = 0
-    """Stamp of the newest message, ns of the robot's clock: ages end with what it says."""
+    """Stamp of the latest message (ns of the robot's clock); ages are measured up to it."""
     gate: GateState | None = None
     odometry: Odometry | None = None
     scan: LaserScan | None = None
@@ -94,12 +94,12 @@ class ScreenState:
     recorder: RecorderHealth | None = None
     stop: Stop | None = None
     events: deque[tuple[int, Event]] = field(default_factory=lambda: deque(maxlen=8))
-    """Each with the UNIX time at which it came, ns."""
+    """Events with their arrival as UNIX time (ns)."""
     trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=2000))
 
     @property
     def why_stopped(self) -> list[str]:
-        """The newest stop in a few lines, while it still holds the truck; nothing otherwise."""
+        """Latest stop in a few lines while it still holds the truck; otherwise empty."""
         if self.stop is None or self.gate is None or self.gate.speed_limit > 0:
             return []
         silence = self.silence if self.gone else 0.0
@@ -107,15 +107,15 @@ class ScreenState:
 
     @property
     def gone(self) -> bool:
-        """Whether no message of the robot came lately, or ever."""
+        """Whether no message of the robot arrived recently, or ever."""
         return self.silence > SILENCE
 
     def take(self, message: Message, real: int = 0) -> None:
-        """Remember ``message`` if the screen shows its kind.
+        """Store ``message`` if the screen shows its kind.
 
         Args:
-            message: of the robot.
-            real: when it came, ns of UNIX time: events are shown by the time of day, which is the same on all screens.
+            message: message of the robot.
+            real: arrival as UNIX time (ns); events are shown with the time of day, which is the same on all screens.
         """
         self.now = message.stamp
         self.began = message.stamp if self.began is None else self.began
@@ -134,14 +134,15 @@ class ScreenState:
                 pass
 
     def _forget_stop(self, until: int) -> None:
-        """The daemon was restarted after ``until``, ns: what stopped its run before is not what holds it now."""
+        """Drop a stop of the daemon's previous run, which ended at ``until`` (ns): it does not hold the current run."""
         if self.stop is not None and self.stop.stamp <= until:
             self.stop = None
 
     def old(self, name: str) -> str:
-        """How old the newest message of a field is, in words; empty while it is one of now.
+        """Return the age of a field's latest message in words; empty while it is current.
 
-        By the clock of the robot, as its gate said last: what a restarted computer said before is not of now either.
+        The age uses the robot's clock, from the latest gate message. A message from before a restart of the computer
+        is old, too.
         """
         message, limit = getattr(self, name), SHOWN[name].stale_after
         if message is None or self.gate is None or limit is None:
@@ -153,7 +154,7 @@ class ScreenState:
 
 
 def calibration_badge(health: CalibrationHealth) -> str:
-    """Wizards by grade, the expired ones by name: ``A drive, steering; expired: compass``."""
+    """Return the wizards by grade, and the expired ones: ``A drive, steering; expired: compass``."""
     good: dict[str, list[str]] = {}
     for state in health.wizards:
         good.setdefault("expired:" if state.expired else state.grade, []).append(state.wizard)
@@ -175,19 +176,19 @@ SHOWN: Final[dict[str, Topic[Any]]] = {
     "recorder": topics.RECORDER,
     "stop": topics.STOP,
 }
-"""Topics of which ``ScreenState`` keeps the newest message, by its field."""
+"""Topics whose latest message ``ScreenState`` keeps, by field."""
 _FIELDS: Final = {topic.model: name for name, topic in SHOWN.items()}
 
 
 def draw(state: ScreenState, width: int, events: int = 6) -> RenderableType:
-    """The whole screen; a terminal narrower than 104 columns names the services alone that are not ready.
+    """Draw the whole screen; below 104 columns, list only the services that are not ready.
 
-    Once the robot has been silent for ``SILENCE`` seconds, that stands above everything it said, in grey.
+    Once the robot has been silent for ``SILENCE`` seconds, a banner appears above its last values, which turn grey.
 
     Args:
-        state: what is shown.
-        width: columns there are.
-        events: lines for the newest events; the newest of all is whole, however long it is.
+        state: state to draw.
+        width: width of the terminal (columns).
+        events: lines for the latest events; the latest event is always complete.
     """
     layout = Layout()
     gone = state.gone
@@ -219,7 +220,7 @@ def _as_it_is(content: RenderableType) -> RenderableType:
 
 
 class _Gone:
-    """What was, in grey."""
+    """Last content, in grey."""
 
     def __init__(self, content: RenderableType) -> None:
         self._content = content
@@ -236,7 +237,7 @@ def _banner(state: ScreenState) -> Text:
 
 
 def _troubled(state: ScreenState) -> list[ServiceHealth]:
-    """The services that are not ready, as many as a small screen has room for."""
+    """Return the services that are not ready, limited to the space of a small screen."""
     services = state.health.services if state.health is not None else ()
     return [row for row in services if row.state is not ServiceState.READY][:4]
 
@@ -277,7 +278,7 @@ def _truck(state: ScreenState) -> Panel:
         _row(table, "busy", Text(state.loop.busy, style="bold yellow"))
     elif state.loop is not None:
         _row(table, "tick late", f"p99 {state.loop.lateness_p99 * 1e3:.1f} ms max {state.loop.lateness_max * 1e3:.1f}")
-    if gate is not None and gate.weakened:  # last: it does not change, and a small screen cuts off the end
+    if gate is not None and gate.weakened:  # last: it is constant, and a small screen cuts off the end
         _row(table, "weakened", Text("\n".join(gate.weakened), style="bold yellow"))
     old = f", {state.silence:.0f} s ago" if state.gone else ""
     return Panel(table, title=f"mt/{state.robot}{old}", border_style="dim")
@@ -291,7 +292,7 @@ def _calibration(table: Table, health: CalibrationHealth) -> None:
 
 
 def _path(table: Table, state: ScreenState) -> None:
-    """Progress on the path, and what the tracker has learnt about the steering."""
+    """Add the progress on the path, and the steering difference that the tracker has learnt."""
     gate, tracker = state.gate, state.tracker
     if tracker is None:
         return
@@ -300,14 +301,14 @@ def _path(table: Table, state: ScreenState) -> None:
     _row(table, "path", f"{bar:░<16} {done:4.0%}")
     waits = tracker.outcome is Reason.DRIVING and gate is not None and not gate.mode.active
     doing = "waits" if waits else tracker.outcome.value
-    old = state.old("tracker") if tracker.outcome is Reason.DRIVING else ""  # at its end it falls silent
+    old = state.old("tracker") if tracker.outcome is Reason.DRIVING else ""  # silent after the path's end
     _row(table, "off path", f"{tracker.cross_track * 100:+.1f} cm {doing}", old)
     if tracker.steering_differs:
         _row(table, "steering", Text(tracker.steering_differs, style="yellow"))
 
 
 def _tilt(table: Table, state: ScreenState) -> None:
-    """Of the body, and of the lidar's plane, as far as they are measured."""
+    """Add the measured tilts of the body and of the lidar's plane."""
     if state.attitude is not None:
         roll, pitch = (math.degrees(angle) for angle in (state.attitude.roll, state.attitude.pitch))
         _row(table, "tilt", f"roll {roll:+.1f}° pitch {pitch:+.1f}°", state.old("attitude"))
@@ -316,19 +317,19 @@ def _tilt(table: Table, state: ScreenState) -> None:
 
 
 def _done(tracker: TrackerState) -> float:
-    """Share of the path that is driven; at the end of a lap the tracker measures along the next one."""
+    """Return the fraction of the path driven; after a lap the tracker already measures along the next lap."""
     if tracker.outcome in (Reason.GOAL_REACHED, Reason.GOAL_MISSED):
         return 1.0
     return tracker.along / tracker.length if tracker.length else 0.0
 
 
 def _why(row: ServiceHealth) -> str:
-    """Why a service does not work, or not well; of a traceback the first line."""
+    """Return why a service fails or is impaired; only the first line of a traceback."""
     return "" if row.state is ServiceState.READY and row.reason is Reason.OK else row.detail.partition("\n")[0]
 
 
 def _services(state: ScreenState, shown: Sequence[ServiceHealth] | None = None) -> Panel:
-    """All services; or those ``shown``, and how many of all are ready."""
+    """Panel of all services, or of those ``shown`` with the number of ready services."""
     table = Table.grid(padding=(0, 1))
     services = state.health.services if state.health is not None else ()
     for row in services if shown is None else shown:
@@ -354,7 +355,7 @@ def _services(state: ScreenState, shown: Sequence[ServiceHealth] | None = None) 
 
 
 def _events(state: ScreenState, width: int, count: int) -> list[Text]:
-    """Lines of the newest events, of as many as go into ``count`` lines whole; of the newest one in any case."""
+    """Return lines of the latest events: as many complete events as fit ``count`` lines, but always the latest."""
     lines: list[Text] = []
     for real, event in reversed(state.events):
         text = Text(f"{str(np.datetime64(real // SECOND, 's'))[-8:]}  ", style="dim")
@@ -369,7 +370,7 @@ def _events(state: ScreenState, width: int, count: int) -> list[Text]:
 
 
 _WRAPPING: Final = Console()
-"""What breaks lines; nothing is written to it."""
+"""Console for line breaking; never written to."""
 
 
 def _view_title(state: ScreenState) -> str:
@@ -380,7 +381,7 @@ def _view_title(state: ScreenState) -> str:
 
 
 class _Braille:
-    """Scan points, echoes of sonars and trail as braille dots, forward up, sized by the space there is."""
+    """Scan points, sonar echoes and trail as braille dots, forward up, scaled to the available space."""
 
     def __init__(self, state: ScreenState) -> None:
         self._state = state
@@ -388,7 +389,7 @@ class _Braille:
     def __rich_console__(self, _console: object, options: object) -> "list[Text]":
         width: int = getattr(options, "max_width", 60)
         height: int = getattr(options, "height", None) or 20
-        scale = min(width, height * 4 * HORIZON) / 2.6  # least distance the scan view shows ahead and to each side
+        scale = min(width, height * 4 * HORIZON) / 2.6  # minimum distance shown ahead and to each side (m)
         cells = np.zeros((height, width), np.uint8)
         if self._state.scan is not None and not self._state.old("scan"):
             mount = _mount(self._state, self._state.scan.frame) or (0.0, 0.0, 0.0)
@@ -411,7 +412,7 @@ def _with_arrow(line: str, at: int) -> str:
 
 
 def _mount(state: ScreenState, frame: str) -> tuple[float, float, float] | None:
-    """Pose (x, y, yaw) of a sensor in base, m, m, rad; None where it is not known."""
+    """Return the pose (x, y, yaw) of a sensor in base (m, m, rad); None if unknown."""
     if state.transforms is None:
         return None
     try:
@@ -421,7 +422,7 @@ def _mount(state: ScreenState, frame: str) -> tuple[float, float, float] | None:
 
 
 def _echo_points(state: ScreenState) -> Array:
-    """Points of the arcs on which the echoes lie, as far as the places of the sonars are known, (n, 2), m in base."""
+    """Return points (n, 2) on the arcs of the echoes in base (m), for the sonars whose mounting is known."""
     arcs = [np.empty((0, 2))]
     if state.sonar is not None and not state.old("sonar"):
         for echo in state.sonar.sonars:

@@ -1,4 +1,4 @@
-"""Follows a robot for the live screen."""
+"""Follow a robot for the live screen."""
 
 import asyncio
 import json
@@ -17,7 +17,7 @@ from monstertruck_schemas.sensor import SonarEcho
 from monstertruckd.tools.status.screen import SHOWN, ScreenState, calibration_badge, draw
 
 PICTURED = frozenset({topics.SCAN.name, topics.TRANSFORMS.name})
-"""Shown by the picture alone, not in words."""
+"""Topics shown only in the scan view, not in words."""
 SCREEN_PERIOD = 0.1
 
 
@@ -25,9 +25,9 @@ class Follower:
     """Keeps a ``ScreenState`` up to date from a client's subscriptions.
 
     Args:
-        client: connected.
-        clock: the station's time.
-        state: what is kept up to date; None = a new one.
+        client: connected client.
+        clock: clock of the station.
+        state: state to update; None creates one.
     """
 
     def __init__(self, client: TruckClient, clock: Clock, state: ScreenState | None = None) -> None:
@@ -59,7 +59,7 @@ class Follower:
 
 
 async def watch(clock: Clock, robot: str, endpoint: str) -> None:
-    """Draw the screen until cancelled; a robot that is not there, or goes, is waited for."""
+    """Draw the screen until cancelled; wait for a robot that is absent or disappears."""
     state = ScreenState(robot_on_host(robot, endpoint), clock.now())
     following = asyncio.create_task(_follow(clock, robot, endpoint, state))
     try:
@@ -76,7 +76,7 @@ async def watch(clock: Clock, robot: str, endpoint: str) -> None:
 async def _follow(clock: Clock, robot: str, endpoint: str, state: ScreenState) -> None:
     while True:
         try:
-            # 1.0: seconds in which a robot that is there answers
+            # 1.0: timeout of the robot's answer (s)
             async with TruckClient(robot, endpoint, clock=clock, timeout=1.0) as client:
                 state.trouble = ""
                 await Follower(client, clock, state).run()
@@ -90,7 +90,7 @@ async def print_once(clock: Clock, robot: str, endpoint: str, *, json_output: bo
     """Print the robot's state once.
 
     Raises:
-        NoAnswerError: the robot published nothing for a second.
+        NoAnswerError: the robot published no message within a second.
     """
     async with TruckClient(robot, endpoint, clock=clock) as client:
         boxes = {topic.name: client.subscribe(topic, latest()) for topic in SHOWN.values()}
@@ -110,13 +110,13 @@ async def print_once(clock: Clock, robot: str, endpoint: str, *, json_output: bo
 
 
 def _echo(echo: SonarEcho) -> str:
-    """One sonar: ``fl 0.42 m``."""
+    """Return one sonar in words: ``fl 0.42 m``."""
     distance = "no echo" if echo.range is None else f"{echo.range:.2f} m"
     return f"{echo.name} {distance if echo.answered else 'silent'}"
 
 
 def _steering(state: ScreenState) -> list[str]:
-    """What was calibrated, and what the tracker has learnt."""
+    """Return the calibration state and the steering difference that the tracker has learnt."""
     health, tracker = state.calibration, state.tracker
     rows = [
         ("calibrated", "" if health is None else calibration_badge(health)),
@@ -127,7 +127,7 @@ def _steering(state: ScreenState) -> list[str]:
 
 
 def plain(state: ScreenState) -> list[str]:
-    """The state in words, for pipes."""
+    """Return the state in words, for pipes."""
     lines = []
     if state.gate is not None:
         reasons = ", ".join(reason.value for reason in state.gate.reasons) or "-"
