@@ -23,9 +23,9 @@ FRAME: Final = 0.001
 
 
 class DeviceEnd:
-    """The device's side of a port: what an emulator reads and writes, whoever has the host side open.
+    """Device side of a port, which an emulator reads and writes, whichever process has the host side open.
 
-    Bytes without a reader are dropped, as a USB device's are. ``baud`` paces both directions like a real
+    Bytes without a reader are dropped, as with a USB device. ``baud`` paces both directions like a real
     line (10 bits a byte). Faults of the cable live here too.
     """
 
@@ -86,15 +86,15 @@ class DeviceEnd:
 
 
 CABLE: Final = contextvars.Context()
-"""Of bytes under way: they arrive whatever their sender does meanwhile."""
+"""Context of bytes in transit: they arrive whatever their sender does meanwhile."""
 
 
 class _Direction:
-    """One direction of the line. Timers may ring in any order; bytes arrive in that in which they were sent."""
+    """One direction of the line. Timers may fire in any order; bytes arrive in the order sent."""
 
     def __init__(self) -> None:
         self._free = 0.0
-        """Loop time at which all that was sent is through."""
+        """Loop time at which all sent bytes have passed."""
         self._sent: deque[Callable[[], None]] = deque()
 
     def is_free(self) -> bool:
@@ -237,15 +237,15 @@ class MemoryPort:
 
 @contextlib.contextmanager
 def reserved(*links: Path) -> Iterator[None]:
-    """Keep the names of ptys for this program while the context lasts: nobody else's are replaced.
+    """Reserve the names of ptys for this program within the context, without replacing those of other programs.
 
     Args:
-        links: symlinks that are to be made; their folders must exist.
+        links: symlinks to create; their folders must exist.
 
     Raises:
-        BusyError: another program serves one of them; its process is named.
-        InputError: something else than a link has the name.
-        OSError: a link cannot be made there.
+        BusyError: another program serves one of them; the text gives its process.
+        InputError: the name belongs to something other than a link.
+        OSError: the link cannot be created.
     """
     with contextlib.ExitStack() as stack:
         for link in links:
@@ -253,7 +253,7 @@ def reserved(*links: Path) -> Iterator[None]:
                 raise InputError(f"{link}: is there already, and no link: a pty does not take its place")
             lock = link.with_name(f".{link.name}.lock")
             try:
-                file = stack.enter_context(lock.open("a+"))  # keeps what a holder wrote
+                file = stack.enter_context(lock.open("a+"))  # keeps the holder's text
             except OSError as error:
                 error.filename = str(link)
                 raise
@@ -336,7 +336,7 @@ class PtyPort:
         self._timer = None
         frame = bytes(self._frame)
         self._frame.clear()
-        # What a pty of about 10 kB has no room for is lost, as are bytes of a USB device that are not fetched in time.
+        # Bytes beyond a pty's capacity of about 10 kB are lost, like bytes of a USB device not fetched in time.
         with contextlib.suppress(BlockingIOError):
             os.write(self._fds[0], frame)
 

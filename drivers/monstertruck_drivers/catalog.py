@@ -1,8 +1,9 @@
-"""The tables of device roles and of device kinds, from which everything that lists devices is derived.
+"""Tables of device roles and device kinds; every list of devices derives from them.
 
-A role is what a device is for: its key in the configuration, the topics it writes and reads, when it starts. A kind is
-a product with its driver: what ``kind:`` means. Both may come from other distributions: ``docs/writing-a-driver.md``.
-Modules of a kind are loaded on use, so that listing kinds, checking a configuration and ``--help`` cost nothing.
+A role is the purpose of a device: its key in the configuration, the topics it writes and reads, its place in the start
+order. A kind is a product with its driver, the value of ``kind:``. Other distributions may add both:
+``docs/writing-a-driver.md``. The modules of a kind are loaded on use, so that listing kinds, checking a configuration
+and ``--help`` cost nothing.
 """
 
 import re
@@ -35,7 +36,7 @@ Probe = Callable[..., Awaitable[dict[str, Any]]]
 
 
 class Duty(StrEnum):
-    """What the truck needs a device for."""
+    """Purpose for which the truck needs a device."""
 
     ACTUATOR = "actuator"
     """Carries out the gate's commands; outlives the gate, and a bug in its driver ends the daemon."""
@@ -46,17 +47,17 @@ class Duty(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class RoleSpec:
-    """What a device is for, whatever its kind."""
+    """Purpose of a device, independent of its kind."""
 
     name: str
-    """Key in the configuration, name of the service, frame of what it measures."""
+    """Key in the configuration, name of the service, frame of the measurements."""
     duty: Duty
     doc: str
     writes: Mapping[str, Topic[Any]]
-    """Topics by the driver's parameter. The first one is the role's own; another one is left out (the driver gets None)
-    where another device that is configured has it as its own."""
+    """Topics by the driver's parameter. The first is the role's main topic; any other is left out (the driver gets
+    None) if it is the main topic of another configured device."""
     reads: Mapping[str, Topic[Any]] = field(default_factory=dict)
-    """Topics of which the driver gets the newest message, by its parameter."""
+    """Topics whose latest message the driver gets, by the driver's parameter."""
     frame: bool = False
     """Whether its mount is in the tree of frames."""
     elements: str | None = None
@@ -220,7 +221,7 @@ OUR_ROLES: Final = (
     LINK,
     HOST,
 )
-"""In the order in which they are listed and started."""
+"""Roles in listing and start order."""
 
 
 class UsbIdentity(NamedTuple):
@@ -242,14 +243,14 @@ class DeviceKind(Plugin):
     """
 
     roles: tuple[RoleSpec, ...]
-    """What it can be used for."""
+    """Roles it can take."""
     emulator: str
     """Place ``module:function`` of its ``EmulatorFactory``."""
     probe: str
     """Place ``module:function`` of its ``Probe``."""
     also: Mapping[str, Topic[Any]] = field(default_factory=dict)
-    """Topics that it writes besides those of its role, by the driver's parameter. The driver gets None where another
-    device that is configured has the topic as its own."""
+    """Topics written in addition to the role's topics, by the driver's parameter. The driver gets None if the topic is
+    the main topic of another configured device."""
     opens: Literal["serial", "video", "computer"] = "serial"
     """What driver and probe get: a serial ``Port``, a ``FrameSource`` (the probe: a path), or the ``Computer``."""
     baud: int | None = None
@@ -260,7 +261,7 @@ class DeviceKind(Plugin):
 
     @property
     def role(self) -> RoleSpec:
-        """What it is used for first of all."""
+        """Its primary role."""
         return self.roles[0]
 
     def emulator_factory(self) -> EmulatorFactory:
@@ -275,8 +276,8 @@ class DeviceKind(Plugin):
 RESERVED: Final = frozenset(
     {*map(str, ServiceName), "at_present", "controller", "measures", "present", "shafts", "steers"}
 )
-"""Names that no role of another distribution may have: of the services that are no device, and of what a section of the
-configuration has besides its roles (a test compares)."""
+"""Names refused for roles of other distributions: services that are not devices, and keys of a configuration section
+besides its roles (a test compares)."""
 
 
 class DeviceCatalog(Catalog[DeviceKind]):
@@ -287,7 +288,7 @@ class DeviceCatalog(Catalog[DeviceKind]):
         self._roles = {role.name: role for role in OUR_ROLES}
 
     def fault(self, row: Any) -> str | None:
-        """What is wrong with a kind of another distribution, or with a role it brings."""
+        """Return the fault of another distribution's kind or of a role it adds."""
         if fault := super().fault(row):
             return fault
         if not row.roles:
@@ -311,7 +312,7 @@ class DeviceCatalog(Catalog[DeviceKind]):
 
     @property
     def roles(self) -> Mapping[str, RoleSpec]:
-        """Roles by name, in the order in which they are listed and started."""
+        """Roles by name, in listing and start order."""
         len(self)  # reads the entry points
         return self._roles
 
@@ -570,7 +571,7 @@ DEVICES: Final = DeviceCatalog(
 
 
 def start_order() -> tuple[str, ...]:
-    """Roles in the order in which they start behind a returned hub."""
+    """Roles in their start order behind a returned hub."""
     roles = [role for role in DEVICES.roles.values() if role.duty is not Duty.MONITOR]
     return tuple(role.name for role in sorted(roles, key=lambda role: role.start))
 

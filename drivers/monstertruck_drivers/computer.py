@@ -80,10 +80,10 @@ class NoWatcher:
 
 
 class UdevWatcher:
-    """Listens to udev, that is after its rules ran: links and permissions are in place.
+    """Listens to udev events after its rules ran, so links and permissions are in place.
 
     Args:
-        monitor: a ``pyudev.Monitor``, or what looks like one.
+        monitor: a ``pyudev.Monitor``, or an object with its interface.
     """
 
     def __init__(self, monitor: Any) -> None:
@@ -135,7 +135,7 @@ async def run_command(arguments: Sequence[str]) -> tuple[int, str]:
     """Run a program without a shell.
 
     Returns:
-        Its exit code and what it printed.
+        Exit code and output.
 
     Raises:
         OSError: it cannot be started.

@@ -38,7 +38,7 @@ C = TypeVar("C", bound=Schema)
 
 
 class PortConfig(Schema):
-    """Where a device hangs."""
+    """Port of a device."""
 
     path: Path
     """Device node, best by hub port: /dev/truck/<role> or /dev/serial/by-path/..."""
@@ -58,7 +58,7 @@ class PortConfig(Schema):
 
 
 class TcpPortConfig(Schema):
-    """Where a device listens on the network."""
+    """Network address at which a device listens."""
 
     address: str
     """IPv4 address; an emulated device has one of 127.0.0.0/8"""
@@ -108,7 +108,7 @@ class Device(Schema, Generic[C]):
 
     @property
     def kind(self) -> DeviceKind:
-        """What the driver's settings say it is."""
+        """Device kind given by the driver's settings."""
         return kind_of(self.driver)
 
     @model_validator(mode="after")
@@ -154,7 +154,7 @@ class _Devices(Schema):
         return next((role for role, device in self.present().items() if 0 in _served(role, device)), None)
 
     def steers(self) -> tuple[str, SteeringOutputs] | None:
-        """Role of the device that steers, with what its servos do; None if nothing steers."""
+        """Role of the steering device with its steering outputs; None if nothing steers."""
         return next(self._steering(), None)
 
     def _steering(self) -> Iterator[tuple[str, SteeringOutputs]]:
@@ -213,7 +213,7 @@ def _served(role: str, device: Device[Any]) -> tuple[int, ...]:
 
 
 class _Monitors(Schema):
-    """What is read from the computer itself, without a port; what is left out is not watched."""
+    """Monitors of the computer itself, without a port; omitted monitors do not run."""
 
     def present(self) -> dict[str, Schema]:
         """Settings of those that are configured, by role."""
@@ -252,7 +252,7 @@ def _choice(role: RoleSpec, *, monitors: bool) -> Any:
 if TYPE_CHECKING:
 
     class Devices(_Devices):
-        """By name only what the robot's own code asks for."""
+        """Devices by role; only roles used by the robot's code are declared."""
 
         lidar: Device[Schema] | None = None
         drive: Device[EposConfig] | None = None
@@ -268,7 +268,7 @@ if TYPE_CHECKING:
         actuators: Device[VescConfig] | None = None
 
     class Monitors(_Monitors):
-        """By name only what the robot's own code asks for."""
+        """Monitors by role; only roles used by the robot's code are declared."""
 
         battery: IioConfig | None = None
         link: LinkQualityConfig | None = None

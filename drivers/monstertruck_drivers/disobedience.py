@@ -64,7 +64,7 @@ class DisobedientMotor:
         return cls(disobedience, rpm, StoppedBy(rest[0]) if rest else StoppedBy.STAGE)
 
     def target(self, asked: float | None, present: float, *, line: bool = False) -> float | None:
-        """What the motor is driven to.
+        """Return the speed that the motor is driven to.
 
         Args:
             asked: commanded speed, rpm; None = power stage off.

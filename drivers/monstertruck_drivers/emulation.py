@@ -1,4 +1,4 @@
-"""What emulators have in common: their interface, the physics they may ask for, what they are made from."""
+"""Emulator interface, the physics that emulators may query, and the parts an emulator is built from."""
 
 import shutil
 from collections.abc import Callable, Iterable
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 class FileTree:
-    """Files below a folder; each changes at once and whole, and only if its text does.
+    """Files below a folder; each is replaced atomically, and only if its text changes.
 
     Args:
         root: folder that stands for /, or for a part of it.
@@ -29,7 +29,7 @@ class FileTree:
         self._texts: dict[str, str] = {}
 
     def put(self, path: str, text: str) -> None:
-        """Make the file say ``text``, with a line end if it has none."""
+        """Write ``text`` to the file; append a line end if it has none."""
         if self._texts.get(path) == text:
             return
         self._texts[path] = text
@@ -40,7 +40,7 @@ class FileTree:
         scratch.replace(file)
 
     def remove(self, path: str) -> None:
-        """Take away a file or a folder with all its files."""
+        """Remove a file, or a folder with all its files."""
         target = self.root / path
         if target.is_dir():
             shutil.rmtree(target)
@@ -52,19 +52,19 @@ class FileTree:
 
 
 class ReceivedBytes(bytearray):
-    """The newest bytes of a stream, ``KEPT`` at most: what an emulator was sent, for tests."""
+    """Latest bytes sent to an emulator, at most ``KEPT``, for tests."""
 
     KEPT: Final = 1 << 16
 
     def extend(self, data: Iterable[SupportsIndex], /) -> None:
-        """Add bytes at the end; the oldest ones go."""
+        """Append bytes; drop the oldest above ``KEPT``."""
         super().extend(data)
         if len(self) > self.KEPT:
             del self[: -self.KEPT]
 
 
 class Emulator(Protocol):
-    """The device side of a protocol, byte for byte, with the device's own persistent state.
+    """Device side of a protocol, byte for byte, with the device's persistent state.
 
     Its attribute ``signals``, a ``Signals``, may be absent: see ``signals_of``.
     """
@@ -75,7 +75,7 @@ class Emulator(Protocol):
         """Serve until cancelled; survives hosts that come, go and die."""
 
     def power_cycle(self) -> None:
-        """Supply off and on again: volatile state is lost, stored settings stay."""
+        """Switch the supply off and on: volatile state is lost, stored settings stay."""
 
     def inject(self, fault: str, *values: str) -> None:
         """Start (or end) a device fault by name.
@@ -86,16 +86,16 @@ class Emulator(Protocol):
 
 
 def signals_of(emulator: object) -> Signals | None:
-    """Return what an emulator reports and obeys; None if it does not say."""
+    """Return the signals of an emulator; None if it declares none."""
     found = getattr(emulator, "signals", None)
     return found if isinstance(found, Signals) else None
 
 
 class FileEmulator(Protocol):
-    """A part of the computer that shows in files below /proc and /sys."""
+    """Part of the computer that appears as files below /proc and /sys."""
 
     async def run(self) -> None:
-        """Bring them up to date until cancelled."""
+        """Update the files until cancelled."""
 
     def inject(self, fault: str, *values: str) -> None:
         """Start or end a fault.
@@ -106,7 +106,7 @@ class FileEmulator(Protocol):
 
 
 class RangeSource(Protocol):
-    """What a lidar sees."""
+    """Source of a lidar's scans."""
 
     def scan(self, time_ns: int) -> NDArray[np.int32]:
         """Raw distances in mm of one revolution that began at ``time_ns``.
@@ -116,27 +116,27 @@ class RangeSource(Protocol):
 
 
 class RangeSheet(NamedTuple):
-    """Ranges of a scanner by its data sheet."""
+    """Ranges of a scanner according to its data sheet."""
 
     least: float
-    """Shortest range, m."""
+    """Minimum range (m)."""
     greatest: float
-    """Longest range, m."""
+    """Maximum range (m)."""
     error: float
-    """Bound of the error of short ranges, m."""
+    """Error bound at short range (m)."""
     relative_error: float
-    """Bound of the error of longer ranges, as a share of the range."""
+    """Error bound at longer range, as a fraction of the range."""
     dark: float | None = None
-    """Longest range to a surface that reflects 10 % of the light, m; None = the data sheet states white ones only."""
+    """Maximum range to a surface of 10 % reflectivity (m); None if the data sheet covers white surfaces only."""
 
     @property
     def sure(self) -> float:
-        """Longest range at which the data sheet promises a return of any obstacle, m."""
+        """Maximum range at which the data sheet guarantees a return from any obstacle (m)."""
         return self.greatest if self.dark is None else self.dark
 
 
 class BeamSource(Protocol):
-    """What the beams of a scanner of any geometry meet."""
+    """Source of beam ranges for a scanner of any geometry."""
 
     def beams(self, bearings: Array, times_ns: NDArray[np.int64], sheet: RangeSheet) -> Array:
         """Ranges of single beams, shape (n,), m: +inf = nothing within range, NaN = the measurement failed.
@@ -149,11 +149,11 @@ class BeamSource(Protocol):
 
 
 class ScannedRoom(RangeSource, BeamSource, Protocol):
-    """What any lidar sees."""
+    """Source of ranges for any lidar."""
 
 
 class MotorReading(NamedTuple):
-    """A motor shaft at one instant, in the controller's own sign."""
+    """State of a motor shaft at one instant, with the controller's sign."""
 
     turns: float
     """Shaft revolutions since power-up of the world."""
@@ -167,24 +167,24 @@ class MotorPlant(Protocol):
     """A motor with its load, driven by a speed controller."""
 
     def command(self, time_ns: int, target_rpm: float | None, accel_rpm_s: float) -> None:
-        """From ``time_ns`` on ramp towards ``target_rpm``; None = power stage off, coasting."""
+        """Ramp towards ``target_rpm`` from ``time_ns`` on; None switches the power stage off, so the motor coasts."""
 
     def reading(self, time_ns: int) -> MotorReading:
         """State at ``time_ns`` (never earlier than a time already requested)."""
 
 
 class PulseSource(Protocol):
-    """A servo controller's outputs."""
+    """Outputs of a servo controller."""
 
     def pulse_us(self, channel: int, time_ns: int) -> float | None:
-        """Pulse being sent, microseconds; None = no pulses."""
+        """Width of the pulse being sent (us); None if no pulses are sent."""
 
 
 class ServoPlant(Protocol):
     """Servos with their load; ``advance`` is called before any target changes."""
 
     def attach(self, pulses: PulseSource) -> None:
-        """Name the controller whose pulses move the servos."""
+        """Set the controller whose pulses move the servos."""
 
     def advance(self, time_ns: int) -> None:
         """Let the servos follow their pulses up to ``time_ns``."""
@@ -195,30 +195,30 @@ class ServoPlant(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CompassReading:
-    """What the compass's sensors feel: magnetic heading and tilt, without the device's own quantisation."""
+    """True input of the compass: magnetic heading and tilt, without the device's quantisation."""
 
     heading_deg: float
     """Clockwise from magnetic north."""
     pitch_deg: float
-    """Device's sign: nose up positive."""
+    """Pitch with the device's sign: nose up positive."""
     roll_deg: float
-    """Device's sign: right side down positive."""
+    """Roll with the device's sign: right side down positive."""
     temperature_c: float
     field: tuple[float, float, float]
     """Magnetic field in the device frame, milligauss."""
     acceleration: tuple[float, float, float]
-    """In g."""
+    """Acceleration (g)."""
 
 
 class AttitudeSource(Protocol):
-    """Where a compass gets its truth from."""
+    """Source of a compass's true readings."""
 
     def compass(self, time_ns: int) -> CompassReading:
         """Reading at ``time_ns``."""
 
 
 class ImuReading(NamedTuple):
-    """What an inertial measurement unit feels, in its own axes: x forward, y left, z up."""
+    """True input of an inertial measurement unit, in its axes: x forward, y left, z up."""
 
     angular_velocity: tuple[float, float, float]
     """rad/s."""
@@ -228,45 +228,45 @@ class ImuReading(NamedTuple):
 
 
 class ImuSource(Protocol):
-    """Where an inertial measurement unit gets its truth from."""
+    """Source of an inertial measurement unit's true readings."""
 
     def imu(self, time_ns: int) -> ImuReading:
         """Reading at ``time_ns``."""
 
 
 class WheelSource(Protocol):
-    """What the encoders of the rear wheels count."""
+    """Source of the rear wheels' angles for their encoders."""
 
     def wheels(self, time_ns: int) -> tuple[float, float]:
-        """Angle of the left and of the right wheel, rad, forward positive; it grows from turn to turn."""
+        """Cumulative angles of the left and right wheel (rad), forward positive."""
 
 
 class SonarSource(Protocol):
-    """What the robot's sonars hear, by their names."""
+    """Source of the robot's sonar echoes, by sonar name."""
 
     def fire(self, name: str, time_ns: int) -> None:
-        """A sonar sends.
+        """Send a ping from a sonar.
 
         Raises:
             InputError: the robot has no sonar of that name.
         """
 
     def range(self, name: str) -> float:
-        """Distance that the newest ping of a sonar came to, m, once its sound is back; inf = no echo."""
+        """Distance measured by a sonar's latest ping (m), available once its echo is back; inf = no echo."""
 
 
 class JointSource(Protocol):
-    """The joints of a mount: a pitch joint on the body, a roll joint on it, the device on the roll joint."""
+    """Joints of a mount: a pitch joint on the body, a roll joint on the pitch joint, the device on the roll joint."""
 
     def angles(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """True pitch and roll, rad, REP 103, at rising instants of the last second; each (n,)."""
 
 
 class ViewSource(Protocol):
-    """What a camera sees."""
+    """Source of a camera's pictures."""
 
     def exposure(self, time_ns: int, size: tuple[int, int], /) -> Callable[[], NDArray[np.uint8]]:
-        """The picture of an instant: what is returned draws it, in any thread, one at a time.
+        """Return a function that draws the picture of an instant, in any thread, one at a time.
 
         Args:
             time_ns: instant of the exposure.
@@ -278,32 +278,32 @@ class ViewSource(Protocol):
 
 
 class Horn(NamedTuple):
-    """Of a servo of the lidar's mount."""
+    """Assembly of a servo in the lidar's mount."""
 
     zero: float | None
-    """Position at which the lidar is parallel to the body, steps; None = as the driver's settings say."""
+    """Position at which the lidar is parallel to the body (steps); None = value from the driver's settings."""
     direction: Literal[-1, 1] | None
-    """+1 where a rising position turns the joint positively; None = as the driver's settings say."""
+    """+1 where a rising position turns the joint positively; None = value from the driver's settings."""
 
 
 class Physics(Protocol):
-    """The simulated world, as far as devices feel it."""
+    """Simulated world as devices measure it."""
 
     @property
     def lidar(self) -> ScannedRoom:
-        """What the lidar sees."""
+        """Source of the lidar's ranges."""
 
     @property
     def view(self) -> ViewSource:
-        """What stands around the truck."""
+        """Source of camera pictures of the truck's surroundings."""
 
     @property
     def motors(self) -> tuple[MotorPlant, ...]:
-        """Of the driven shafts."""
+        """Motors of the driven shafts."""
 
     @property
     def servos(self) -> ServoPlant:
-        """Of the axles, with the inputs of their controller."""
+        """Steering servos of the axles, with the inputs of their controller."""
 
     @property
     def compass(self) -> AttitudeSource:
@@ -311,7 +311,7 @@ class Physics(Protocol):
 
     @property
     def sonars(self) -> SonarSource:
-        """Of the robot's sides."""
+        """Sonars on the robot's sides."""
 
     @property
     def imu(self) -> ImuSource:
@@ -319,39 +319,39 @@ class Physics(Protocol):
 
     @property
     def wheels(self) -> WheelSource:
-        """Rear wheels that roll along."""
+        """Rolling rear wheels."""
 
     def battery_volts(self, time_ns: int) -> float:
         """Voltage behind the battery's divider."""
 
     def horns(self) -> tuple[Horn, Horn]:
-        """How the mount's pitch and roll servo were put together."""
+        """Assembly of the mount's pitch and roll servos."""
 
     def carry_lidar(self, joints: JointSource) -> None:
-        """Put the lidar onto a mount with joints."""
+        """Attach the lidar to a mount with joints."""
 
     def mount_torque(self, joint: int) -> float:
-        """With which the lidar pushes its pitch (0) or roll (1) joint, Nm, at the newest instant of the world."""
+        """Torque of the lidar on its pitch (0) or roll (1) joint at the world's latest instant (Nm)."""
 
 
 @dataclass(frozen=True, slots=True)
 class EmulatorSetup:
-    """What an emulated device is made from."""
+    """Parts that an emulated device is built from."""
 
     role: str
     settings: Any
-    """The driver's; None = defaults."""
+    """Settings of the driver; None = defaults."""
     clock: Clock
     physics: Physics
     seed: int = 0
-    """Of the device's noise."""
+    """Seed of the device's noise."""
     port: EmulatedPort = field(default_factory=lambda: MemoryPort(""))
-    """Where it is plugged in."""
+    """Port of the device."""
     root: Path = Path()
     """Folder with proc and sys of the emulated computer."""
     offload: Offload = in_thread
-    """Where what takes long is computed."""
+    """Runs long computations."""
 
 
 EmulatorFactory = Callable[[EmulatorSetup], Any]
-"""Makes an ``Emulator``; of a monitor, a ``FileEmulator``."""
+"""Builds an ``Emulator``, or a ``FileEmulator`` for a monitor."""

@@ -1,4 +1,4 @@
-"""What drivers of inertial measurement units have in common: biases and scale taken out."""
+"""Correction shared by drivers of inertial measurement units: removal of biases and scale."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -12,7 +12,7 @@ Xyz = tuple[float, float, float]
 
 
 class ImuCorrection(Schema):
-    """What is taken out of the measurements, as calibrated; the unit's own axes."""
+    """Calibrated correction of the measurements, in the unit's axes."""
 
     rate_x: float = 0.0
     """Bias of the angular velocity, rad/s"""

@@ -23,9 +23,9 @@ class Link:
 
     Args:
         name: for error messages.
-        transmit: takes bytes to the peer.
+        transmit: sends bytes to the peer.
         hang_up: closes the underlying transport; called once.
-        baud: bits per second of the line; None where it has no rate of its own.
+        baud: baud rate of the line (bit/s); None where it has none.
     """
 
     def __init__(
@@ -43,13 +43,13 @@ class Link:
         self._lost: DeviceLostError | None = None
         self._waiting: LinkWaiter | None = None
         self._due: float | None = None
-        """Loop time at which the present wait has lasted too long."""
+        """Loop time at which the current wait times out."""
         self._alarm: asyncio.TimerHandle | None = None
         """Rings at ``_due`` or earlier; outlives its wait, because the next one most likely needs it as well."""
         self._rings = 0.0
-        """Loop time at which the alarm does."""
+        """Loop time at which the alarm rings."""
 
-    # What the transport calls
+    # Interface to the transport
 
     def feed(self, data: bytes) -> None:
         """Bytes arrived from the peer."""
@@ -70,7 +70,7 @@ class Link:
             self._alarm.cancel()
             self._alarm = None
 
-    # What the user calls
+    # Interface to the user
 
     @property
     def is_lost(self) -> bool:
@@ -138,7 +138,7 @@ class Link:
         return data
 
     def discard(self) -> int:
-        """Throw away what was received and not read; returns how many bytes."""
+        """Discard received bytes that were not read; return their number."""
         count = len(self._buffer)
         self._buffer.clear()
         return count
@@ -215,10 +215,10 @@ class LinkWaiter(Protocol):
 
 
 class _Sleeper:
-    """A coroutine that waits.
+    """Waiting coroutine.
 
     Args:
-        enough: whether what has come is worth waking for.
+        enough: whether the received bytes justify a wake-up.
     """
 
     def __init__(self, enough: Callable[[], bool]) -> None:

@@ -1,13 +1,13 @@
-"""What the daemon needs to know of a controller of driven shafts or of steering, whatever its kind."""
+"""Properties of a drive or steering controller that the daemon needs, for any kind."""
 
 from typing import Any, NamedTuple
 
 
 class MotorLimits(NamedTuple):
-    """What a motor does at most, at its own shaft; ``motor_limits`` of a drive's settings."""
+    """Limits of a motor at its shaft; ``motor_limits`` of a drive's settings."""
 
     rate: float
-    """Greatest rate, rad/s."""
+    """Maximum rate (rad/s)."""
     deceleration: float
     """Deceleration of its ordinary ramp, rad/s^2."""
     quick_deceleration: float
@@ -15,21 +15,21 @@ class MotorLimits(NamedTuple):
 
 
 def motor_limits(settings: Any) -> MotorLimits | None:
-    """Of a drive's settings; None = a kind that does not say."""
+    """Return the motor limits from a drive's settings; None if the kind does not declare them."""
     limits: MotorLimits | None = getattr(settings, "motor_limits", None)
     return limits
 
 
 class SteeringOutputs(NamedTuple):
-    """What the servos of a steering controller do; ``steering_outputs`` of its settings."""
+    """Steering outputs of a controller; ``steering_outputs`` of its settings."""
 
     reaches: tuple[tuple[float, float], ...]
     """For every servo of a ``SteeringCommand``, in its order: servo angles, rad, to the right (negative) and to the
     left. Both are 0 where the controller has no output for it."""
     dead_time: float | None
-    """From a command to the first movement of the wheels, s; None = not measured."""
+    """Dead time from a command to the first movement of the wheels (s); None = not measured."""
     lag: float | None
-    """Time constant with which the wheels then turn, s; None = not measured."""
+    """Time constant of the wheels' movement after the dead time (s); None = not measured."""
 
     @property
     def axles(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -38,12 +38,12 @@ class SteeringOutputs(NamedTuple):
 
 
 def steering_outputs(settings: Any) -> SteeringOutputs | None:
-    """Return what the servos of a device do; None if it steers nothing."""
+    """Return the steering outputs of a device; None if it steers nothing."""
     outputs: SteeringOutputs | None = getattr(settings, "steering_outputs", None)
     return outputs
 
 
 def stop_words(settings: Any) -> str | None:
-    """Return what the stop script needs to know besides kind, port and baud rate; None if it cannot stop the kind."""
+    """Return the stop script's arguments besides kind, port and baud rate; None if it cannot stop the kind."""
     words: str | None = getattr(settings, "stop_words", None)
     return words

@@ -1,4 +1,4 @@
-"""Signals of an emulated device: the values it reports and the orders it obeys, and what falsifies them.
+"""Signals of an emulated device: the values it reports, the orders it obeys, and the faults that falsify them.
 
 An emulator names its signals once and passes each value through ``report`` or ``order``; every fault of this module
 then applies to every signal. Tests and drills derive their families of faults from ``Signals.faults``.
@@ -22,7 +22,7 @@ R = TypeVar("R")
 
 
 class SignalKind(StrEnum):
-    """What a signal carries."""
+    """Content of a signal."""
 
     NUMBER = "number"
     ARRAY = "array"
@@ -42,10 +42,10 @@ COMMANDS: Final = frozenset({SignalKind.ORDER, SignalKind.SWITCH})
 
 @dataclass(slots=True)
 class Context:
-    """What a distortion may look at.
+    """Inputs of a distortion.
 
     Args:
-        newest: last true value of the signal, None if it had none.
+        newest: latest true value of the signal, None if it had none.
         neighbour: returns the last true value of the next signal of the same kind, None if it had none.
         rng: randomness.
     """
@@ -203,11 +203,11 @@ def _late(_: Context, seconds: float) -> Distortion:
 
 @dataclass(frozen=True, slots=True)
 class SignalFault:
-    """One way to falsify signals.
+    """Fault that falsifies signals.
 
     Args:
         make: builds the distortion from its context and, if it has one, its argument.
-        kinds: of the signals it fits.
+        kinds: applicable kinds of signals.
         argument: name and unit of the argument for help texts; empty = it takes none.
     """
 
@@ -234,8 +234,8 @@ FAULTS: Final[Mapping[str, SignalFault]] = {
     "lost": SignalFault(_lost, COMMANDS, "SHARE"),
     "growing": SignalFault(_growing, frozenset({SignalKind.ORDER})),
 }
-"""Every fault of a signal by name; arguments are in the signal's own unit. ``growing`` obeys an order only if its
-magnitude is not below that of the one before."""
+"""Every fault of a signal by name; arguments are in the signal's unit. ``growing`` obeys an order only if its magnitude
+is not below the previous order's magnitude."""
 
 
 HELP: Final = "of its signals: signal NAME off|" + "|".join(
@@ -248,9 +248,9 @@ class Signals:
 
     Args:
         now: returns the time, ns.
-        kinds: of the signals, by name; the order decides which are neighbours.
-        rng: the device's randomness; the faults' own is spawned from it.
-        codes: arrays in which values below a least one are codes: faults that calculate leave them as they are.
+        kinds: kinds of the signals by name; their order defines the neighbours.
+        rng: the device's randomness; the faults' randomness is spawned from it.
+        codes: arrays in which values below a minimum are codes; faults that calculate leave codes unchanged.
     """
 
     def __init__(
@@ -268,7 +268,7 @@ class Signals:
         self._greatest: dict[str, float] = {}
         self._active: dict[str, list[Distortion]] = {}
         self._due: dict[str, int] = {}
-        """Instant, ns, at which the newest late command of a signal is obeyed; later ones never overtake it."""
+        """Instant at which a signal's latest delayed command is obeyed (ns); later commands never overtake it."""
 
     def faults(self) -> Iterator[tuple[str, str]]:
         """Yield every (signal, fault) that ``inject`` accepts; ``swapped`` only where there is a neighbour."""
@@ -282,7 +282,7 @@ class Signals:
         return name in self._newest
 
     def extent(self, name: str) -> float:
-        """Greatest magnitude that a number, array or order has had so far, in its own unit; 0 = none yet."""
+        """Return the maximum magnitude of a number, array or order so far, in its unit; 0 = none yet."""
         newest = self._newest.get(name)
         return float(np.abs(newest).max()) if isinstance(newest, np.ndarray) else self._greatest.get(name, 0.0)
 
@@ -321,10 +321,10 @@ class Signals:
         return shown
 
     def order(self, name: str, value: T, obey: Callable[[T], R]) -> R | None:
-        """Obey a command with what its faults leave of ``value``.
+        """Obey a command with ``value`` as changed by the signal's faults.
 
         Returns:
-            What ``obey`` returned; None if it is called later or never.
+            The result of ``obey``; None if it is called later or never.
         """
         distortions = self._active.get(name, ())
         now, given, late = self._now(), value, 0.0

@@ -1,4 +1,4 @@
-"""Devices with a network socket of their own, reached over TCP."""
+"""Devices with a network socket, reached over TCP."""
 
 import asyncio
 import os
@@ -12,7 +12,7 @@ from monstertruck_runtime.errors import DeviceLostError
 PATIENCE: Final = 2.0
 """Seconds within which a device must accept the connection."""
 MAX_AGE: Final = 0.5
-"""Seconds after which unacknowledged bytes end the connection: more than two retransmissions on a local network."""
+"""Age at which unacknowledged bytes end the connection (s): more than two retransmissions on a local network."""
 
 
 def parse_address(text: str) -> tuple[str, int] | None:

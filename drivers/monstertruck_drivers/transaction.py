@@ -1,6 +1,6 @@
-"""Transactions over a link that go on in the very callback that brings the next bytes.
+"""Transactions over a link that resume in the callback that delivers the next bytes.
 
-A handshake byte by byte costs a coroutine a wake-up of its task per byte; here the bytes go straight to a generator.
+In a byte-by-byte handshake, a coroutine costs one task wake-up per byte; here the bytes go straight to a generator.
 """
 
 import asyncio
@@ -15,7 +15,7 @@ from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, Pro
 T = TypeVar("T")
 
 MISSES: Final = 3
-"""Exchanges in a row without a usable answer that end a session, unless a driver says otherwise."""
+"""Consecutive exchanges without a usable answer that end a session, unless a driver sets another number."""
 
 
 class Misses:
@@ -42,21 +42,21 @@ class Misses:
 
 
 class WaitFor(NamedTuple):
-    """What a transaction waits for: so many bytes within so many seconds; of size 0: that time."""
+    """Wait condition of a transaction: ``size`` bytes within a time in seconds; with size 0, the time alone."""
 
     size: int
     within: float
 
 
 Steps = Generator[WaitFor, bytes, T]
-"""Yields what it needs and is sent the bytes; ``TimeoutError`` and ``DeviceLostError`` are thrown in."""
+"""Yields wait conditions and receives the bytes; ``TimeoutError`` and ``DeviceLostError`` are thrown in."""
 
 
 class Transaction(Generic[T]):
-    """One transaction, begun at once and carried to its end whether or not a task waits for it.
+    """One transaction, started at once and run to its end whether or not a task waits for it.
 
     Args:
-        link: of which it is the only reader until it has ended.
+        link: link whose only reader is this transaction until it ends.
         steps: the transaction.
     """
 
@@ -127,7 +127,7 @@ class Transaction(Generic[T]):
 
     @contextmanager
     def _ending_by_any_error(self) -> Iterator[None]:
-        """End with an error outside ``Exception``, which a signal may raise anywhere: whoever waits must not hang."""
+        """End with an error outside ``Exception``, which a signal may raise anywhere: waiting tasks must not hang."""
         try:
             yield
         except BaseException as error:

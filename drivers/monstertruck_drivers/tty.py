@@ -1,7 +1,7 @@
-"""Serial ports of the kernel, opened and closed in threads of their own.
+"""Serial ports of the kernel, opened and closed in separate threads.
 
-Both may wait for the device: opening makes several USB transfers, of which each takes up to 5 s where the device does
-not answer; closing waits 30 s for a device that takes no bytes. Only reading and writing are done on the event loop.
+Both may wait for the device: opening makes several USB transfers of up to 5 s each if the device does not answer;
+closing waits 30 s for a device that takes no bytes. Only reading and writing run on the event loop.
 """
 
 import asyncio
@@ -28,9 +28,9 @@ from monstertruck_runtime.errors import DeviceLostError, DeviceWedgedError, Port
 from monstertruck_runtime.open_files import holders
 
 PATIENCE: Final = 2.0
-"""Seconds after which a port that the kernel is still opening or closing is reported as wedged."""
+"""Time limit for the kernel to open or close a port (s); a slower port is reported as wedged."""
 MAX_AGE: Final = 0.25
-"""Seconds without progress after which unsent bytes are outdated, and their device is wedged: more than a hub takes
+"""Time without progress after which unsent bytes are outdated and their device is wedged (s): longer than a hub takes
 to resume, about as long as the gate drives without feedback."""
 
 _PTY_MAJORS: Final = range(136, 144)
@@ -120,16 +120,16 @@ _closing: set[Future[None]] = set()
 
 @atexit.register
 def _await_last_words() -> None:
-    """Let closing ports send what was written last. The end of the process kills the threads of wedged ones."""
-    # Seconds that the end of the program waits for ports to be closed: a closing port sends what was written last.
+    """Let closing ports send their last bytes. The end of the process kills the threads of wedged ports."""
+    # Seconds that the end of the program waits for ports to close: a closing port sends its last bytes.
     last_words = 1.0
     futures.wait(_closing, last_words)
 
 
 class _PortNode:
-    """One device node of the kernel: its work of opening and closing, done one after the other.
+    """One device node of the kernel; its opens and closes run one at a time.
 
-    A node that the kernel does not let go of occupies one thread; the device gets another node when it is enumerated
+    A node that the kernel does not release occupies one thread; the device gets another node when it is enumerated
     again.
     """
 
@@ -139,10 +139,10 @@ class _PortNode:
         """Work that did not end in time."""
 
     async def open(self, name: str, make: "Callable[[], _Tty]") -> "_Tty":
-        """Run ``make`` in a thread; what it makes too late, or for a cancelled caller, is closed there.
+        """Run ``make`` in a thread; a tty made too late, or for a cancelled caller, is closed there.
 
         Args:
-            name: of the port, for error messages.
+            name: name of the port, for error messages.
             make: opens the tty.
 
         Raises:
@@ -310,7 +310,7 @@ class _Tty(serial.Serial):
         """Do not drain: that waits for the device, without limit."""
 
     def begin_closing(self) -> None:
-        """From now on an open of the node waits until this port is closed."""
+        """Make later opens of the node wait until this port is closed."""
         if self._ending is None:
             self._ending = self._node.begin()
             _closing.add(self._ending)
@@ -344,7 +344,7 @@ class _SerialProtocol(asyncio.Protocol):
         self._loop = asyncio.get_running_loop()
         self._transport = serial_asyncio.SerialTransport(self._loop, self, tty)
         self._moved = 0.0
-        """Loop time at which the device was last seen to have taken bytes."""
+        """Loop time at which the device last took bytes."""
         self._untaken = 0
         """Bytes that the kernel had for the device after the last write."""
         self._full_since = 0.0
@@ -379,9 +379,9 @@ class _SerialProtocol(asyncio.Protocol):
         self._untaken = self._tty.untaken()
 
     def _check_age(self) -> None:
-        """Give the device up if its line has been full for too long.
+        """Give up the device if its line has been full for too long.
 
-        Also after an error of reading, when the transport wants to send what it still has before it ends.
+        This also applies after a read error, when the transport tries to send its remaining bytes before it ends.
         """
         self._alarm = None
         if self._transport.get_write_buffer_size() == 0:
@@ -393,7 +393,7 @@ class _SerialProtocol(asyncio.Protocol):
             self._give_up()
 
     def _give_up(self) -> None:
-        """The device takes nothing: what waits for it is outdated."""
+        """Drop the outdated bytes of a device that takes none."""
         self.link.lose(f"its device has taken no bytes for {MAX_AGE:g} s", DeviceWedgedError)
         self._hang_up()
 

@@ -29,14 +29,14 @@ class ArduinoBridgeConfig(Schema):
     quick_deceleration: Annotated[float, Field(gt=0)] = 30.0
     """Deceleration after `m 0 0`, which takes the motors' voltage at once, as measured, rad/s^2"""
     auto_stop: Annotated[float, Field(ge=0.05, le=10)] = AUTO_STOP
-    """Seconds without a set-point after which the board stops the motors (`AUTO_STOP_INTERVAL`). Compiled into the
-    firmware, and it cannot be asked: compile it with 250 ms, and say so here"""
+    """Time without a set-point after which the board stops the motors (s, `AUTO_STOP_INTERVAL`). It is compiled into
+    the firmware and cannot be read: compile it with 250 ms, and enter that here"""
     rate: Annotated[float, Field(ge=5, le=50)] = 20.0
     """Exchanges per second"""
     answer_timeout: Annotated[float, Field(gt=0, le=0.5)] = 0.1
-    """Seconds in which an answer must come"""
+    """Timeout of an answer (s)"""
     command_timeout: Seconds = 0.25
-    """Age of the newest command at which the motors are stopped"""
+    """Age of the latest command at which the motors stop (s)"""
     boot: Annotated[float, Field(ge=0, le=10)] = 3.0
     """Longest time that a board takes to answer after its port was opened, s: most restart then"""
 
@@ -52,7 +52,7 @@ class ArduinoBridgeConfig(Schema):
 
     @property
     def motor_limits(self) -> MotorLimits:
-        """What a motor does."""
+        """Limits of a motor."""
         return MotorLimits(self.max_rate, self.deceleration, self.quick_deceleration)
 
     @property

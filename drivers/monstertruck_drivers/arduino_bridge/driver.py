@@ -27,17 +27,17 @@ Counts = tuple[int, int]
 
 
 class BoardSetpoint(NamedTuple):
-    """What the motors shall do."""
+    """Set-points of the motors."""
 
     mode: DriveMode
     command: bytes
 
 
 def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: ArduinoBridgeConfig) -> BoardSetpoint:
-    """Return what the newest commands of both shafts mean together; stale ones stop.
+    """Combine the latest commands of both shafts into set-points; stale commands stop.
 
     Args:
-        commands: newest one of both shafts, if any.
+        commands: latest command of each shaft, if any.
         now: time, ns.
         config: signs, limits and time-outs.
     """
@@ -97,10 +97,10 @@ class ArduinoBridgeDriver:
         self._outs = (out, out_2)
         self._events = events
         self._counts: list[int] = [0, 0]
-        """Counted over sessions and restarts of the board."""
-        averaged = 4  # readings over which a speed is taken: a count is much of what a slow wheel turns in one cycle
+        """Counts accumulated over sessions and restarts of the board."""
+        averaged = 4  # readings averaged for a speed: one count is much of a slow wheel's turn per cycle
         self._readings: deque[tuple[Counts, int]] = deque(maxlen=averaged + 1)
-        """Newest counters of this session, with their instants."""
+        """Latest counters of this session, with their instants."""
         self._sent = DriveMode.DISABLED
 
     async def run(self, ready: Ready) -> None:
@@ -152,7 +152,7 @@ class ArduinoBridgeDriver:
         return wanted is not DriveMode.ENABLED and wanted is not self._sent
 
     async def _until(self, due: int) -> None:
-        """Wait for the next cycle, or for a command that stops running motors; the right shaft's is the newest."""
+        """Wait for the next cycle, or for a command that stops running motors; the right shaft's is the latest."""
         while (left := due - self._clock.now()) > 0:
             last = self._commands[-1]
             if await last.next_within(left / SECOND, lambda _: not self._is_urgent()) is None or self._is_urgent():

@@ -25,14 +25,14 @@ TO_RPM: Final = 60.0
 
 
 class ArduinoBridgeEmulator:
-    """A board with two motors.
+    """Board with two motors.
 
-    Faults (``inject``): ``silent on|off`` (gives no answers), ``late SECONDS [COUNT]`` (answers), ``noise COUNT`` (so
-    many answers have a wrong byte), ``reset``, ``runaway`` (both motors disobey, see ``DisobedientMotor``).
+    Faults (``inject``): ``silent on|off`` (gives no answers), ``late SECONDS [COUNT]`` (answers), ``noise COUNT``
+    (COUNT answers have a wrong byte), ``reset``, ``runaway`` (both motors disobey, see ``DisobedientMotor``).
 
     Args:
         clock: time.
-        plants: what the motors turn; free motors take the missing places.
+        plants: loads of the motors; free motors take the missing places.
         settings: counts, auto-stop.
     """
 
@@ -41,7 +41,7 @@ class ArduinoBridgeEmulator:
     ) -> None:
         self.name = "arduino_bridge"
         self.received = ReceivedBytes()
-        """Newest bytes from the host."""
+        """Latest bytes from the host."""
         kinds = dict.fromkeys(("left", "right"), SignalKind.NUMBER)
         kinds |= dict.fromkeys(("run_left", "run_right"), SignalKind.ORDER)
         self.signals = Signals(clock.now, kinds, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""Is a board with ROSArduinoBridge on the port, and what does it count; stops the motors, which identifies it."""
+"""Detect a board with ROSArduinoBridge and read its counters; the motor stop identifies it."""
 
 from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
 from monstertruck_drivers.arduino_bridge.protocol import speeds

@@ -2,7 +2,7 @@
 
 Source: Patrick Goebel and James Nugen, ``commands.h`` and ``ROSArduinoBridge.ino``. The host sends a letter and its
 arguments, one space apart, and a carriage return; the board answers every command by one line that ends with CR and LF,
-and says nothing unasked. There is no sum and no sequence number.
+and sends nothing else. There is no checksum and no sequence number.
 
 ============== =========================================================== =================
 command        meaning                                                     answer
@@ -47,7 +47,7 @@ def pwm(left: int, right: int) -> bytes:
 ENCODERS: Final = b"e\r"
 BAUD_RATE: Final = b"b\r"
 END: Final = b"\r"
-"""Ends what a dead host left half sent."""
+"""Terminates a partial command of a dead host."""
 
 
 def counts_of(line: bytes) -> tuple[int, int] | None:

@@ -17,17 +17,17 @@ from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, Wrong
 
 
 class BoardSession:
-    """One session. Answers carry no mark of their own: what is left of an earlier one is thrown away before a question.
+    """One session. Answers carry no identifier, so leftovers of an earlier answer are discarded before each request.
 
     Args:
         link: open link.
         clock: time.
-        timeout: seconds in which an answer must come.
+        timeout: timeout of an answer (s).
     """
 
     def __init__(self, link: Link, clock: Clock, timeout: float) -> None:
         self.asked = 0
-        """When the newest question was sent, ns."""
+        """Send time of the latest request (ns)."""
         self._link = link
         self._clock = clock
         self._timeout = timeout
@@ -90,7 +90,7 @@ class BoardSession:
             self._lines = BoardLines()
 
     async def _collect(self, within: float, count: int) -> list[bytes]:
-        """Lines that come within so many seconds, at most ``count``; empty ones and refusals of noise do not count."""
+        """Collect at most ``count`` lines within ``within`` seconds, without empty lines and refusals of noise."""
         found: list[bytes] = []
         due = self._clock.now() + round(within * SECOND)
         while len(found) < count and (left := due - self._clock.now()) > 0:

@@ -47,7 +47,7 @@ class AlarmConfig(Schema):
     """Seconds a joint rests after an alarm; doubled while it trips again."""
     rest_max: Positive = 60.0
     settled_after: Positive = 30.0
-    """Seconds of holding after which the rest starts from ``rest`` again."""
+    """Time of holding after which the next rest starts from ``rest`` again (s)."""
     cool_below: Annotated[int, Field(ge=0, le=100)] = 60
     """Degrees Celsius a joint must have reached."""
 
@@ -65,11 +65,11 @@ class Ax12Config(Schema):
     pitch: JointConfig = JointConfig(id=1, zero=511, min_position=409, max_position=613)
     roll: JointConfig = JointConfig(id=2, zero=204, min_position=102, max_position=306)
     speed: Annotated[float, Field(gt=0, le=1023 * SPEED_UNIT)] = 4.0
-    """Greatest speed of a joint, rad/s."""
+    """Maximum speed of a joint (rad/s)."""
     margin: Annotated[int, Field(ge=0, le=255)] = 1
     """Steps from the goal within which a joint is content."""
     slope: Literal[2, 4, 8, 16, 32, 64, 128] = 32
-    """Steps from the goal at which a joint gives its full torque."""
+    """Distance from the goal at which a joint applies full torque (steps)."""
     rate: Annotated[float, Field(gt=0, le=100)] = 25.0
     """Times a second both joints are read; an adapter at its usual latency of 16 ms allows 31."""
     check_interval: Positive = 1.0
@@ -81,7 +81,7 @@ class Ax12Config(Schema):
     usb_latency: Annotated[float, Field(ge=0, le=0.255)] = 0.016
     """Latency timer of the adapter, s; 0.001 only where that is confirmed."""
     command_timeout: Annotated[float, Field(gt=0, le=5)] = 0.5
-    """Seconds after which joint goals are stale and not obeyed: the joints hold."""
+    """Age at which joint goals are stale (s): they are ignored and the joints hold."""
     alarm: AlarmConfig = AlarmConfig()
 
     @model_validator(mode="after")
@@ -96,7 +96,7 @@ class Ax12Config(Schema):
         return max(1, round(self.speed / SPEED_UNIT))
 
     def timeout(self, size: int, baud: int = AX12_BAUD) -> float:
-        """Seconds to wait for an exchange of ``size`` bytes: line, return delay, and the adapter both ways."""
+        """Timeout of an exchange of ``size`` bytes (s): line, return delay, and the adapter in both directions."""
         timeout_min = 0.005  # seconds; below that a busy host misses answers that came in time
         scheduling = 0.002  # seconds a host may take in addition to line and adapter
         return max(timeout_min, size * 10 / baud + self.return_delay + 2 * self.usb_latency + scheduling)

@@ -19,19 +19,19 @@ from monstertruck_schemas.sensor import StabiliserFeedback, StabiliserJoint, Tor
 STORED: Final = 19
 """Bytes of settings from the start of the control table."""
 ANSWERS_ALL: Final = b"\x02"
-"""Status level at which writes are answered too."""
+"""Status level at which units also answer writes."""
 
 
 class Joint:
-    """Keeps one unit holding; time passes only in ``join`` and ``poll``.
+    """Keeps one unit holding its goal; time passes only in ``join`` and ``poll``.
 
     **Alarms.** An overload or overheated unit sets its own torque limit to 0 and goes limp; it answers as before, and
-    its error bits may clear although it stays limp. So the torque settings are looked at when the bits change and
-    once in a while. After a rest, once cool, the unit gets torque again: its goal becomes its present position
-    first, or it would jump.
+    its error bits may clear although it stays limp. So the driver reads the torque settings when the bits change
+    and from time to time. After a rest, once cool, the unit gets torque again; its goal is first set to its current
+    position, or it would jump.
 
-    **Motion without a goal.** A load pushes a joint away from its goal against the unit's torque. A unit whose own
-    torque points away from its goal, and which moves there, does not obey: it loses its torque.
+    **Motion without a goal.** A load pushes a joint away from its goal against the unit's torque. A unit whose
+    torque points away from its goal, and which moves that way, does not obey: the driver removes its torque.
 
     Args:
         name: ``pitch`` or ``roll``.
@@ -60,7 +60,7 @@ class Joint:
         self.forget()
 
     def forget(self) -> None:
-        """A session starts: nothing is known of the unit, whose rest after alarms goes on all the same."""
+        """Forget the unit's state at the start of a session; its rest after alarms continues."""
         self.torque = TorqueState.ABSENT
         self._present: Present | None = None
         self._error = Alarm(0)
@@ -73,11 +73,11 @@ class Joint:
         self._max_torque = p.MAX_TORQUE.default
         self._outage = False
         self._goal: int | None = None
-        """Newest goal sent, steps."""
+        """Latest goal sent (steps)."""
         self._straying = 0
-        """Newest readings in which it drove itself away from its goal."""
+        """Number of latest readings in which the unit drove itself away from its goal."""
 
-    # What is known
+    # Known state
 
     @property
     def angle(self) -> float | None:
@@ -108,7 +108,7 @@ class Joint:
     # Exchanges
 
     async def join(self, session: Ax12Session, retries: int = RETRIES) -> None:
-        """Make sure that the unit is there and what is configured; the next ``poll`` makes it hold.
+        """Check that the unit is present and matches the configuration; the next ``poll`` makes it hold.
 
         Raises:
             DeviceLostError: unplugged.
@@ -133,11 +133,11 @@ class Joint:
         self._hold_at = 0
 
     async def poll(self, session: Ax12Session) -> None:
-        """Read the unit, and do what it needs.
+        """Read the unit and act on its state.
 
         Raises:
             DeviceLostError: unplugged.
-            WrongDeviceError: the unit came back as another one.
+            WrongDeviceError: the unit came back as a different unit.
             DeviceMismatchError: the same, in its settings.
         """
         try:
@@ -156,21 +156,21 @@ class Joint:
             self._miss(str(error))
 
     def _is_straying(self, before: Present, present: Present) -> bool:
-        """Whether the unit drives itself away from its goal, in three readings one after the other."""
+        """Whether the unit drives itself away from its goal, in three consecutive readings."""
         if self.torque is not TorqueState.HOLDING or self._goal is None:
             self._straying = 0
             return False
         gap, gap_before = present.position - self._goal, before.position - self._goal
         driven = present.load * gap > 0 and abs(gap) > max(abs(gap_before), self._config.margin)
         self._straying = self._straying + 1 if driven else 0
-        strays = 3  # readings in which a unit drives itself away from its goal after which it loses its torque
+        strays = 3  # readings of a unit that drives itself away from its goal, after which it loses its torque
         return self._straying >= strays
 
     async def _stop_straying(self, session: Ax12Session, present: Present) -> None:
-        """Take the unit's torque away for a rest; read back, as a late answer may be that of an earlier write.
+        """Remove the unit's torque for a rest; read it back, as a late answer may belong to an earlier write.
 
         Raises:
-            DeviceTimeoutError, ProtocolError: it does not say that its torque is off; the next reading repeats it.
+            DeviceTimeoutError, ProtocolError: the unit does not confirm torque off; the next reading repeats it.
         """
         await session.write(self.id, p.TORQUE_ENABLE, b"\x00")
         enabled, *_ = await self._settings(session, RETRIES)
@@ -295,15 +295,15 @@ class Joint:
 
 
 class Ax12Driver:
-    """Passes joint goals on as they come, by one sync write for both units, and reads both in between.
+    """Forwards joint goals as they arrive, in one sync write for both units, and reads both in between.
 
-    The units have no watchdog: they hold their last goal when goals stop or the session ends. A unit that does not
-    answer leaves the other one working; when none answers, the session is lost (12 V rail or bus).
+    The units have no watchdog: they hold their last goal when goals stop or the session ends. If one unit does
+    not answer, the other keeps working; if none answers, the session is lost (12 V rail or bus).
 
     Args:
         config: calibration, rates, time-outs, alarms.
         port: the adapter's port, at 1 Mbaud.
-        clock: time; the goals' stamps are of the same clock.
+        clock: time, also the clock of the goals' stamps.
         commands: joint goals.
         out: feedback, joint angles in rad, REP 103 signs.
         events: alarms, losses and returns of the units.
@@ -336,7 +336,7 @@ class Ax12Driver:
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: no unit answers.
-            WrongDeviceError: another device answers, or units that are no AX-12A.
+            WrongDeviceError: another device answers, or units other than AX-12A.
             DeviceMismatchError: a unit's own limits contradict the configuration.
             PortBusyError: another process holds the port.
         """

@@ -29,27 +29,27 @@ KNOWN: Final = (
 
 
 class Ax12Bus:
-    """Up to six units on one half-duplex line; ``end.baud = 1_000_000`` makes exchanges as long as real ones.
+    """Up to six units on one half-duplex line; ``end.baud = 1_000_000`` gives exchanges their real duration.
 
-    The adapter lives from USB, the units from the 12 V rail: unplugging leaves them as they are, ``power off``
-    silences all of them while the port stays. Two units with one number both answer, and garble each other's answers.
+    USB powers the adapter, the 12 V rail the units: unplugging does not affect the units, ``power off`` silences them
+    all while the port stays. Two units with one number both answer and garble each other.
     Faults (``inject``): ``vanish ID``, ``return ID``, ``power on|off``, ``block ID on|off``, ``freeze ID on|off``
     (position sensor), ``heat ID CELSIUS``, ``voltage VOLTS|source``, ``trip ID`` (overload now), ``stray ID
-    POSITION|off`` (turns there instead of to its goal), ``reset ID`` (factory), ``renumber ID NEW``, ``latch on|off``
-    (error bits outlast their cause), ``echo on|off``, and for the next ``COUNT`` (1) answers ``mute``, ``double``,
-    ``truncate``, ``garble`` and ``late SECONDS``.
+    POSITION|off`` (turns to POSITION instead of its goal), ``reset ID`` (factory), ``renumber ID NEW``,
+    ``latch on|off`` (error bits outlast their cause), ``echo on|off``, and for the next ``COUNT`` (1) answers ``mute``,
+    ``double``, ``truncate``, ``garble`` and ``late SECONDS``.
 
     Args:
         clock: time.
         ids: numbers of the units.
-        seed: of what a collision makes of the answers.
-        echo: the adapter gives back every byte it is sent.
-        latency_s: what the adapter adds to everything it passes to the host.
-        host_baud: rate the host opens the port with; units set to another one receive nothing.
+        seed: seed of the damage by collisions of answers.
+        echo: the adapter echoes every byte it receives from the host.
+        latency_s: latency that the adapter adds towards the host (s).
+        host_baud: baud rate of the host's port; units set to another rate receive nothing.
         answers_damage: whether a request with a wrong sum is answered (checksum error bit) or ignored.
-        positions: of the shafts at the start, steps per unit number; 512 where not named.
-        load: what pushes the shafts.
-        voltage: supply at the units.
+        positions: initial positions of the shafts by unit number (steps); default 512.
+        load: load on the shafts.
+        voltage: supply voltage at the units.
 
     Raises:
         InputError: too many units, or a bad number.
@@ -96,7 +96,7 @@ class Ax12Bus:
             for number, ident in enumerate(ids, 1)
         ]
 
-    # What the world calls
+    # Interface to the simulated world
 
     def angle(self, ident: int, time_ns: int) -> float:
         """Shaft of a unit, rad, counter-clockwise positive, 0 at position 0; see ``angles``."""
@@ -198,7 +198,7 @@ class Ax12Bus:
         while True:
             data = await end.read()
             now = self._clock.now()
-            if now - heard > 100_000_000:  # nanoseconds of silence inside a packet after which a unit gives it up
+            if now - heard > 100_000_000:  # silence inside a packet after which a unit drops it (ns)
                 parser = Ax12Parser()
             heard = now
             self.received.extend(data)

@@ -1,4 +1,4 @@
-"""Who is on the bus, and what does it read: without moving anything."""
+"""Find the units on the bus and read them, without motion."""
 
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import Ax12Config
@@ -9,12 +9,12 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 
 IDS = range(1, 7)
-"""Numbers requested: those of the robot's bus."""
+"""Unit numbers to ping: the numbers on the robot's bus."""
 STORED = 19
 
 
 async def probe(port: Port, clock: Clock, settings: Ax12Config | None = None) -> dict[str, object]:
-    """Ping units 1 to 6 at 1 Mbaud and read settings and state of those that answer.
+    """Ping units 1 to 6 at 1 Mbaud and read settings and state of the units that answer.
 
     Returns:
         JSON-able: ``device``, ``port``, ``echo`` of the adapter, ``units``: per unit its id, model, firmware, limits,

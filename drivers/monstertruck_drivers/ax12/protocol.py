@@ -14,7 +14,7 @@ BROADCAST: Final = 254
 """Unit number that all units execute and none answers."""
 ID_MAX: Final = 253
 LONGEST_PACKET: Final = 150
-"""Greatest length byte a parser waits for; what lies beyond is taken for damage."""
+"""Maximum length byte a parser waits for; higher values are treated as damage."""
 AX12_BAUD: Final = 1_000_000
 MODEL: Final = 12
 """Model number of an AX-12A."""
@@ -34,7 +34,7 @@ DELAY_UNIT: Final = 2e-6
 
 
 class Instruction(IntEnum):
-    """What a request asks for."""
+    """Instruction of a request."""
 
     PING = 0x01
     READ = 0x02
@@ -73,7 +73,7 @@ class Register:
     size: int = 1
     default: int = 0
     high: int = 255
-    """Greatest value a write may hold."""
+    """Maximum value of a write."""
     read_only: bool = False
 
     @property
@@ -168,12 +168,12 @@ class Present:
 
     @classmethod
     def decode(cls, data: bytes) -> Self:
-        """From ``PRESENT_SIZE`` bytes."""
+        """Decode ``PRESENT_SIZE`` bytes."""
         return cls(word(data), from_sign_bit(word(data, 2)), from_sign_bit(word(data, 4)), data[6], data[7])
 
 
 def checksum(body: bytes) -> int:
-    """Of everything between header and sum."""
+    """Checksum over everything between header and sum."""
     return ~sum(body) & 0xFF
 
 
@@ -224,13 +224,13 @@ def sync_write(start: Register, data: Mapping[int, bytes]) -> bytes:
 
 
 class Ax12Parser:
-    """Bytes in, packets out, however they are cut; bounded by one packet.
+    """Extracts packets from bytes, however they are cut; buffers at most one packet.
 
-    Nothing is stuffed: a header may occur inside parameters. So packets are taken by their length and proven by
-    their sum; after a failure the search goes on one byte further.
+    The protocol has no byte stuffing: a header may occur inside parameters. The parser therefore takes packets by
+    length and verifies their sum; after a failure it continues the search one byte further.
 
     Args:
-        longest: greatest valid length byte.
+        longest: maximum valid length byte.
     """
 
     def __init__(self, longest: int = LONGEST_PACKET) -> None:

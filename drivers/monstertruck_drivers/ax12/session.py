@@ -37,7 +37,7 @@ class Ax12Session:
     def __init__(self, link: Link, clock: Clock, timeout: Callable[[int, int], float]) -> None:
         self.echo = False
         self.strange = 0
-        """Bytes received that were no part of a correct packet."""
+        """Number of received bytes outside correct packets."""
         self._link = link
         self._clock = clock
         self._timeout = timeout
@@ -130,7 +130,7 @@ class Ax12Session:
         raise DeviceTimeoutError(f"{self._link.name}: unit {unit}: no correct answer")
 
     async def _catch_up(self, unit: int) -> bool:
-        """Ping, whose answer has no data: answers come in order, so what was late has come before it."""
+        """Ping, whose answer has no data: answers arrive in order, so late answers arrive before it."""
 
         def wanted(packet: Packet) -> bool:
             return packet.unit == unit and not packet.params

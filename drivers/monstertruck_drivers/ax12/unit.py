@@ -57,12 +57,12 @@ class Unit:
 
     Args:
         ident: number on the bus.
-        position: of the shaft, steps.
-        time_ns: now.
-        load: what pushes the shaft.
-        voltage: supply.
-        signals: of the whole bus.
-        number: its position on the bus, from 1 on: its signals end with it.
+        position: position of the shaft (steps).
+        time_ns: current time.
+        load: load on the shaft.
+        voltage: supply voltage.
+        signals: signals of the whole bus.
+        number: position on the bus, from 1; the suffix of its signals.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Unit:
         self._past: deque[tuple[int, float]] = deque([(time_ns, position)], maxlen=history)
         self._table = bytearray(p.TABLE_SIZE)
         self._values: dict[int, int] = {}
-        """Of the registers, by their address: the same as in the table."""
+        """Register values by address, as in the register table."""
         self.factory_reset()
         self.put(p.ID, ident)
 
@@ -352,7 +352,7 @@ class Unit:
 
 
 def steady_voltage(_: int) -> float:
-    """As from a good 12 V converter."""
+    """Supply voltage of a good 12 V converter."""
     return 11.1
 
 

@@ -1,4 +1,4 @@
-"""Configuration of the battery: the pack, when it counts as low, critical or overcharged, and where it is measured."""
+"""Battery settings: the pack, its limits for low, critical and overcharged, and the measuring converter."""
 
 from itertools import pairwise
 from typing import Annotated, Literal, Self
@@ -12,11 +12,11 @@ Seconds = Annotated[float, Field(ge=0, le=60)]
 
 
 class PackConfig(Schema):
-    """A lithium-polymer pack and its limits; the default is 6S.
+    """Lithium-polymer pack and its limits; the default is 6S.
 
-    Low, critical, clear and overcharged are compared with the voltage at rest (the measured one plus what the
-    motor's current costs), collapsed with the measured one. A pack is distinguished from a wrong scale only by the
-    scale's own calibration: 5 % of error make a full pack overcharged.
+    Low, critical, clear and overcharged are compared with the voltage at rest (the measured voltage plus the sag from
+    the motor's current), collapsed with the measured voltage. Only the calibration of the scale distinguishes a pack
+    from a wrong scale: an error of 5 % makes a full pack overcharged.
     """
 
     cells: Annotated[int, Field(ge=1, le=14)] = 6
@@ -26,7 +26,7 @@ class PackConfig(Schema):
     """Ohm of cells and wiring, for the sag; 5 to 15 milliohm per cell are usual. Fit it from a start of the motor: with
     half the true value the charge reads up to 0.2 too low at 100 W"""
     max_compensation: Volts = 1.5
-    """Greatest sag the motor's current may explain: a wrong current shall not hide an empty pack"""
+    """Maximum sag attributed to the motor's current, so that a wrong current cannot hide an empty pack"""
     smoothing: Seconds = 5.0
     """Time constant of the published voltages."""
     low: Volts = 22.0
@@ -78,6 +78,6 @@ class IioConfig(PackConfig):
     offset: float = 0.0
     """Volts added to the pack's voltage"""
     full_scale: Annotated[int, Field(gt=0)] | None = None
-    """Greatest reading of the converter; None = from its scan element, or unknown"""
+    """Maximum reading of the converter; None = from its scan element, or unknown"""
     rate: Annotated[float, Field(gt=0, le=50)] = 10.0
     """Readings a second"""

@@ -15,11 +15,11 @@ class IioBatteryDriver:
 
     Args:
         config: pack, converter, divider.
-        computer: whose converter; files are read off the loop, as a conversion over I2C takes milliseconds.
+        computer: computer with the converter; files are read off the loop, as an I2C conversion takes milliseconds.
         clock: time.
         out: battery messages.
-        events: gets an event when the battery's level changes.
-        drive: the motor's feedback, whose current explains the sag; None = not used.
+        events: changes of the battery's level.
+        drive: motor feedback, whose current explains the sag; None = unused.
         name: service name.
     """
 
@@ -45,7 +45,7 @@ class IioBatteryDriver:
 
         Raises:
             DeviceLostError: no such converter, or it vanished.
-            DeviceMismatchError: it has no such channel, or several converters are there and none is named.
+            DeviceMismatchError: the converter lacks the channel, or there are several and none is configured.
             DeviceTimeoutError: it does not answer, three readings in a row.
             ProtocolError: no numbers, three readings in a row.
             PortBusyError: another process streams from it.

@@ -50,7 +50,7 @@ class Channel:
     offset: float
     """Counts."""
     full_scale: int | None
-    """Greatest reading; None = unknown."""
+    """Maximum reading; None = unknown."""
 
     def read(self) -> int:
         """Counts.
@@ -157,7 +157,7 @@ def _shared(folder: Path, stem: str, attribute: str) -> float | None:
 
 
 def _full_scale(file: Path) -> int | None:
-    """From a scan element's type, such as ``le:s12/16>>4``."""
+    """Parse the maximum reading from a scan element's type, such as ``le:s12/16>>4``."""
     match = _SCAN_TYPE.match(read_text(file)) if file.exists() else None
     if match is None:
         return None

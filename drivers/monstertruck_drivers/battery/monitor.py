@@ -1,4 +1,4 @@
-"""From voltage samples to messages and events, for every driver that measures the battery."""
+"""Battery monitor: turns voltage samples into messages and events, for every driver that measures the battery."""
 
 import math
 import statistics
@@ -16,9 +16,9 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback
 
 MEDIAN_WINDOW: Final = 5
-"""Samples of the median: shorter spikes and connector bounces do not count."""
+"""Window of the median filter (samples): rejects shorter spikes and connector bounces."""
 GAP: Final = SECOND
-"""Nanoseconds without a sample after which nothing counts as continuous any more."""
+"""Time without a sample after which all durations restart (ns)."""
 
 CELL_VOLTS: Final = (
     3.27, 3.61, 3.69, 3.71, 3.73, 3.75, 3.77, 3.79, 3.80, 3.82, 3.84,
@@ -40,13 +40,13 @@ def charge_of(cell_volts: float) -> float:
 
 
 class BatteryVerdict(NamedTuple):
-    """What is known of the battery after a sample."""
+    """State of the battery after a sample."""
 
     level: BatteryLevel
     voltage: float | None = None
     """Smoothed, V; None while the sensor is at fault or too few samples came."""
     rest_voltage: float | None = None
-    """As ``voltage``, without the sag."""
+    """``voltage`` without the sag (V)."""
 
 
 class BatteryJudge:
@@ -72,10 +72,10 @@ class BatteryJudge:
         """Take one sample.
 
         Args:
-            time_ns: when it was taken; must not go back.
+            time_ns: time of the sample; must not go back.
             voltage: pack voltage, V; NaN = the converter was at an end of its scale.
-            current: the motor's, A, either sign; None = unknown, no sag is taken out. The pack's own current is
-                smaller while the motor is slow, and has the electronics' added: both are within the table's error.
+            current: motor current (A), either sign; None = unknown, no sag is removed. The pack current is smaller at
+                low motor speed, and includes the electronics: both effects are within the table's error.
         """
         elapsed = 0 if self._last is None else time_ns - self._last
         if elapsed > GAP:
@@ -110,7 +110,7 @@ class BatteryJudge:
         critical = self._critical.update(time_ns, rest < config.critical)
         collapsed = self._collapsed.update(time_ns, loaded < config.collapsed)
         clear = self._clear.update(time_ns, rest > config.clear)
-        # Judged by what was measured: a guess of the sag must not make a full pack overcharged.
+        # Judge the measured voltage: an estimated sag must not make a full pack look overcharged.
         self._over.update(time_ns, loaded)
         if critical or collapsed:
             return BatteryLevel.CRITICAL
@@ -122,7 +122,7 @@ class BatteryJudge:
 
 
 CURRENT_VALID: Final = SECOND // 2
-"""Nanoseconds for which a motor current explains the sag."""
+"""Time for which a motor current explains the sag (ns)."""
 
 LEVEL_EVENTS: Final = {
     BatteryLevel.NORMAL: (Reason.OK, Severity.INFO),
@@ -187,7 +187,7 @@ class BatteryMonitor:
         )
 
     def _motor_current(self, stamp: int) -> float | None:
-        """Newest current; not every feedback carries one."""
+        """Return the latest current; not every feedback carries one."""
         feedback = self._drive.latest if self._drive is not None else None
         if feedback is not None and feedback.current is not None:
             self._current, self._current_at = feedback.current, feedback.stamp

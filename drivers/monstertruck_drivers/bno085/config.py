@@ -11,12 +11,12 @@ from monstertruck_schemas.base import FrameId, Schema
 class Bno085Config(Schema):
     """CEVA BNO085 in UART-RVC mode (PS0 high, PS1 low): tilt, specific force, turn rate from its heading.
 
-    Its heading counts from power-up and drifts by half a degree a minute: it is no compass.
+    Its heading is relative to power-up and drifts by half a degree a minute, so it does not replace a compass.
     """
 
     kind: Literal["bno085"] = "bno085"
     average: Annotated[int, Field(ge=1, le=20)] = 2
-    """Frames of which one message is the mean; the unit sends 100 a second"""
+    """Frames averaged in one message; the unit sends 100 frames a second"""
     delay: Annotated[float, Field(ge=0, le=0.5)] = 0.006
     """Age of a measurement when the last byte of its frame arrives, s: 19 bytes and the unit's filter"""
     silence: Annotated[float, Field(gt=0, le=10)] = 0.3
@@ -24,7 +24,7 @@ class Bno085Config(Schema):
     stuck_after: Annotated[int, Field(ge=2, le=10_000)] = 100
     """Frames in a row with the same acceleration to the last bit that end the session: sensors are never so quiet"""
     gravity_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.2
-    """Share of 1 g by which the acceleration may differ before roll and pitch stop being tilt"""
+    """Tolerance of the acceleration (fraction of 1 g); beyond it, roll and pitch are not tilt"""
     correction: ImuCorrection = ImuCorrection()
     """Biases and scale of this unit"""
     frame: FrameId = "base"

@@ -16,13 +16,13 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import STANDARD_GRAVITY, Attitude, Imu
 
 LONGEST_GAP: Final = 10
-"""Frames that may be missing between two of which a turn rate is computed: at 10 rad/s half a turn is 31 frames."""
+"""Maximum number of frames missing between the two of a turn rate; at 10 rad/s half a turn is 31 frames."""
 
 
 def body_rates(before: RvcFrame, after: RvcFrame) -> Xyz | None:
-    """Return the angular velocity between two frames, rad/s, in the unit's axes; None if they are one, or far apart.
+    """Return the angular velocity between two frames (rad/s) in the unit's axes; None if they are equal or far apart.
 
-    The unit's own clock counts: the index says how many hundredths of a second lie between.
+    The time base is the unit's clock: the index gives the hundredths of a second between the frames.
     """
     steps = (after.number - before.number) % INDICES
     if not 0 < steps <= LONGEST_GAP:
@@ -39,17 +39,17 @@ def body_rates(before: RvcFrame, after: RvcFrame) -> Xyz | None:
 
 
 class Bno085Driver:
-    """Listens; the unit cannot be asked anything.
+    """Receives the unit's stream; the unit accepts no requests.
 
     Args:
         config: averaging and checks.
-        port: where it hangs.
+        port: port of the unit.
         clock: time.
-        out: angular velocity and specific force, in the unit's own axes.
-        attitude: tilt, with a heading that counts from power-up and is marked as not to be trusted; None where a
-            compass measures it.
-        events: frames that are missing.
-        name: of the service, and of the frame.
+        out: angular velocity and specific force, in the unit's axes.
+        attitude: tilt, with a heading relative to power-up that is marked as untrustworthy; None where a compass
+            measures it.
+        events: missing frames.
+        name: name of the service and of the frame.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class Bno085Driver:
         newest = received - round(config.delay * SECOND)
         self._out.put(
             Imu(
-                # A rate is that of the middle between two frames, and the mean that of the middle of its rates.
+                # A rate applies to the middle between two frames, the mean to the middle of its rates.
                 stamp=newest - len(rates) * SECOND // (2 * RATE),
                 received=received,
                 seq=self._out.next_seq(),

@@ -22,15 +22,15 @@ REPORTED: Final = ("yaw", "pitch", "roll", "x", "y", "z")
 
 
 class Bno085Emulator:
-    """A unit that streams.
+    """Streaming unit.
 
-    Faults (``inject``): ``frozen on|off`` (the same measurement again and again, the index goes on), ``silent on|off``,
-    ``bad_checksum N`` (the next so many frames), ``skip N`` (so many frames are not sent), ``half_frame``, ``reset``.
+    Faults (``inject``): ``frozen on|off`` (repeats one measurement, the index continues), ``silent on|off``,
+    ``bad_checksum N`` (the next N frames), ``skip N`` (N frames are not sent), ``half_frame``, ``reset``.
 
     Args:
         clock: time.
         source: physics.
-        seed: of noise and drift.
+        seed: seed of noise and drift.
     """
 
     def __init__(self, clock: Clock, source: ImuSource, *, seed: int = 0) -> None:
@@ -51,7 +51,7 @@ class Bno085Emulator:
         """Supply off and on: heading and index begin at 0."""
         self._index, self._yaw = 0, 0.0
         self._turning = 0.0
-        """Newest turn rate, rad/s."""
+        """Latest turn rate (rad/s)."""
         self._tilt: tuple[float, float] | None = None
         self._last: RvcFrame | None = None
         self._torn = True
@@ -113,7 +113,7 @@ class Bno085Emulator:
         self._turning = turning
         x, y, z = reading.acceleration
         felt = atan2(-x, hypot(y, z)), atan2(y, z)
-        fusion = 0.5  # time constant with which pitch and roll follow the accelerometer's vertical, s
+        fusion = 0.5  # time constant of pitch and roll following the accelerometer's vertical (s)
         share = 1.0 if self._tilt is None else 1.0 - exp(-1.0 / (RATE * fusion))
         pitch, roll = self._tilt or felt
         roll_rate, pitch_rate, _ = (rate / RATE for rate in reading.angular_velocity)

@@ -1,6 +1,6 @@
 """Frames of the BNO085's UART-RVC mode (CEVA, "BNO08X Data Sheet", section 1.3.5.2).
 
-A frame has 19 bytes, a hundred times a second, unasked: AA AA, an index that counts frames, yaw, pitch and roll in
+The unit streams 100 frames a second, of 19 bytes each: AA AA, an index that counts frames, yaw, pitch and roll in
 0.01 degree, acceleration along x, y and z in 0.001 g, each signed with the low byte first, three reserved bytes, and
 the sum of the sixteen bytes from the index on. The unit takes no commands in this mode.
 """
@@ -28,7 +28,7 @@ class RvcFrame(NamedTuple):
     """Raw numbers of one frame."""
 
     number: int
-    """Of the frame: the index, which wraps at 256."""
+    """Index of the frame, which wraps at 256."""
     yaw: int
     """0.01 degree since power-up, -18000 to 18000."""
     pitch: int

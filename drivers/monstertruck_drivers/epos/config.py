@@ -1,4 +1,4 @@
-"""What a configuration file may say about the drive controller."""
+"""Settings of the drive controller in the configuration file."""
 
 import math
 from typing import Annotated, Literal
@@ -15,7 +15,7 @@ RpmPerSecond = Annotated[int, Field(gt=0, lt=2**31)]
 class EposConfig(Schema):
     """Drive controller EPOS 24/1 in profile velocity mode.
 
-    The defaults are the truck's: 18000 rpm are 0.22 m/s; 82000 rpm/s are 1 m/s^2 (ratio 644, wheel radius 75 mm).
+    The defaults suit the truck: 18000 rpm are 0.22 m/s; 82000 rpm/s are 1 m/s^2 (ratio 644, wheel radius 75 mm).
     """
 
     kind: Literal["epos"] = "epos"
@@ -28,9 +28,9 @@ class EposConfig(Schema):
     """Set points are limited to this; also written to the controller as its own limit."""
     acceleration_rpm_s: RpmPerSecond = 60_000
     deceleration_rpm_s: RpmPerSecond = 200_000
-    """2.4 m/s^2, less than what makes the slipper clutch slip; the wheels follow the motor some 0.1 s later."""
+    """2.4 m/s^2, below the limit of the slipper clutch; the wheels follow the motor some 0.1 s later."""
     quick_stop_deceleration_rpm_s: RpmPerSecond = 240_000
-    """From full speed to rest in 0.08 s."""
+    """Quick stop deceleration: full speed to rest in 0.08 s."""
 
     encoder_pulses_per_turn: Annotated[int, Field(gt=0, le=65_535)] | None = 500
     """Encoder pulses per motor turn (counts / 4); None = use the controller's own setting."""
@@ -42,9 +42,9 @@ class EposConfig(Schema):
     status_period: Seconds = 0.1
     current_period: Annotated[float, Field(gt=0, le=2)] = 0.2
     command_timeout: Seconds = 0.25
-    """Age of the last command at which the target becomes 0."""
+    """Age of the last command at which the target becomes 0 (s)."""
     quick_stop_after: Seconds = 1.0
-    """Age of the last command at which the controller is commanded to quick stop."""
+    """Age of the last command at which the driver commands a quick stop (s)."""
     standstill_rpm: Annotated[int, Field(ge=1)] = 60
     """Slower than this counts as at rest."""
 
@@ -56,7 +56,7 @@ class EposConfig(Schema):
 
     @property
     def motor_limits(self) -> MotorLimits:
-        """What the motor does."""
+        """Limits of the motor."""
         rpm = 2 * math.pi / 60
         return MotorLimits(
             self.max_motor_rpm * rpm, self.deceleration_rpm_s * rpm, self.quick_stop_deceleration_rpm_s * rpm

@@ -1,13 +1,12 @@
 """Drive service: the EPOS 24/1 in profile velocity mode behind ``cmd/drive`` and ``sensor/drive``.
 
-Everything goes through one schedule of exchanges; before each of them the newest command is looked at, so a stop
-waits for at most the exchange in flight. Quick stop and power off are sent again after every velocity that is not
-standstill: a controller that did not take the first one gets it again. What the controller should do and where its
-statusword says it is are compared every cycle, and one controlword brings it a step closer: enabling, stopping,
-running again after a quick stop and coming back from a fault are one and the same loop.
+All exchanges share one schedule. The driver checks the latest command before each exchange, so a stop waits at most for
+the exchange in flight. It repeats quick stop and power off after every velocity other than standstill, in case the
+controller missed the first one. Every cycle it compares the desired state with the statusword and sends one controlword
+that brings the controller a step closer: one loop enables, stops, runs after a quick stop and recovers from faults.
 
-The controller keeps its last speed when the host goes silent. So the first bytes of every session are a quick stop,
-and the last ones are a quick stop and power stage off.
+The controller keeps its last speed when the host goes silent. Every session therefore starts with a quick stop and ends
+with a quick stop and power stage off.
 """
 
 import math
@@ -42,22 +41,22 @@ RAD_S_PER_RPM = 2 * math.pi / 60
 
 
 class Setpoint(NamedTuple):
-    """What the controller shall do: a power state, and the target of ENABLED."""
+    """Desired state of the controller: a power state, and the target of ENABLED."""
 
     goal: State
     rpm: int = 0
 
 
 def setpoint_of(command: DriveCommand | None, now: int, config: EposConfig) -> Setpoint:
-    """What the newest command means at ``now``; the host's deadman is here.
+    """Return the set-point of the latest command at ``now``; implements the host's deadman.
 
     Args:
-        command: newest command, if any.
+        command: latest command, if any.
         now: time, ns.
         config: sign, limits and time-outs.
 
     Returns:
-        ENABLED with a target in the controller's own sign, QUICK_STOP, or SWITCH_ON_DISABLED.
+        ENABLED with a target in the controller's sign, QUICK_STOP, or SWITCH_ON_DISABLED.
     """
     if command is None or command.action is DriveAction.DISABLE:
         return Setpoint(State.SWITCH_ON_DISABLED)
@@ -96,7 +95,7 @@ class Odometer:
         self.counts = 0
         """Counts since the daemon started, controller's sign."""
         self._last: tuple[int, int] | None = None
-        """Newest position of the controller, and when it was read, ns."""
+        """Latest position of the controller, and its read time (ns)."""
 
     def update(self, raw: int, now: int, fastest: float) -> int:
         """Add the motion since the last reading; a step no motor can make is a counter that was reset.
@@ -127,13 +126,13 @@ SAFE_TIME = 0.225
 """Seconds a session may take to leave the motor stopped and disabled, besides the time of the quick stop itself, from
 when the controller listens."""
 SAFE_ATTEMPTS = 2
-"""Attempts with such a time each: the first one may meet the rest of what was damaged."""
+"""Attempts, each with this time: the first may meet the rest of a damaged frame."""
 STOPS = {State.QUICK_STOP: Control.QUICK_STOP, State.SWITCH_ON_DISABLED: Control.DISABLE_VOLTAGE}
-"""Controlwords that must not wait, by what they lead to."""
+"""Controlwords that must not wait, by target state."""
 SLOW_EXCHANGE = 0.03
-"""Median duration of exchanges, s, from which on the link is slow: at 38400 baud they take 10 to 13 ms."""
+"""Median duration of exchanges from which the link is slow (s); at 38400 baud they take 10 to 13 ms."""
 QUICK_EXCHANGE = 0.02
-"""Median duration, s, up to which it is no longer slow."""
+"""Median duration at or below which the link is no longer slow (s)."""
 
 
 class EposDriver:
@@ -171,7 +170,7 @@ class EposDriver:
         self.reported_fault: int | None = None
         """Fault that was reported and is still there."""
         self.mark: int | None = None
-        """Value of ``od.MARK`` while the controller has not restarted; None = it takes none."""
+        """Value of ``od.MARK`` while the controller has not restarted; None if it accepts no mark."""
         self._port = port
         self._quiet_until = 0
 
@@ -204,7 +203,7 @@ class EposDriver:
 
 
 class _DriveSession:
-    """One connection: what was sent and what the controller last said."""
+    """One connection: commands sent and latest state of the controller."""
 
     def __init__(self, driver: EposDriver, line: Exchanger) -> None:
         self._driver = driver
@@ -214,24 +213,24 @@ class _DriveSession:
         self._sign = sign(driver.config)
         self._counts_per_turn = 1
         self._state = State.UNKNOWN
-        """As the statusword said it, and as commanded since."""
+        """State from the statusword, updated by later commands."""
         self._reported = State.UNKNOWN
-        """As the statusword said it."""
+        """State from the statusword."""
         self._doubtful = False
         """An exchange failed: the controller may have restarted."""
         self._sent_rpm: int | None = None
-        """Target in the controller; None = not known."""
+        """Target in the controller; None = unknown."""
         self._rpm = 0
         self._current: float | None = None
         self._fault: int | None = None
         self._stopping: State | None = None
         """QUICK_STOP or SWITCH_ON_DISABLED, if it is wanted now and its controlword was sent."""
         self._control_sent: Control | None = None
-        """Newest controlword of this host."""
+        """Latest controlword from this host."""
         self._prepared = False
         """Mode and profile are those configured."""
         self._commands_after = self._clock.now()
-        """Older commands do not count."""
+        """Instant before which commands are ignored."""
         self._goal = State.UNKNOWN
         self._goal_since = 0
         self._late_reported = False
@@ -307,7 +306,7 @@ class _DriveSession:
         from when the controller listens again: it is given the silence that a damaged or late answer before asks for.
         """
         full_speed = self._config.max_motor_rpm / self._config.quick_stop_deceleration_rpm_s
-        # Seconds after which a quick stop is not waited for any longer, however slow it is configured.
+        # Maximum wait for a quick stop (s), whatever its configured deceleration.
         longest_braking = 1.0
         limit = SAFE_TIME + min(full_speed, longest_braking)
         for _ in range(SAFE_ATTEMPTS):
@@ -399,7 +398,7 @@ class _DriveSession:
             if entries[len(values)] is od.VELOCITY_AVERAGED:
                 self._rpm = value
                 if self._moves:
-                    self._stopping = None  # what stops it is repeated until standstill is measured
+                    self._stopping = None  # the stop is repeated until standstill is measured
             values.append(value)
             return not self._is_urgent()
 
@@ -428,7 +427,7 @@ class _DriveSession:
     # What to do
 
     def _setpoint(self) -> Setpoint:
-        """What the newest valid command asks for now; without one a moving motor is braked, then switched off."""
+        """Return the set-point of the latest valid command; without one a moving motor is braked, then switched off."""
         command = self._driver.commands.latest
         if command is not None and command.stamp < self._commands_after:
             command = None
@@ -438,7 +437,7 @@ class _DriveSession:
 
     @property
     def _moves(self) -> bool:
-        """Whether the newest velocity is that of a moving motor."""
+        """Whether the latest velocity shows a moving motor."""
         return abs(self._rpm) > self._config.standstill_rpm
 
     async def _act(self, *, also_faster: bool = False) -> None:
@@ -492,10 +491,10 @@ class _DriveSession:
             self._driver.reported_fault = None
 
     def _judge_foreign_stop(self) -> None:
-        """End the session if the motor was to turn: whoever stopped it does not expect it to set off again at once.
+        """End the session if the motor should turn: a motor stopped by another client must not restart at once.
 
         Raises:
-            DeviceStoppedError: it was.
+            DeviceStoppedError: the motor should turn.
         """
         if self._setpoint().rpm != 0:
             text = "quick stop by another than this program: the deadman line fell, or a second master commands"
@@ -508,7 +507,7 @@ class _DriveSession:
         if goal is not self._goal or settled(self._state, goal) or self._state in FAULTED:
             self._goal, self._goal_since, self._late_reported = goal, now, False
         late = (now - self._goal_since) / SECOND
-        goal_limit = 2.0  # seconds after which a controller that does not follow its commands is reported
+        goal_limit = 2.0  # seconds of not following commands after which the controller is reported
         if late > goal_limit and not self._late_reported:
             self._late_reported = True
             text = f"controller stays in {self._state.name}, wanted {goal.name}"
@@ -516,7 +515,7 @@ class _DriveSession:
         control = next_control(self._state, goal)
         if control is Control.SHUTDOWN:
             await self._prepare()
-        # Seconds after which running again from a quick stop goes the long way, through power stage off.
+        # Seconds after which restarting from a quick stop goes through power stage off.
         reenable_limit = 0.3
         if self._state is State.QUICK_STOP and late > reenable_limit and not self._moves:
             control = Control.DISABLE_VOLTAGE

@@ -47,12 +47,12 @@ FAULT_NAMES = {
 
 
 class EposEmulator:
-    """Emulated controller; set ``end.baud = 38400`` for exchanges as long as real ones.
+    """Emulated controller; set ``end.baud = 38400`` for exchanges of real duration.
 
     Args:
         clock: time.
-        motor: shaft and load; None = a free motor of its own.
-        seed: of delays and noise.
+        motor: shaft and load; None = a separate free motor.
+        seed: seed of delays and noise.
         node: node id it answers to (besides 0).
     """
 
@@ -61,9 +61,9 @@ class EposEmulator:
         self.firmware = Firmware(clock.now, motor or FreeMotor(), np.random.default_rng(seed))
         self.signals = self.firmware.signals
         self.received: deque[tuple[int, bytes]] = deque(maxlen=4096)
-        """Newest bytes from the host, with their instants."""
+        """Latest bytes from the host, with their instants."""
         self.frames: deque[tuple[int, Frame]] = deque(maxlen=1024)
-        """Newest frames accepted from the host."""
+        """Latest frames accepted from the host."""
         self.repeat_refused = False
         """An answer the host refuses is sent again (it is not documented whether the real one does)."""
         self._clock = clock
@@ -320,7 +320,7 @@ class EposEmulator:
 
     @property
     def state(self) -> State:
-        """Power state as of the newest look."""
+        """Power state at the latest update."""
         return self.firmware.state
 
 

@@ -35,12 +35,12 @@ T = TypeVar("T")
 
 ACKNOWLEDGE_TIMEOUT = 0.1
 QUIET = 0.55
-"""Seconds of silence after which a controller as delivered has surely dropped a half frame."""
+"""Silence after which a controller with factory settings has certainly dropped a half frame (s)."""
 QUICK_ANSWER = 0.05
-"""Longest of the newest exchanges (s) up to which a line is quick: a byte that has not come by then is lost, not
+"""Maximum duration of the latest exchanges on a quick line (s): a byte that has not arrived by then is lost, not
 late."""
 HELD_BACK = 0.01
-"""Seconds in which bytes that an adapter or this host holds back come in."""
+"""Time within which bytes held back by an adapter or this host arrive (s)."""
 RECENT = 32
 """Exchanges whose duration is judged."""
 STRAY_LIMIT = 3
@@ -48,9 +48,9 @@ STRAY_LIMIT = 3
 ATTEMPTS = 3
 """Attempts at an exchange outside the schedule."""
 BRIEF_SILENCES = 2
-"""Failures in a row after which a brief silence is enough. The second one most likely met what disturbed the first,
-after which the request is repeated within some 130 ms; a controller that lost the time-out set by the host needs a
-long silence."""
+"""Consecutive failures up to which a brief silence suffices. The second failure most likely has the same cause as the
+first, as the request is repeated within some 130 ms; a controller that lost the time-out set by the host needs a long
+silence."""
 
 _ANSWER_LENGTHS: dict[int, frozenset[int]] = {Opcode.READ: frozenset((1, 3)), Opcode.WRITE: frozenset((1,))}
 
@@ -71,8 +71,8 @@ class ObjectError(ProtocolError):
 class Exchanger:
     """Object access over one link.
 
-    An exchange that has begun is finished even if its caller is cancelled, so that the next frame (a stop,
-    most likely) finds a controller that listens; ``finish`` waits for that.
+    A started exchange is completed even if its caller is cancelled, so that the controller listens to the next frame
+    (most likely a stop); ``finish`` waits for its end.
 
     Args:
         link: open link to the controller.
@@ -89,27 +89,27 @@ class Exchanger:
         self._hurried = False
         """A task waits for the end of the exchange that is read."""
         self.quiet_until = quiet_until
-        """Instant from which the controller listens again; in the past while all is well."""
+        """Instant from which the controller listens again; in the past during normal operation."""
         self.strange = b""
-        """Newest bytes that did not belong where they came."""
+        """Latest unexpected bytes."""
         self.acknowledged = False
         """True once something answered as an EPOS does."""
         self.began = 0
-        """Instant of the first byte of the newest exchange."""
+        """Instant of the first byte of the latest exchange."""
         self.ended = 0
-        """Instant of the last byte of the newest complete exchange."""
+        """Instant of the last byte of the latest complete exchange."""
         self.durations: deque[int] = deque(maxlen=RECENT)
-        """Of the newest complete exchanges, ns."""
+        """Durations of the latest complete exchanges (ns)."""
         self._frame_timeout: float | None = None
-        """Seconds after which the controller drops a half frame, as set by the host; None = as delivered."""
+        """Time-out set by the host after which the controller drops a half frame (s); None = factory setting."""
         self._answer_awaited = False
-        """The request is with the controller: what comes late now is its answer."""
+        """The controller has the request, so late bytes are its answer."""
         self._failures = 0
         """Exchanges in a row that failed."""
         self._silence = QUIET
-        """Seconds of silence that the newest failure asks for."""
+        """Silence required after the latest failure (s)."""
         self._touched = 0
-        """Instant of the newest byte of either side."""
+        """Instant of the latest byte from either side."""
 
     async def read(self, entry: ObjectEntry, attempts: int = 1) -> int:
         """Value of an object.
@@ -122,9 +122,9 @@ class Exchanger:
         return self._value(entry, await self._answer(read_request(entry, self._node), entry, attempts))
 
     async def read_row(self, entries: Sequence[ObjectEntry], take: Callable[[int], bool]) -> None:
-        """Read objects one right after the other, until ``take``, which gets every value at once, says False.
+        """Read objects back to back, pass each value to ``take`` at once, and stop when it returns False.
 
-        Nor does a row go on without a reader.
+        The row also ends when its reader is gone.
 
         Raises:
             ObjectError, DeviceTimeoutError, ProtocolError, DeviceLostError: as ``read``.
@@ -226,7 +226,7 @@ class Exchanger:
         Raises:
             DeviceLostError: the link went down.
         """
-        quiet_limit = 1.1  # seconds after which a line that never falls silent is used anyway: it is not an EPOS
+        quiet_limit = 1.1  # seconds after which a line that is never silent is used anyway: it is not an EPOS
         limit = self._clock.now() + int(quiet_limit * SECOND)
         while (left := min(self.quiet_until, limit) - self._clock.now()) > 0:
             with suppress(TimeoutError):
@@ -236,11 +236,11 @@ class Exchanger:
         self._link.discard()
 
     def _be_silent(self, *, waited: bool) -> None:
-        """After a failure, let the controller drop its half frame, whose time runs from the last byte of either side.
+        """Require silence after a failure: the controller drops its half frame, timed from either side's last byte.
 
-        Briefly, if the controller drops half frames soon. As long as for a controller as delivered after more failures
-        than ``BRIEF_SILENCES``, and when an answer may still come: on a quick line, one that was not ``waited`` for.
-        There the controller has said its last byte by the time that an exchange takes.
+        The silence is brief if the controller drops half frames soon. It is as long as for factory settings after more
+        than ``BRIEF_SILENCES`` failures, and when an answer may still come. On a quick line, that is an answer not
+        ``waited`` for: there the controller has sent its last byte within the duration of an exchange.
         """
         quick = self._is_quick()
         last = self._touched if quick else self._clock.now()
@@ -275,7 +275,7 @@ class Exchanger:
         except BaseException as error:
             self._be_silent(waited=isinstance(error, DeviceTimeoutError))
             self._failures += 1
-            self._link.discard()  # what came of it is no sign that the controller still speaks
+            self._link.discard()  # bytes of the failed exchange do not show that the controller still answers
             raise
         self._failures = 0
         self.ended = self._clock.now()
@@ -339,12 +339,12 @@ class Exchanger:
         return frame
 
     def _repeated(self, lengths: frozenset[int] | None) -> Steps[Frame | None]:
-        """Refuse a damaged answer. Undocumented whether the controller repeats it or forgets it: listen which."""
-        yield WaitFor(0, 0.005)  # seconds in which the rest of a damaged answer has come in
+        """Refuse a damaged answer; listen whether the controller repeats or forgets it, which is undocumented."""
+        yield WaitFor(0, 0.005)  # seconds within which the rest of a damaged answer arrives
         self._link.discard()
         self._write(bytes((REFUSED,)))
         try:
-            repeat_wait = 0.03  # seconds in which a controller that repeats a refused answer has begun to do so
+            repeat_wait = 0.03  # seconds within which a controller starts to repeat a refused answer
             return (yield from self._frame(lengths, repeat_wait))
         except DeviceTimeoutError:
             return None
@@ -391,7 +391,7 @@ class _HeldUpError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class ControllerIdentity:
-    """Settings of a controller; None = it does not know the object."""
+    """Settings of a controller; None where it lacks the object."""
 
     software: int
     hardware: int | None
@@ -405,14 +405,14 @@ class ControllerIdentity:
     motor_max_rpm: int | None
 
     def as_values(self) -> dict[str, int | None]:
-        """By name, for events and reports."""
+        """Return the values by name, for events and reports."""
         return asdict(self)
 
     def counts_per_turn(self, config: EposConfig) -> int:
         """Position counts per motor turn.
 
         Raises:
-            DeviceMismatchError: neither the controller nor the configuration says so.
+            DeviceMismatchError: neither the controller nor the configuration states them.
         """
         pulses = self.encoder_pulses_per_turn or config.encoder_pulses_per_turn
         if pulses is None:
@@ -420,7 +420,7 @@ class ControllerIdentity:
         return pulses * od.COUNTS_PER_PULSE
 
     def check(self, config: EposConfig) -> None:
-        """Compare with what was configured.
+        """Compare with the configuration.
 
         Raises:
             DeviceMismatchError: driving would be wrong by a factor, or with a motor of another kind.
@@ -440,10 +440,10 @@ class ControllerIdentity:
 
 
 async def read_identity(line: Exchanger) -> ControllerIdentity:
-    """Ask the controller.
+    """Read the identity from the controller.
 
     Raises:
-        WrongDeviceError: what answers has no software version.
+        WrongDeviceError: the answering device has no software version.
         DeviceTimeoutError, ProtocolError, DeviceLostError: as ``Exchanger.read``.
     """
 

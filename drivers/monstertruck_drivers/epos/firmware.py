@@ -64,7 +64,7 @@ ORDERED = (
 """Objects whose values move the motor."""
 
 POWER_ORDERS = ("disable_voltage", "quick_stop", "halt", "enable", "fault_reset")
-"""What controlwords ask for."""
+"""Orders of controlwords."""
 
 
 def signal_name(entry: ObjectEntry) -> str:
@@ -134,13 +134,13 @@ class FreeMotor:
         self._accel = self.COAST_RPM_S
 
     def command(self, time_ns: int, target_rpm: float | None, accel_rpm_s: float) -> None:
-        """As ``MotorPlant.command``."""
+        """See ``MotorPlant.command``."""
         self._advance(time_ns)
         self._goal = target_rpm or 0.0
         self._accel = self.COAST_RPM_S if target_rpm is None else accel_rpm_s
 
     def reading(self, time_ns: int) -> MotorReading:
-        """As ``MotorPlant.reading``."""
+        """See ``MotorPlant.reading``."""
         self._advance(time_ns)
         current = 60.0 * math.copysign(self._rpm != 0, self._rpm) + 0.01 * (self._goal - self._rpm)
         return MotorReading(self._turns, self._rpm, self._rpm, current, self.supply_v)
@@ -173,7 +173,7 @@ class Firmware:
         self.strict_transitions = False
         """Answer an impossible controlword with "wrong device state" instead of ignoring it."""
         self.latched_quick_stop = False
-        """Quick stop is left through power stage off only (what the real one does is not sure)."""
+        """Quick stop ends only through power stage off (the real controller's behaviour is uncertain)."""
         self.over_voltage_above = 27.0  # volts; the real limit is not known
         self.causes: set[int] = set()
         """Injected fault codes whose cause is still present; supply faults come and go by themselves."""
@@ -220,7 +220,7 @@ class Firmware:
 
     @property
     def frame_timeout(self) -> float:
-        """Seconds without a byte after which a half frame is forgotten."""
+        """Silence after which a half frame is dropped (s)."""
         return self._values[od.RS232_TIMEOUT] / 1000
 
     # Objects

@@ -19,7 +19,7 @@ class ObjectEntry:
 
     @property
     def limits(self) -> tuple[int, int]:
-        """Least and greatest value."""
+        """Minimum and maximum value."""
         return (-(1 << (self.width - 1)), (1 << (self.width - 1)) - 1) if self.signed else (0, (1 << self.width) - 1)
 
     def encode(self, value: int) -> int:
@@ -75,8 +75,8 @@ VELOCITY = ObjectEntry("velocity actual", 0x606C, 0, 32, signed=True, access="ro
 CURRENT = ObjectEntry("current actual", 0x6078, 0, 16, signed=True, access="ro")
 MAX_VELOCITY = ObjectEntry("maximal profile velocity", 0x607F, 0, 32)
 MARK = ObjectEntry("profile velocity", 0x6081, 0, 32)
-"""Of profile position mode, without effect in profile velocity mode: what is written here lasts until the controller
-restarts, so that a restart shows."""
+"""Object of profile position mode, without effect in profile velocity mode: its value lasts until the controller
+restarts, and so reveals a restart."""
 ACCELERATION = ObjectEntry("profile acceleration", 0x6083, 0, 32)
 DECELERATION = ObjectEntry("profile deceleration", 0x6084, 0, 32)
 QUICK_STOP_DECELERATION = ObjectEntry("quick stop deceleration", 0x6085, 0, 32)

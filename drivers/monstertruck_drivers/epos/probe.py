@@ -68,7 +68,7 @@ async def _report(line: Exchanger, clock: Clock) -> dict[str, Any]:
 
 
 async def _serial_number(line: Exchanger) -> str | None:
-    """Hexadecimal; None where the firmware's segmented service differs from what is documented."""
+    """Hexadecimal; None where the firmware's segmented service differs from its documentation."""
     try:
         return (await line.read_long(od.SERIAL_NUMBER)).hex()
     except (DeviceTimeoutError, ProtocolError):

@@ -23,10 +23,10 @@ from typing import NamedTuple
 from monstertruck_drivers.epos.objects import CONTROLWORD, ObjectEntry
 
 EPOS_BAUD = 38400
-"""Of the RS232 line, as set at the author's controller."""
+"""Baud rate of the RS232 line, as set in the author's controller."""
 
 READY = 0x4F
-"""'O': ready for what follows, or accepted."""
+"""'O': ready for the next bytes, or accepted."""
 REFUSED = 0x46
 """'F': busy, or CRC wrong."""
 ANSWER = 0x00

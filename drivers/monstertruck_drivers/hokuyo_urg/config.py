@@ -34,7 +34,7 @@ class ScipConfig(Schema):
     line_timeout: Annotated[float, Field(gt=0)] = 0.14
     """Seconds of silence within the answer to a command."""
     verify_timeout: Annotated[float, Field(gt=0)] = 10.0
-    """Seconds the sensor may take to verify a suspected fault of its own (statuses 21-49)."""
+    """Time limit for the sensor to verify a suspected internal fault (s, statuses 21-49)."""
     clock_samples: Annotated[int, Field(ge=1, le=100)] = 12
     """Exchanges of the start-up clock comparison; the quickest one counts."""
 

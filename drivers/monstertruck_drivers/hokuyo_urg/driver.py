@@ -66,7 +66,7 @@ class Dialect(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """What the handshake found."""
+    """Result of the handshake."""
 
     dialect: Dialect
     identity: LidarIdentity
@@ -81,7 +81,7 @@ class ScipSession:
     def __init__(self, link: Link, clock: Clock, config: ScipConfig) -> None:
         self.parser = ScipParser()
         self.arrival = 0
-        """When the newest bytes came, ns."""
+        """Arrival time of the latest bytes (ns)."""
         self._link = link
         self._clock = clock
         self._config = config
@@ -238,7 +238,7 @@ class ScipSession:
         raise DeviceTimeoutError(f"{self._link.name}: no answer to QT")
 
     async def _discard(self, seconds: float) -> None:
-        """Throw away what comes within ``seconds``."""
+        """Discard bytes that arrive within ``seconds``."""
         with contextlib.suppress(TimeoutError):
             async with self._clock.deadline(seconds):
                 while True:

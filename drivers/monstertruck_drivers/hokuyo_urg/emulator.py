@@ -1,8 +1,8 @@
-"""The device side of a URG-04LX, byte for byte: power-up state, both dialects, streaming, time, faults.
+"""Device side of a URG-04LX, byte for byte: power-up state, both dialects, streaming, time, faults.
 
 Three tasks run forever: one reads request lines, one answers them a little later, and one is the rotor,
-which turns on a 100 ms grid of the sensor's own clock whether or not anybody listens. A stream, once asked
-for, goes on until QT, RS, its count or the supply ends it; a host that dies changes nothing.
+which turns on a 100 ms grid of the sensor's clock with or without a client. A requested stream continues
+until QT, RS, its count or the supply ends it; a host that dies changes nothing.
 
 Where the specification is silent the emulator answers TM0 during a scan with 0A, MD during a stream with 0B,
 and everything but TM and RS in time-adjust mode with 0E.
@@ -91,9 +91,9 @@ def scan_lines(order: ScanOrder, counter: int, revolution: NDArray[np.int32]) ->
     """Lines of a scan after its status: time line (not in SCIP 1.1) and data.
 
     Args:
-        order: what was requested.
-        counter: milliseconds at step 0, 24 bits.
-        revolution: of all steps, mm or error codes.
+        order: requested scan.
+        counter: time at step 0 (ms, 24 bits).
+        revolution: values of all steps, mm or error codes.
     """
     values = _clustered(revolution[order.start : order.end + 1], order.cluster)
     if order.command.endswith("E"):
@@ -119,7 +119,7 @@ def counter_line(counter: int) -> bytes:
 
 
 def _clustered(values: NDArray[np.int32], cluster: int) -> NDArray[np.int32]:
-    """Least valid value of each group of neighbours, or the first one's code if none is valid."""
+    """Minimum valid value of each group of neighbours, or the first code of the group if none is valid."""
     if cluster == 1:
         return values
     groups = np.pad(values, (0, -len(values) % cluster)).reshape(-1, cluster)
@@ -136,7 +136,7 @@ FAULTS: Final = (
     "timer MILLISECONDS | drift PPM | cover FROM TO VALUE [SHARE] | cover off | mirror FROM TO"
 )
 ORDERED: Final = {"BM": "laser_on", "MD": "stream", "MS": "stream", "QT": "quit", "RS": "reset", "TM": "adjust"}
-"""Requests that change what it does, with the names of their signals."""
+"""Requests that change the sensor's state, with the names of their signals."""
 RANGE: Final = "range"
 """All distances of a scan, mm."""
 COUNTER: Final = "counter"
@@ -145,26 +145,26 @@ COUNTER: Final = "counter"
 Handler = Callable[[str, str], tuple[str, list[bytes]]]
 """Answers a request and its note by a status and lines."""
 Cover = Callable[[NDArray[np.int32]], NDArray[np.int32]]
-"""What becomes of the values (n,) of the steps behind something."""
+"""Maps the values (n,) of the covered steps."""
 
 
 class HokuyoEmulator:
     """Emulated scanner.
 
     Args:
-        clock: the world's time.
-        source: what it sees; asked at the end of each revolution that is sent.
-        seed: of the USB jitter.
-        model: which one it is.
-        state: what the host finds: freshly powered (SCIP 1.1), configured to start in SCIP 2.0, left streaming or
+        clock: world time.
+        source: source of the ranges, read at the end of each revolution that is sent.
+        seed: seed of the USB jitter.
+        model: scanner model.
+        state: initial state: freshly powered (SCIP 1.1), configured to start in SCIP 2.0, left streaming or
             in time-adjust mode by a dead host.
         serial: ``SERI`` of VV.
         firmware: ``FIRM`` of VV; a major number below 3 knows SCIP 1.1 only.
         timer_start: counter at construction, ms.
-        drift_ppm: how much faster than the world the sensor's clock runs.
-        jitter: greatest delay of a scan by USB batching, s.
-        min_step: first step that measures (``AMIN``); by default the model's.
-        max_step: last step that measures (``AMAX``); by default the model's.
+        drift_ppm: rate error of the sensor's clock; positive runs faster than the world.
+        jitter: maximum delay of a scan by USB batching (s).
+        min_step: first measuring step (``AMIN``); default: value of the model.
+        max_step: last measuring step (``AMAX``); default: value of the model.
     """
 
     def __init__(
@@ -185,7 +185,7 @@ class HokuyoEmulator:
     ) -> None:
         self.name = "lidar"
         self.received: deque[str] = deque(maxlen=1000)
-        """Newest request lines, for tests."""
+        """Latest request lines, for tests."""
         self._clock = clock
         self._source = source
         self._rng = np.random.default_rng(seed)
@@ -236,8 +236,8 @@ class HokuyoEmulator:
         """Start or end a fault.
 
         ``status N`` sends that status with the next revolution of a stream: 21-49 hold the stream until 98, 50-97 end
-        it. ``deaf`` ignores requests; ``fragile`` makes an unknown command cause that. ``cut`` ends the next scan in
-        the middle of a line. ``laser`` keeps the laser from lighting. ``seri`` puts a wrong sum on SERI and an empty
+        it. ``deaf`` ignores requests; ``fragile`` makes an unknown command cause that. ``cut`` ends the next scan
+        in the middle of a line. ``laser`` keeps the laser from lighting. ``seri`` puts a wrong sum on SERI and an empty
         line into VV. ``tm`` makes it refuse its time-adjust mode. ``timer`` sets the counter, ``drift`` the rate of
         its clock against the world's.
 
@@ -296,7 +296,7 @@ class HokuyoEmulator:
             model = self._model
             values = np.where(values >= model.least_mm, 2 * values, values)
             values[values > model.greatest_mm] = model.unreturned
-            specular = 0.2  # share of a mirror, in its middle, from which the light comes straight back
+            specular = 0.2  # fraction of a mirror, around its middle, that reflects the light straight back
             half = round(len(values) * specular / 2)
             values[len(values) // 2 - half : len(values) // 2 + half] = model.dazzled
             return values
@@ -355,7 +355,7 @@ class HokuyoEmulator:
                 self._send_scan(end, order, begin)
 
     async def _next_revolution(self, previous: int | None) -> int | None:
-        """Sensor's time at step 0 of the revolution after ``previous``; None = it never turns again."""
+        """Sensor time at step 0 of the revolution after ``previous``; None if the rotor never turns again."""
         period = self._model.period
         if previous is None:
             return -(-self._time() // period) * period
@@ -382,7 +382,7 @@ class HokuyoEmulator:
         return self._steps[1] * self._model.period // self._model.steps_per_turn + processing
 
     def _sent_at(self, begin: int) -> int:
-        """The world's time at which the scan begun at ``begin`` reaches the host."""
+        """World time at which the scan started at ``begin`` reaches the host."""
         late = self._rng.uniform(0.0, self._jitter) if self._jitter > 0 else 0.0
         return self._world_time(begin + self._sweep()) + round(late * SECOND)
 

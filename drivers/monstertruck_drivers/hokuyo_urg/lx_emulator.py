@@ -1,8 +1,8 @@
-"""The device side of a UST or UTM: SCIP 2.2 on a network socket.
+"""Device side of a UST or UTM: SCIP 2.2 on a network socket.
 
 Unlike the URG-04LX it has neither SCIP 1.1 nor a baud rate, but scans with intensities, a state (``%ST``), a partial
-reset (``RT``) and a reboot (``RB``). The specification does not say whether a stream ends with its connection; here it
-goes on.
+reset (``RT``) and a reboot (``RB``). The specification leaves open whether a stream ends with its connection; here it
+continues.
 """
 
 import math
@@ -46,13 +46,13 @@ class BeamRanges:
 class LxEmulator(HokuyoEmulator):
     """Emulated UST or UTM.
 
-    Faults (``inject``): ``unstable N`` (0M in place of the next so many scans), and those of the URG-04LX.
+    Faults (``inject``): ``unstable N`` (0M in place of the next N scans), and the faults of the URG-04LX.
 
     Args:
         clock: the world's time.
-        source: what it sees.
-        model: which one it is.
-        seed: of the jitter.
+        source: source of the ranges.
+        model: scanner model.
+        seed: seed of the jitter.
         options: as ``HokuyoEmulator``.
     """
 

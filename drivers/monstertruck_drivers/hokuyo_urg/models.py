@@ -20,7 +20,7 @@ class ScannerModel(NamedTuple):
     last_step: int
     """Last step that measures."""
     greatest_step: int
-    """Greatest step that may be asked for."""
+    """Maximum step of a request."""
     front_step: int
     least_mm: int
     greatest_mm: int

@@ -27,7 +27,7 @@ async def probe(port: Port, clock: Clock, settings: HokuyoConfig | None = None) 
 
 
 async def probe_lx(port: Port, clock: Clock, settings: HokuyoLxConfig | None = None) -> dict[str, object]:
-    """As ``probe``, of a UST or UTM."""
+    """Probe a UST or UTM; see ``probe``."""
     return await _probe(port, clock, settings or HokuyoLxConfig())
 
 

@@ -27,9 +27,9 @@ COUNTER_BITS: Final = 24
 COUNTER_MASK: Final = (1 << COUNTER_BITS) - 1
 """The millisecond counter wraps after 4 h 39 min 37.2 s."""
 LINE_PAYLOAD: Final = 64
-"""Most payload characters of a data line."""
+"""Maximum number of payload characters in a data line."""
 TAG_LIMIT: Final = 16
-"""Most characters of the echoed string after ``;``."""
+"""Maximum length of the echoed string after ``;``."""
 MAX_REPLY: Final = 8192
 """Bytes kept while waiting for the end of a reply; the longest real one (1081 ranges with intensities) has 6700."""
 
@@ -264,7 +264,7 @@ class ScipParser:
 
 
 class StatusMeaning(Enum):
-    """What a status asks of the host."""
+    """Action that a status requires of the host."""
 
     OK = auto()
     ALREADY = auto()
@@ -371,7 +371,7 @@ def split_ranges(values: NDArray[np.int32], least: int) -> tuple[NDArray[np.floa
 
     Args:
         values: shape (n,), mm or codes.
-        least: mm; what is below is an error code (``DMIN``).
+        least: minimum range (mm, ``DMIN``); lower values are error codes.
 
     Returns:
         Ranges in m, +inf where invalid, and codes, 255 where valid; both shape (n,), read-only as messages have them.
@@ -386,16 +386,16 @@ def split_ranges(values: NDArray[np.int32], least: int) -> tuple[NDArray[np.floa
 def split_lx_ranges(
     values: NDArray[np.int32], least: int, greatest: int, *, free: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """As ``split_ranges``, of the series UST and UTM, whose values outside their range are errors.
+    """Like ``split_ranges``, for the series UST and UTM, whose values outside their range are errors.
 
     A UTM reports 1 where nothing is in range (table 4 of the SCIP 2.0 specification), a UST a value beyond its range.
-    Their other errors say nothing.
+    Their other errors carry no information.
 
     Args:
         values: shape (n,), mm or errors.
-        least: mm (``DMIN``).
-        greatest: mm (``DMAX``).
-        free: whether a beam that nothing returned is free as far as the scanner reaches.
+        least: minimum range (mm, ``DMIN``).
+        greatest: maximum range (mm, ``DMAX``).
+        free: whether a beam without a return is free up to the scanner's maximum range.
     """
     valid = (values >= least) & (values <= greatest)
     ranges = np.where(valid, values / 1000.0, np.inf)
@@ -467,13 +467,13 @@ SCIP1_PARAMETERS: Final = Parameters("URG-04LX", 20, 4095, 1024, 44, 725, 384, 6
 
 
 def parse_fields(lines: list[bytes], *, sums: bool = True) -> dict[str, str]:
-    """``KEY:value;`` lines as a mapping.
+    """Parse ``KEY:value;`` lines into a mapping.
 
-    A wrong sum on SERI is accepted (some units send it so), and one that leaves out what follows ``<-`` (some models'
-    II).
+    A wrong sum on SERI is accepted (some units send it), and a sum that leaves out the text after ``<-`` (II of some
+    models).
 
     Raises:
-        ProtocolError: another line with a wrong sum, or not of this form.
+        ProtocolError: another line has a wrong sum, or a line has another form.
     """
     fields: dict[str, str] = {}
     for line in lines:

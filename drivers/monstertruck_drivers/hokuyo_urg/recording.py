@@ -88,15 +88,15 @@ def _parse(line: str, where: str) -> tuple[int, NDArray[np.int32]]:
 
 
 class RecordedHokuyoEmulator(HokuyoEmulator):
-    """Scanner that turns when the recorded one did; reports steps 43..725 as the recorded one.
+    """Scanner that turns at the recorded times; reports steps 43..725 like the recorded scanner.
 
-    The first request for a stream starts the recording, which then runs through once, whether or not anything listens.
+    The first request for a stream starts the recording, which then plays once, with or without a client.
 
     Args:
         clock: the world's time.
-        recording: what it sees and when.
-        seed: of the USB jitter.
-        state: what the host finds; ``streaming`` starts the recording at once.
+        recording: scans and their times.
+        seed: seed of the USB jitter.
+        state: initial state; ``streaming`` starts the recording at once.
         options: others of ``HokuyoEmulator``.
     """
 
@@ -130,7 +130,7 @@ class RecordedHokuyoEmulator(HokuyoEmulator):
         return self._first + int(self._recording.times[self._index])
 
     def _measure(self, begin: int) -> NDArray[np.int32]:
-        # In the sensor's time, which may drift from the world's.
+        # Sensor time, which may drift from world time.
         return self._recording.scan(begin)
 
     def _latest_revolution(self) -> int:

@@ -30,9 +30,9 @@ class HostHealthConfig(Schema):
     """Busy share of all cores"""
     busy_clear: Share = 0.85
     busy_after: Seconds = 10.0
-    """As ``after``: planning may take all there is for a while"""
+    """Like ``after``, for a busy processor: planning may use all of it for a while"""
     slow: Share = 0.8
-    """Greatest allowed clock as a share of the greatest possible one; lower it where a cap is wanted"""
+    """Limit for the allowed clock, as a fraction of the maximum clock; lower it where a cap is intended"""
     memory: Share = 0.1
     """Available share of the memory"""
     memory_clear: Share = 0.15
@@ -40,7 +40,7 @@ class HostHealthConfig(Schema):
     """Free bytes of the file system that holds ``disk_path``"""
     disk_clear: Bytes = 3 * GIGABYTE // 2
     disk_path: Path = Path("runs")
-    """Where logs are written; need not exist yet"""
+    """Folder of the logs; it need not exist yet"""
 
     @model_validator(mode="after")
     def _clear_of_the_limits(self) -> Self:

@@ -1,4 +1,4 @@
-"""Host monitor: looks once a second, reports what gets short."""
+"""Host monitor: samples once a second and reports scarce resources."""
 
 from typing import Final
 
@@ -17,14 +17,14 @@ SEVERITIES: Final = {Reason.DISK_LOW: Severity.ERROR, Reason.MEMORY_LOW: Severit
 
 
 class HostHealthDriver:
-    """Publishes the computer's health and reports every limit that is passed, and when it is over.
+    """Publishes the computer's health, and reports each limit when it is passed and when it recovers.
 
     Args:
         config: limits.
-        computer: whose health.
+        computer: monitored computer.
         clock: time.
         out: host health.
-        events: what gets short, and when it is over.
+        events: shortages and recoveries.
         name: service name.
     """
 

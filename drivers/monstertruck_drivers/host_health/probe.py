@@ -1,4 +1,4 @@
-"""Which readings of its own health a computer offers."""
+"""List the health readings that a computer offers."""
 
 from dataclasses import asdict
 from pathlib import Path

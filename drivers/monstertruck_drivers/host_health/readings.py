@@ -28,7 +28,7 @@ class Times:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """The computer at one instant; None = not available."""
+    """State of the computer at one instant; None = not available."""
 
     load: float
     cores: int
@@ -54,11 +54,11 @@ def read_host(root: Path, disk: Disk) -> Reading:
 
     Args:
         root: folder that holds ``proc`` and ``sys``.
-        disk: the file system that counts.
+        disk: the monitored file system.
 
     Raises:
         DeviceError: no /proc.
-        ProtocolError: a file of /proc that every Linux has is not as proc(5) says.
+        ProtocolError: a file of /proc that every Linux has differs from proc(5).
     """
     cores, times = parse_stat(_required(root / "proc/stat"))
     total, available = parse_meminfo(_required(root / "proc/meminfo"))
@@ -165,6 +165,6 @@ def _shares(cpus: Path) -> Iterator[float]:
 
 def _firmware_throttled(file: Path) -> bool:
     try:
-        return bool(int(text_of(file) or "0", 16) & 0xF)  # bits that say what holds now
+        return bool(int(text_of(file) or "0", 16) & 0xF)  # bits of the current conditions
     except ValueError:
         return False

@@ -38,7 +38,7 @@ class Ld19Session:
     def __init__(self, link: Link, clock: Clock) -> None:
         self.parser = Ld19Parser()
         self.arrival = 0
-        """When the newest bytes came, ns."""
+        """Arrival time of the latest bytes (ns)."""
         self.packets = 0
         """Packets received so far."""
         self._link, self._clock = link, clock
@@ -89,11 +89,11 @@ class PacketSamples:
 
     def __init__(self) -> None:
         self.elapsed = 0
-        """Of the newest packet, ns."""
+        """Elapsed time of the latest packet (ns)."""
         self._stamp: int | None = None
 
     def of(self, packets: list[Ld19Packet]) -> BeamSamples:
-        """BeamSamples of packets that follow one another; those of a head that stands are left out."""
+        """Return the samples of consecutive packets; packets of a stationary head are left out."""
         kept, ends = [], []
         for packet in packets:
             if self._stamp is not None:

@@ -32,16 +32,16 @@ COUNTER: Final = "counter"
 
 
 class Ld19Emulator:
-    """An LD06, LD19 or STL-19P that streams from power-up on.
+    """LD06, LD19 or STL-19P that streams from power-up on.
 
-    Faults (``inject``): ``silent on|off``, ``bad_crc N`` (the next so many packets), ``half_packet``, and those of the
-    head.
+    Faults (``inject``): ``silent on|off``, ``bad_crc N`` (the next N packets), ``half_packet``, and the faults of
+    the head.
 
     Args:
         clock: time.
-        source: what it sees.
-        sheet: of the model.
-        seed: of covers.
+        source: source of the ranges.
+        sheet: data sheet of the model.
+        seed: seed of covers.
     """
 
     def __init__(self, clock: Clock, source: BeamSource, sheet: ModelSheet = MODELS["ld19"], *, seed: int = 0) -> None:
@@ -123,7 +123,7 @@ class Ld19Emulator:
         millimetres = np.rint(ranges * 1000).astype(np.int64)
         points["distance"] = np.clip(self.signals.report(RANGE, millimetres), 0, 0xFFFF)
         bright = 230  # intensity of a near white surface; it falls with the distance
-        fading = 6.0  # distance at which a quarter of the intensity is left, m
+        fading = 6.0  # distance at which a quarter of the intensity remains (m)
         points["intensity"] = np.where(points["distance"] > 0, bright / (1.0 + 3.0 * (ranges / fading) ** 2), 0.0)
         angles = np.rint(turned[[0, -1]] * FULL_TURN).astype(np.int64) % FULL_TURN
         stamp = self.signals.report(COUNTER, (int(times[-1]) - self._powered_at) // 1_000_000 % STAMP_TURN)

@@ -19,7 +19,7 @@ POINTS: Final = 12
 LD19_SIZE: Final = 47
 HEADER: Final = b"\x54\x2c"
 STAMP_TURN: Final = 30_000
-"""Milliseconds after which the time stamp starts again."""
+"""Period at which the time stamp wraps (ms)."""
 FULL_TURN: Final = 36_000
 """Angles are hundredths of a degree."""
 _POLYNOMIAL: Final = 0x4D
@@ -61,7 +61,7 @@ class Ld19Packet(NamedTuple):
 
     @property
     def span(self) -> int:
-        """From the first to the last point, 0.01 degrees."""
+        """Angle from the first to the last point (0.01 degrees)."""
         return (self.end - self.start) % FULL_TURN
 
     def decoded(self) -> NDArray[np.void]:

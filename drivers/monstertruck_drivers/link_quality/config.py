@@ -11,7 +11,7 @@ Dbm = Annotated[float, Field(ge=-120, le=0)]
 
 
 class LinkQualityConfig(Schema):
-    """Which interface is watched, and what its signal is worth (rules of thumb)."""
+    """Monitored interface and its signal limits (rules of thumb)."""
 
     kind: Literal["link_quality"] = "link_quality"
     interface: Annotated[str, Field(pattern=r"^[^/\s]{1,15}$")] | None = None
@@ -21,13 +21,13 @@ class LinkQualityConfig(Schema):
     smoothing: Annotated[float, Field(ge=0, le=60)] = 4.0
     """Seconds, time constant of the signal's mean"""
     excellent: Dbm = -50.0
-    """dBm from which the signal is excellent"""
+    """Minimum excellent signal (dBm)"""
     good: Dbm = -67.0
     fair: Dbm = -75.0
     poor: Dbm = -85.0
     """Below it the link is unusable"""
     hysteresis: Annotated[float, Field(ge=0, le=20)] = 3.0
-    """Decibels above its limit from which a better level is reached again"""
+    """Margin above the limit of a better level before it is reached again (dB)"""
 
     @model_validator(mode="after")
     def _limits_in_order(self) -> Self:

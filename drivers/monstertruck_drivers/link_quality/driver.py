@@ -36,7 +36,7 @@ class LinkJudge:
         """Smoothed, dBm; None while nothing is known of it."""
 
     def update(self, time_ns: int, sample: Sample | None) -> LinkLevel:
-        """Take one sample; None = there is no interface."""
+        """Process one sample; None = the interface is missing."""
         if sample is None or not sample.connected:
             self._forget()
             return LinkLevel.DOWN
@@ -61,7 +61,7 @@ class LinkJudge:
         return level + (self.signal - level) * math.exp(-elapsed / self._smoothing)
 
     def _ranked(self, signal: float) -> int:
-        """Best level whose limit is reached; those better than the present one ask for more."""
+        """Return the best level whose limit is reached; levels above the current one need a margin."""
         for rank, (_, bound) in enumerate(self._bounds):
             climbing = self._rank is not None and rank < self._rank
             if signal >= bound + (self._hysteresis if climbing else 0.0):
@@ -112,7 +112,7 @@ class LinkQualityDriver:
         self._before: tuple[int, Sample] | None = None
 
     async def run(self, ready: Ready) -> None:
-        """Look until cancelled; nothing the kernel says or leaves unsaid ends the session."""
+        """Sample until cancelled; no kernel output, and no missing output, ends the session."""
         schedule = Schedule(self._clock, self._config.rate, IN_THREADS)
         while True:
             await schedule.next()

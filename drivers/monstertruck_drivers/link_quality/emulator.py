@@ -14,7 +14,7 @@ HEADER: Final = (
 )
 STYLES: Final = ("normal", "no_dot", "unsigned", "header", "missing")
 ON_AIR: Final = 20_000
-"""Bytes a second both ways while connected."""
+"""Traffic in each direction while connected (bytes/s)."""
 
 
 class NetworkEmulator:

@@ -18,7 +18,7 @@ class Signal:
     """One row of /proc/net/wireless."""
 
     level: float | None
-    """dBm; None = not connected."""
+    """Signal level (dBm); None = not connected."""
     noise: float | None
     """dBm; None = unknown."""
 
@@ -75,9 +75,9 @@ def read_interfaces(root: Path) -> list[Sample]:
 
 
 def choose(samples: list[Sample], name: str | None) -> Sample | None:
-    """The interface of that name; without a name the one the truck most likely talks over.
+    """Return the named interface; without a name, the interface that the truck most likely uses.
 
-    That is Wi-Fi before cable, but whatever is connected before what is not: it is Wi-Fi that gets weak.
+    Connected interfaces come before unconnected ones, then Wi-Fi before cable, because only Wi-Fi gets weak.
     """
     if name is not None:
         return next((sample for sample in samples if sample.name == name), None)

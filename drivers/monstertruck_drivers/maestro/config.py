@@ -27,9 +27,9 @@ class ServoConfig(Schema):
     max_us: Microseconds = 1840.0
     max_angle_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
     speed: Annotated[int, Field(ge=0, le=0x3FFF)] = 100
-    """Limit of the pulse's change, 0.25 us per 10 ms; 0 = none."""
+    """Speed limit of the pulse (0.25 us per 10 ms); 0 = unlimited."""
     acceleration: Annotated[int, Field(ge=0, le=255)] = 0
-    """0.25 us per 10 ms per 80 ms; 0 = none."""
+    """Acceleration limit of the pulse (0.25 us per 10 ms per 80 ms); 0 = unlimited."""
 
     @model_validator(mode="after")
     def _centre_within_limits(self) -> Self:
@@ -52,8 +52,8 @@ class ServoConfig(Schema):
         return max(ends[0], -limit), min(ends[1], limit)
 
     def within_limits(self, quarters: int) -> bool:
-        """Whether a pulse in quarter microseconds can be one of this driver's targets."""
-        rounding = 2  # quarter microseconds by which a pulse may differ from its target
+        """Whether a pulse (quarter microseconds) can be a target of this driver."""
+        rounding = 2  # tolerance of a pulse around its target (quarter microseconds)
         return 4 * self.min_us - rounding <= quarters <= 4 * self.max_us + rounding
 
     def angle(self, quarters: int) -> float:
@@ -91,22 +91,22 @@ class MaestroConfig(Schema):
     front: ServoConfig = ServoConfig(channel=1)
     rear: ServoConfig = ServoConfig(channel=0)
     front_right: ServoConfig | None = None
-    """Where every wheel has its own servo: the front right wheel's; ``front`` is the front left one's"""
+    """Servo of the front right wheel, where every wheel has a servo; ``front`` is then the front left wheel"""
     rear_right: ServoConfig | None = None
-    """The rear right wheel's; ``rear`` is the rear left one's"""
+    """Servo of the rear right wheel; ``rear`` is then the rear left wheel"""
     dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
-    """From a steering command to the first movement of the wheels, s; null = not measured"""
+    """Dead time from a steering command to the first movement of the wheels (s); null = not measured"""
     lag: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Time constant with which the wheels then turn, s; null = not measured"""
+    """Time constant of the wheels' movement after the dead time (s); null = not measured"""
     battery: BatteryInputConfig | None = BatteryInputConfig()
     poll_rate: Annotated[float, Field(gt=0, le=50)] = 20.0
     """Times a second both pulses and the error word are read."""
     battery_rate: Annotated[float, Field(gt=0, le=50)] = 10.0
     """Times a second the battery is read; never more often than ``poll_rate``."""
     answer_timeout: Annotated[float, Field(gt=0, le=1)] = 0.1
-    """Seconds in which all answers of one poll must have come."""
+    """Timeout of all answers to one poll (s)."""
     command_timeout: Annotated[float, Field(gt=0, le=2)] = 0.25
-    """Seconds after which a steering command is stale: the servos hold, the deadman is released."""
+    """Age at which a steering command is stale (s): the servos hold, the deadman is released."""
     deadman_channel: Channel | None = None
     """Digital output held high while commands are fresh; wire it to the motor controller's quick-stop input."""
     deadman_feed: Literal["fresh", "always"] = "fresh"
@@ -125,7 +125,7 @@ class MaestroConfig(Schema):
 
     @property
     def steering_outputs(self) -> SteeringOutputs:
-        """What its servos do."""
+        """Steering outputs of the servos."""
         return SteeringOutputs(tuple(servo.reach for servo in self.servos), self.dead_time, self.lag)
 
     @model_validator(mode="after")

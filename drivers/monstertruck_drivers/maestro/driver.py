@@ -22,25 +22,25 @@ class MaestroDriver:
     """Sends every steering command at once, and polls pulses, errors and battery in between.
 
     **Deadman.** The Maestro's serial time-out (set once in the unit, about 0.5 s) sends its channels home when
-    no valid command comes, whichever it is: polling feeds it as well as targets do. Commands are stale
+    no valid command of any kind comes: polling feeds it as well as targets do. Commands are stale
     ``command_timeout`` after their stamp. Then the servos hold, the deadman line (if configured) is released by
     an explicit target, and with ``deadman_feed: fresh`` the driver sends nothing until the next command, so that
     the time-out trips too although the driver still lives; feedback and battery pause meanwhile. With ``always``
-    polling goes on, and the time-out guards only against a hung or dead process. Before the first command of a
-    session there is nothing to guard: the line is low and polling runs. Channels that go home are the unit's own
-    setting: deadman line "Off", steering "Ignore". A command may lower the line too: nothing else reaches a motor
-    whose own link is lost.
+    polling continues, and the time-out guards only against a hung or dead process. Before the first command of a
+    session there is nothing to guard: the line is low and polling runs. Channels that go home are a setting
+    of the unit: deadman line "Off", steering "Ignore". A command may lower the line too: nothing else reaches a motor
+    whose link is lost.
 
     Args:
         config: calibration and rates.
         port: the Maestro's Command Port.
-        clock: time; the commands' stamps are of the same clock.
+        clock: time, also the clock of the commands' stamps.
         commands: steering commands of the gate.
         out: feedback, angles as servo angles in rad, left positive.
         battery: pack voltage; None when the battery is measured elsewhere.
-        events: where errors of the device are reported.
+        events: errors of the device.
         name: service name.
-        drive: the motor's feedback, whose current explains the battery's sag.
+        drive: motor feedback, whose current explains the battery's sag.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class MaestroDriver:
 
     def _start_session(self) -> None:
         self._command: SteeringCommand | None = None
-        """Newest one."""
+        """Latest command."""
         self._fresh: SteeringCommand | None = None
         """The same, until it is stale."""
         self._failing = False

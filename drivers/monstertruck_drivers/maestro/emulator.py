@@ -39,7 +39,7 @@ CHANNEL_COMMANDS: Final = (Code.SET_TARGET, Code.SET_SPEED, Code.SET_ACCELERATIO
 
 Mode = Literal["dual_port", "uart"]
 Home = float | Literal["off", "ignore"]
-"""What a channel does at an error: pulse in microseconds, no pulses, or nothing."""
+"""Error reaction of a channel: a pulse (us), no pulses, or no change."""
 
 
 @dataclass(slots=True)
@@ -79,14 +79,14 @@ class MaestroEmulator:
     """A Micro Maestro 6 powered by USB.
 
     Settings given here live in the unit's non-volatile memory; targets, speeds and accelerations do not.
-    Faults (``inject``): ``brown_out [seconds]``, ``at_junk``, ``mode dual_port|uart``, ``mute on|off`` (answers
-    are withheld), ``late SECONDS [COUNT]`` (answers come later), ``pulse CHANNEL MICROSECONDS`` (moved by another
+    Faults (``inject``): ``brown_out [seconds]``, ``at_junk``, ``mode dual_port|uart``, ``mute on|off`` (no
+    answers), ``late SECONDS [COUNT]`` (answers come later), ``pulse CHANNEL MICROSECONDS`` (moved by another
     program, beyond its limits), ``error BIT``, ``rail VOLTS``, ``noise LSB``, ``battery VOLTS``.
 
     Args:
         clock: time.
         servos: physics; without it the analog inputs read ``analog_v`` and the pulses move nothing.
-        seed: of the analog noise.
+        seed: seed of the analog noise.
         mode: serial mode; in ``uart`` (as from the factory) bytes over USB are ignored.
         crc: whether commands must carry a CRC-7 byte.
         device_number: for the Pololu protocol.
@@ -94,10 +94,10 @@ class MaestroEmulator:
         home: per channel; default: outputs "off", others "ignore".
         inputs: channels that are analog inputs.
         outputs: channels that are digital outputs.
-        limits_us: least and greatest pulse; targets are clamped.
+        limits_us: minimum and maximum pulse (us); targets are clamped.
         noise_lsb: standard deviation of the analog noise.
-        rail_drift_v: amplitude of a slow (60 s) swing of the 5 V rail, to which inputs are referred.
-        usb: the port it hangs on; lets a brown-out make it vanish and come back.
+        rail_drift_v: amplitude of a slow (60 s) swing of the 5 V rail, the reference of the inputs.
+        usb: port of the unit; lets a brown-out make it vanish and come back.
         on_output: called with (channel, high) when a digital output changes, whatever the cause.
     """
 
@@ -172,13 +172,13 @@ class MaestroEmulator:
         self._report_outputs()
 
     def set_serial_timeout(self, seconds: float) -> None:
-        """Store the silence after which all channels go home; 0 = never."""
+        """Store the serial timeout after which all channels go home (s); 0 = never."""
         self._timeout = round(seconds * SECOND)
 
-    # What the world calls
+    # Interface to the simulated world
 
     def pulse_us(self, channel: int, time_ns: int) -> float | None:
-        """Pulse at ``time_ns``; None = none."""
+        """Pulse at ``time_ns`` (us); None if no pulses are sent."""
         self._tick(time_ns)
         position = self._ramps[channel].position
         return position / 4 if position > 0 else None
@@ -293,7 +293,7 @@ class MaestroEmulator:
                 answer = min(max(errors, 0), 0xFFFF).to_bytes(2, "little")
                 self._errors = Error(0)
             case Code.GET_MOVING_STATE:
-                answer = b"\x00"  # the Micro's firmware fault: says so even while moving
+                answer = b"\x00"  # firmware bug of the Micro: it reports 0 even while moving
             case Code.GET_SCRIPT_STATUS:
                 answer = b"\x01"  # no script is stored
             case _:

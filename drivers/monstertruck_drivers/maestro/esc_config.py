@@ -17,7 +17,7 @@ class EscConfig(Schema):
 
     channel: Channel = 2
     neutral_us: Microseconds = 1500.0
-    """Pulse at which the motor stands"""
+    """Pulse at which the motor stands still"""
     reach_us: Annotated[float, Field(gt=0, le=1000)] = 400.0
     """Change of the pulse that makes the motor turn at max_rate"""
     direction: Literal[-1, 1] = 1
@@ -51,12 +51,12 @@ class MaestroEscConfig(Schema):
 
     @property
     def motor_limits(self) -> MotorLimits:
-        """What the motor does."""
+        """Limits of the motor."""
         return MotorLimits(self.esc.max_rate, self.esc.deceleration, self.esc.quick_deceleration)
 
     @property
     def steering_outputs(self) -> SteeringOutputs:
-        """What its servos do."""
+        """Steering outputs of the servos."""
         return self.unit.steering_outputs
 
     @property
@@ -66,7 +66,7 @@ class MaestroEscConfig(Schema):
 
     @property
     def command_timeout(self) -> float:
-        """Age of the newest command at which the pulse becomes neutral, s."""
+        """Age of the latest command at which the pulse becomes neutral (s)."""
         return self.unit.command_timeout
 
     @property

@@ -1,8 +1,8 @@
 """Driver of a Maestro with a speed controller (ESC) on one of its channels: drives, steers, measures the battery.
 
 The pulse follows every command that the gate sends to the servos, so a stop waits for the next tick. Stale commands
-make it neutral, and so do begin and end of a session. The unit's own serial time-out is the watchdog: it must send this
-channel to the neutral pulse. Nothing measures the motor: what is reported is the rate commanded, slowed as configured.
+make it neutral, as do start and end of a session. The unit's serial time-out is the watchdog: it must send this
+channel to the neutral pulse. The motor is not measured: the reported rate is the commanded rate, slowed as configured.
 """
 
 import math

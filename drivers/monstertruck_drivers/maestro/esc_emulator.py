@@ -1,7 +1,7 @@
-"""A Maestro with a speed controller (ESC) on one of its channels.
+"""Maestro with a speed controller (ESC) on one of its channels.
 
-Habits of the real thing: the speed controller reads a pulse each 20 ms, does not move before it has had neutral pulses
-for a while, lets the motor coast without pulses, and says nothing of what the motor does.
+A real speed controller reads a pulse every 20 ms, does not move before it has received neutral pulses for a while, lets
+the motor coast without pulses, and gives no feedback of the motor.
 """
 
 import asyncio
@@ -15,20 +15,20 @@ from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
 from monstertruck_runtime.clock import SECOND, Clock
 
 NEAR: Final = 10.0
-"""Us around the neutral pulse that count as neutral."""
+"""Tolerance around the neutral pulse (us)."""
 
 
 class MaestroEscEmulator(MaestroEmulator):
     """The unit, its servos, and the speed controller with its motor.
 
-    Faults (``inject``): those of ``MaestroEmulator``.
+    Faults (``inject``): all faults of ``MaestroEmulator``.
 
     Args:
         clock: time.
         plant: the motor.
         servos: physics of the servos.
         settings: channels and pulses.
-        seed: of the analog noise.
+        seed: seed of the analog noise.
     """
 
     def __init__(

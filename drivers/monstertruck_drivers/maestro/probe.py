@@ -1,4 +1,4 @@
-"""Who is on the port, and what does it read: without moving anything."""
+"""Identify a Maestro on the port and read its channels, without motion."""
 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.config import MaestroConfig

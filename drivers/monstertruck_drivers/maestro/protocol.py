@@ -12,7 +12,7 @@ MINI_SSC_START: Final = 0xFF
 CHANNELS: Final = 6
 """Channels of the Micro Maestro."""
 POSITION_MAX: Final = 0x3FFF
-"""Greatest position or target the 14-bit format can hold, quarter microseconds."""
+"""Maximum position or target of the 14-bit format (quarter microseconds)."""
 OUTPUT_THRESHOLD: Final = 6000
 """Targets from here on switch a digital output high."""
 ADC_MAX: Final = 1023
@@ -123,7 +123,7 @@ class Encoder:
         return self.command(Code.SET_TARGET, channel, *halves(quarters))
 
     def set_speed(self, channel: int, speed: int) -> bytes:
-        """Greatest speed in 0.25 us per 10 ms; 0 = unlimited."""
+        """Encode a speed limit (0.25 us per 10 ms); 0 = unlimited."""
         return self.command(Code.SET_SPEED, channel, *halves(speed))
 
     def set_acceleration(self, channel: int, acceleration: int) -> bytes:

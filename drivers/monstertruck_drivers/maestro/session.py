@@ -10,19 +10,19 @@ from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, Pro
 IDENTIFY_ATTEMPTS: Final = 3
 """Tries to identify: another program may be talking into a freshly plugged port."""
 QUIET_AFTER_ANSWER: Final = 0.02
-"""Seconds of silence that end an answer; a Maestro says nothing unasked."""
+"""Silence that ends an answer (s); a Maestro sends nothing without a request."""
 RESYNC_TRIES: Final = 4
 """Tries to come into step with the answers again, at one time."""
 
 
 class MaestroSession:
-    """One session. Answers carry no mark of their own: only their number and form can be checked.
+    """One session. Answers carry no identifier: only their number and form can be checked.
 
     Args:
         link: open link to the Command Port.
         clock: time.
         encoder: protocol form.
-        timeout: seconds in which the answers to one question must come.
+        timeout: timeout of the answers to one request (s).
     """
 
     def __init__(self, link: Link, clock: Clock, encoder: Encoder, timeout: float) -> None:
@@ -124,10 +124,10 @@ class MaestroSession:
             return False
 
     def check(self, positions: list[int], errors: int) -> None:
-        """Refuse words that cannot be what was requested.
+        """Refuse words that cannot be the requested values.
 
         Raises:
-            ProtocolError: out of form, as when a byte was lost.
+            ProtocolError: malformed, as after a lost byte.
         """
         if errors > ERROR_MASK or any(position > POSITION_MAX for position in positions):
             raise ProtocolError(f"{self._link.name}: answers out of form: errors {errors:#x}, positions {positions}")

@@ -1,4 +1,4 @@
-"""From a sentence in the device's units and signs to an attitude in SI units and REP 103 signs."""
+"""Convert a sentence in the device's units and signs to an attitude in SI units and REP 103 signs."""
 
 import math
 from typing import Final, TypeVar

@@ -35,8 +35,8 @@ class IronConfig(Schema):
 class Os4000Config(Schema):
     """OceanServer OS4000 compass.
 
-    Rate, fields and format are written to the unit only where it behaves otherwise. Declination must be zero in
-    the unit: what it sends counts from magnetic north.
+    Rate, fields and format are written to the unit only where it behaves otherwise. Declination must be zero in the
+    unit, so that its headings refer to magnetic north.
     """
 
     kind: Literal["os4000"] = "os4000"
@@ -49,13 +49,13 @@ class Os4000Config(Schema):
     silence: Positive = 0.5
     """Seconds without a correct sentence that end the session; never less than five periods."""
     field_strength: Positive | None = None
-    """Length of the magnetic field vector where the unit was calibrated, microtesla; None = not checked."""
+    """Magnitude of the magnetic field at the place of calibration (microtesla); None = not checked."""
     field_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.25
-    """Share by which the field may differ before the heading counts as disturbed."""
+    """Tolerance of the field (fraction); beyond it, the heading is marked as disturbed."""
     iron: IronConfig = IronConfig()
     """Magnetic calibration of the unit on this truck"""
     gravity_tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.2
-    """Share of 1 g by which the acceleration may differ before roll and pitch stop being tilt."""
+    """Tolerance of the acceleration (fraction of 1 g); beyond it, roll and pitch are not tilt."""
     frame: FrameId = "base"
     """Frame whose axes the unit is mounted along."""
 

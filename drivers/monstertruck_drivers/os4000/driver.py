@@ -1,4 +1,4 @@
-"""Compass driver: what the unit streams becomes attitudes."""
+"""Compass driver: converts the unit's stream into attitudes."""
 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.os4000.attitude import to_attitude
@@ -87,9 +87,9 @@ class Os4000Driver:
             self._events(Reason.DEVICE_MISMATCH, Severity.WARNING, self.name, f"{text} even after setting it")
 
     def _may_write(self, key: Key) -> bool:
-        """Whether a setting may be written once more; it counts as written."""
+        """Whether a setting may be written again; marks it as written."""
         now, before = self._clock.now(), self._written.get(key)
-        # Least seconds between two writes of one setting: they go to memory that wears, and each pauses the stream.
+        # Minimum seconds between two writes of one setting: the memory wears, and each write pauses the stream.
         setting_period = 3600.0
         if before is not None and now - before < setting_period * SECOND:
             return False
@@ -105,7 +105,7 @@ class Os4000Driver:
             text = f"the unit sends {_names(fields)}, configured is {_names(Fields(config.fields))}"
             wrong[Key.FIELDS] = config.fields, text
         rate = observed_rate(heard)
-        rate_tolerance = 0.25  # share by which the observed rate may differ from the configured one
+        rate_tolerance = 0.25  # tolerance of the observed rate, as a fraction of the configured rate
         if rate is None or abs(rate / config.rate - 1) > rate_tolerance:
             seen = "too seldom" if rate is None else f"{rate:.1f} times a second"
             wrong[Key.RATE] = config.rate, f"the unit sends {seen}, configured is {config.rate}"
@@ -128,7 +128,7 @@ class Os4000Driver:
                 limit, heard = self._clock.now() + timeout, session.bytes_heard
 
     def _publish(self, sentences: list[Sentence]) -> bool:
-        """Publish what is usable; sentences that came in one burst are spaced by the period."""
+        """Publish the usable sentences; space sentences from one burst by the period."""
         received = self._clock.now()
         newest = received - round(self._config.delay * SECOND)
         usable = False

@@ -72,24 +72,23 @@ CALIBRATION_KEYS: Final = (Key.CALIBRATE_LEVEL, Key.CALIBRATE_VERTICAL)
 
 
 class Os4000Emulator:
-    """An OS4000-T that streams from power-up on.
+    """OS4000-T that streams from power-up on.
 
-    Faults (``inject``): ``frozen on|off`` (the same sentence again and again), ``silent on|off``, ``bad_checksum N``,
+    Faults (``inject``): ``frozen on|off`` (repeats one sentence), ``silent on|off``, ``bad_checksum N``,
     ``empty_field TAG`` and ``nan_field TAG`` (TAG ``none`` ends it), ``half_sentence``, ``prompt`` (stray text),
-    ``pending [DIGITS]`` (as if a command was left unfinished, with so much of its value), ``rate N`` and ``format N``
-    (stored settings changed by somebody), ``disturbance DEGREES`` (added to the heading), ``drift SHARE`` (of the
-    rate), ``host_baud N``
-    (the host's rate; at another one than the unit's both sides see noise).
+    ``pending [DIGITS]`` (an unfinished command, with DIGITS of its value), ``rate N`` and ``format N``
+    (stored settings changed externally), ``disturbance DEGREES`` (added to the heading), ``drift SHARE`` (of the
+    rate), ``host_baud N`` (the host's rate; if it differs from the unit's rate, both sides see noise).
 
     Args:
         clock: time.
         source: physics.
-        seed: of the sensors' fine noise and of garbled bytes.
+        seed: seed of the sensors' fine noise and of garbled bytes.
         rate: stored rate.
         fields: stored field mask.
         terminators: bytes the firmware takes as end of value.
-        settle: seconds the stream pauses after a setting.
-        pace: bytes take their time on the line at the unit's baud rate.
+        settle: pause of the stream after a setting (s).
+        pace: pace bytes at the unit's baud rate.
     """
 
     def __init__(
@@ -263,7 +262,7 @@ class Os4000Emulator:
                 self._emit(end, now)
                 last = max(last + period, now - period)
                 continue
-            look = 50_000_000  # nanoseconds after which a waiting stream looks whether it may go on
+            look = 50_000_000  # interval at which a paused stream checks whether it may continue (ns)
             await self._clock.sleep_until(now + look if period is None else min(now + look, last + period))
 
     def _period(self) -> int | None:

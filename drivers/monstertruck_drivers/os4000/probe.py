@@ -1,4 +1,4 @@
-"""Who is on the port, and what does it read."""
+"""Identify a compass on the port and read it."""
 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.os4000.config import Os4000Config

@@ -13,7 +13,7 @@ from typing import Final
 
 ESC: Final = 0x1B
 SENTENCE_LIMIT: Final = 200
-"""Bytes without a line end after which what was collected is dropped."""
+"""Bytes without a line end after which the collected bytes are dropped."""
 
 FACTORY_BAUD: Final = 19200
 """Baud rate of a unit as delivered; the kind's row in the catalog makes it the default of a port."""
@@ -25,7 +25,7 @@ RATE_MAX: Final = 40
 
 
 class Fields(IntFlag):
-    """Field mask: what a sentence holds."""
+    """Field mask: content of a sentence."""
 
     HEADING = 1
     PITCH = 2
@@ -78,7 +78,7 @@ class Sentence:
     """Milligauss, if the unit was calibrated with the local field strength."""
     acceleration_length: float | None = None
     acceleration: Xyz | None = None
-    """In g."""
+    """Acceleration (g)."""
 
     @property
     def fields(self) -> Fields:
@@ -199,16 +199,16 @@ def value(number: int) -> bytes:
 
 @dataclass(slots=True)
 class Os4000Parser:
-    """Sentences out of a byte stream, however it is cut; bounded, never stuck.
+    """Extracts sentences from a byte stream, however it is cut; bounded, never stuck.
 
-    Text that is no sentence (prompts, answers, other formats) is kept in ``text`` until taken.
+    Other text (prompts, answers, other formats) is kept in ``text`` until taken.
     """
 
     good: int = 0
     bad: int = 0
-    """Lines with a ``$`` that were no correct sentence, and floods without line end."""
+    """Number of lines with a ``$`` but no correct sentence, and of floods without line end."""
     text: list[bytes] = field(default_factory=list)
-    """The newest lines without ``$``, and sentences of other formats."""
+    """Latest lines without ``$``, and sentences of other formats."""
     _buffer: bytearray = field(default_factory=bytearray)
 
     def feed(self, data: bytes) -> list[Sentence]:

@@ -15,7 +15,7 @@ LISTEN: Final = 1.2
 LEAVE: Final = b"\x1b\r"
 """ESC leaves a command; where there was none it begins one, which CR, being no key, leaves again."""
 SAMPLES: Final = 6
-"""Sentences from which rate and fields are determined."""
+"""Number of sentences used to determine rate and fields."""
 
 
 class Os4000Session:
@@ -76,7 +76,7 @@ class Os4000Session:
             DeviceTimeoutError: silence to the end.
             WrongDeviceError: bytes come, but no sentence of an OS4000.
         """
-        # What a half-typed command holds must not be taken for its value: it is left before anything is ended.
+        # The content of a half-typed command must not become its value: leave the command before ending anything.
         set_rate = protocol.key(Key.RATE) + protocol.value(rate)
         remedies = [LEAVE, b"\r", set_rate]
         heard = await self.listen(LISTEN)
@@ -135,7 +135,7 @@ def observed_fields(heard: list[tuple[int, Sentence]]) -> Fields:
 
 
 def observed_rate(heard: list[tuple[int, Sentence]]) -> float | None:
-    """Sentences a second, by the median interval: a lost sentence or a burst does not count; None = too few."""
+    """Return sentences per second from the median interval, robust to a lost sentence or a burst; None = too few."""
     times = [time for time, _ in heard]
     intervals = sorted(after - before for before, after in pairwise(times))
     if len(intervals) < 2 or intervals[len(intervals) // 2] == 0:

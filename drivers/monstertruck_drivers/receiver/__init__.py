@@ -1,1 +1,1 @@
-"""Receivers of radio controls: the operator beside the robot."""
+"""Receivers of radio controls, for the operator next to the robot."""

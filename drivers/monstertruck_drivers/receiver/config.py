@@ -1,4 +1,4 @@
-"""Settings of receivers: what the channels mean."""
+"""Receiver settings: meaning of the channels."""
 
 from typing import Annotated, Literal, Self
 
@@ -11,28 +11,28 @@ Channel = Annotated[int, Field(ge=1, le=CHANNELS)]
 
 
 class ReceiverConfig(Schema):
-    """Channels of the radio control, as the transmitter numbers them."""
+    """Channels of the radio control, numbered as on the transmitter."""
 
     speed: Channel = 2
-    """Stick of the speed"""
+    """Speed stick"""
     steer: Channel = 1
-    """Stick of the steering"""
+    """Steering stick"""
     arm: Channel = 5
-    """Switch without which the robot does not move"""
+    """Arming switch; the robot moves only while it is on"""
     drive: Channel | None = None
-    """Switch by which the hand drives; off, planners may drive and the hand only supervises; null = it always drives"""
+    """Switch for manual driving; off: planners may drive, the operator only supervises; null: always manual"""
     estop: Channel | None = None
-    """Switch of the emergency stop; null = none"""
+    """Emergency stop switch; null = none"""
     unseen: Channel | None = None
-    """Switch to drive into unseen ground; null = none"""
+    """Switch that permits driving into unseen ground; null = none"""
     inverted: Annotated[tuple[Channel, ...], Field(strict=False)] = (1,)
-    """Channels that count the other way; without this, up is ahead and left is on. Transmitters send more for right"""
+    """Channels with reversed sign; otherwise up is ahead and left is on. Transmitters send higher values for right"""
     dead_band: Annotated[float, Field(ge=0, le=0.3)] = 0.05
-    """Share of a stick's way around its middle that counts as the middle"""
+    """Dead band around a stick's centre, as a fraction of its travel"""
     settle: Annotated[int, Field(ge=1, le=20)] = 3
-    """Frames in a row in which a switch must be on before it counts as on; off counts at once"""
+    """Consecutive frames with a switch on before it takes effect; off takes effect at once"""
     silence: Annotated[float, Field(gt=0, le=2)] = 0.2
-    """Seconds without channels after which the transmitter counts as lost"""
+    """Time without channels after which the transmitter is lost (s)"""
 
     @model_validator(mode="after")
     def _each_once(self) -> Self:
@@ -43,12 +43,12 @@ class ReceiverConfig(Schema):
 
 
 class CrsfConfig(ReceiverConfig):
-    """Receiver that speaks CRSF: ExpressLRS or TBS Crossfire."""
+    """CRSF receiver: ExpressLRS or TBS Crossfire."""
 
     kind: Literal["crsf"] = "crsf"
 
 
 class SbusConfig(ReceiverConfig):
-    """Receiver that speaks SBUS, behind an adapter that inverts the line."""
+    """SBUS receiver behind an adapter that inverts the line."""
 
     kind: Literal["sbus"] = "sbus"

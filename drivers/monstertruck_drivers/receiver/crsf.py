@@ -50,7 +50,7 @@ def channels_frame(channels: ChannelWords) -> bytes:
 
 
 def link_frame(quality: float, rssi: float) -> bytes:
-    """Return a frame with the quality of the radio link; what is not used is 0."""
+    """Return a frame with the quality of the radio link; unused fields are 0."""
     signal = max(0, min(255, round(-rssi)))
     return frame(LINK_TYPE, bytes((signal, signal, round(100 * quality), *bytes(LINK_SIZE - 3))))
 

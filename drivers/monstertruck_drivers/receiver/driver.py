@@ -1,4 +1,4 @@
-"""Driver of a receiver: channels become what the hand of the operator beside the robot asks for."""
+"""Receiver driver: turns channels into the requests of the operator who stands next to the robot."""
 
 from collections import deque
 from typing import Final
@@ -18,7 +18,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import HandControls
 
 PERIOD: Final = SECOND // 50
-"""Between two messages; a change of the switches or of the link comes at once."""
+"""Time between two messages (ns); a change of the switches or of the link is published at once."""
 
 
 def parser_of(config: ReceiverConfig) -> ReceiverParser:
@@ -27,27 +27,27 @@ def parser_of(config: ReceiverConfig) -> ReceiverParser:
 
 
 class Hand:
-    """What the newest frames together say. Pure.
+    """State of the radio control, accumulated from frames. Pure.
 
     Args:
-        config: what the channels mean.
+        config: meaning of the channels.
     """
 
     def __init__(self, config: ReceiverConfig) -> None:
         self._config = config
         self._channels: ChannelWords | None = None
         self._heard = 0
-        """When the newest channels came, ns."""
+        """Arrival time of the latest channels (ns)."""
         self._on: dict[int, int] = {}
-        """Frames in a row in which a switch was on, by channel."""
+        """Consecutive frames with the switch on, by channel."""
         self._failsafe = False
         self._quality: float | None = None
         self._rssi: float | None = None
-        recent = 100  # frames of which the share that arrived is the link quality of a receiver that does not say it
+        recent = 100  # frames over which the link quality is computed if the receiver does not report it
         self._missed: deque[bool] = deque(maxlen=recent)
 
     def take(self, frame: ReceiverFrame, now: int) -> None:
-        """Take one frame that came at ``now``."""
+        """Process one frame that arrived at ``now``."""
         if frame.quality is not None:
             self._quality, self._rssi, self._failsafe = frame.quality, frame.rssi, frame.failsafe
         if frame.channels is None:
@@ -59,7 +59,7 @@ class Hand:
             return
         self._channels, self._heard = frame.channels, now
         for channel, raw in enumerate(frame.channels, 1):
-            on = self._position(channel, raw) > 0.5  # position from which on a switch is on
+            on = self._position(channel, raw) > 0.5  # position above which a switch is on
             self._on[channel] = self._on.get(channel, 0) + 1 if on else 0
 
     def lost(self, now: int) -> bool:
@@ -68,7 +68,7 @@ class Hand:
         return silent or self._failsafe
 
     def controls(self, now: int, seq: int, frame: str) -> HandControls:
-        """Return what the hand asks for; nothing while the transmitter is lost."""
+        """Return the operator's requests; neutral while the transmitter is lost."""
         config, lost = self._config, self.lost(now)
         quality = self._quality
         if quality is None and self._missed:
@@ -102,15 +102,15 @@ class Hand:
 
 
 class ReceiverDriver:
-    """Listens.
+    """Receives frames and publishes hand controls.
 
     Args:
         config: protocol and channels.
-        port: where the receiver hangs.
+        port: port of the receiver.
         clock: time.
-        out: what the hand asks for, at 50 Hz, while the transmitter is lost as well.
-        events: its loss and return.
-        name: of the service.
+        out: the operator's requests, at 50 Hz, also while the transmitter is lost.
+        events: loss and return of the transmitter.
+        name: name of the service.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class ReceiverDriver:
         self._out = out
         self._events = events
         self._said: bool | None = None
-        """Whether the loss of the transmitter was reported."""
+        """Reported state of the transmitter, True = lost; None before the first report."""
 
     async def run(self, ready: Ready) -> None:
         """Serve one session.
@@ -138,7 +138,7 @@ class ReceiverDriver:
             DeviceLostError: unplugged.
             DeviceTimeoutError: silence.
             ProtocolError: bytes without a frame.
-            WrongDeviceError: nothing that comes at the start is a frame.
+            WrongDeviceError: bytes arrive at the start, but no frame.
             PortBusyError: another process holds the port.
         """
         async with await self._port.open() as link:
@@ -156,11 +156,11 @@ class ReceiverDriver:
                     heard = self._clock.now()
                 except (DeviceTimeoutError, ProtocolError):
                     frames = []
-                    if self._clock.now() - heard > 1.0 * SECOND:  # seconds without a byte that end the session
+                    if self._clock.now() - heard > 1.0 * SECOND:  # seconds without a byte after which the session ends
                         raise
 
     def _publish(self, hand: Hand, newest: HandControls | None) -> HandControls:
-        """Publish when it is due, or when a switch or the link has changed; returns the newest message."""
+        """Publish when due, or when a switch or the link has changed; return the latest message."""
         now = self._clock.now()
         controls = hand.controls(now, self._out.next_seq(), self.name)
         if newest is not None and now - newest.received < PERIOD and controls.switches == newest.switches:

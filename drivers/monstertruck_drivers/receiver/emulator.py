@@ -1,8 +1,7 @@
-"""The device side of receivers, byte for byte, with the hand that holds their transmitter.
+"""Device side of receivers, byte for byte, with their transmitter and its operator.
 
-Habits of the real things: they stream unasked; a CRSF receiver without its transmitter sends no channels and a link
-quality of 0; an SBUS receiver goes on with its newest channels, says for a while that packets are lost, then that it
-has lost its transmitter.
+Real receivers stream without a request. Without its transmitter, a CRSF receiver sends no channels and a link quality
+of 0; an SBUS receiver repeats its latest channels, reports lost packets for a while, then the loss of its transmitter.
 """
 
 from typing import Final
@@ -19,19 +18,19 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
 FAILSAFE_AFTER: Final = SECOND
-"""After which an SBUS receiver says that it has lost its transmitter, ns."""
+"""Time after which an SBUS receiver reports the loss of its transmitter (ns)."""
 
 
 class ReceiverEmulator:
     """A receiver and its transmitter: sticks in the middle, switches off.
 
-    Faults (``inject``): ``move CHANNEL POSITION`` (the hand does it), ``transmitter on|off``, ``quality SHARE``,
-    ``silent on|off``, ``damage N`` (the next so many frames have a wrong byte).
+    Faults (``inject``): ``move CHANNEL POSITION`` (by the operator), ``transmitter on|off``, ``quality SHARE``,
+    ``silent on|off``, ``damage N`` (the next N frames have a wrong byte).
 
     Args:
         clock: time.
-        settings: which protocol.
-        seed: of packets that are lost.
+        settings: selects the protocol.
+        seed: seed of the packet loss.
     """
 
     def __init__(self, clock: Clock, settings: ReceiverConfig | None = None, *, seed: int = 0) -> None:
@@ -57,7 +56,7 @@ class ReceiverEmulator:
         self._positions[channel - 1] = raw(position)
 
     def power_cycle(self) -> None:
-        """Supply off and on: the transmitter is found again, if it is on."""
+        """Switch the supply off and on: the receiver finds its transmitter again if that is on."""
 
     def inject(self, fault: str, *values: str) -> None:
         """Start or end a fault, see the class.
@@ -86,7 +85,7 @@ class ReceiverEmulator:
             ) from error
 
     async def run(self, end: DeviceEnd) -> None:
-        """DeviceStream until cancelled."""
+        """Stream frames until cancelled."""
         end.baud = CRSF_BAUD if self._crsf else SBUS_BAUD
         crsf_period = SECOND // 100  # between two packets of a transmitter at 100 Hz, ns
         period = crsf_period if self._crsf else round(SBUS_PERIOD * SECOND)
@@ -129,5 +128,5 @@ def emulated(setup: EmulatorSetup) -> ReceiverEmulator:
 
 
 def emulated_sbus(setup: EmulatorSetup) -> ReceiverEmulator:
-    """The receiver of a simulated robot, which speaks SBUS."""
+    """SBUS receiver of a simulated robot."""
     return ReceiverEmulator(setup.clock, setup.settings or SbusConfig(), seed=setup.seed)

@@ -1,4 +1,4 @@
-"""What a receiver says, whatever its protocol."""
+"""Receiver messages, independent of the protocol."""
 
 from typing import NamedTuple, Protocol
 
@@ -6,24 +6,24 @@ from monstertruck_drivers.receiver.protocol import ChannelWords
 
 
 class ReceiverFrame(NamedTuple):
-    """One message of a receiver; what it does not say is None."""
+    """One message of a receiver; fields it does not carry are None."""
 
     channels: ChannelWords | None = None
     quality: float | None = None
-    """Share of the radio's packets that arrive, 0 to 1."""
+    """Fraction of the radio's packets that arrive, 0 to 1."""
     rssi: float | None = None
-    """Of the better antenna, dBm."""
+    """Signal strength at the better antenna (dBm)."""
     failsafe: bool = False
-    """The receiver itself says that it has lost its transmitter."""
+    """The receiver reports that it has lost its transmitter."""
     lost: bool = False
-    """The receiver missed a packet: the channels are those of an earlier one."""
+    """The receiver missed a packet, so the channels are from an earlier packet."""
 
 
 class ReceiverParser(Protocol):
-    """Cuts the bytes of a receiver into messages."""
+    """Splits the bytes of a receiver into messages."""
 
     refused: int
-    """Bytes that belonged to none."""
+    """Number of bytes that belonged to no message."""
 
     def feed(self, data: bytes) -> list[ReceiverFrame]:
         """Return messages that became complete."""

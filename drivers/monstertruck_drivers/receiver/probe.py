@@ -1,4 +1,4 @@
-"""Is a receiver on the port, and what does it hear?"""
+"""Detect a receiver on the port and read its channels."""
 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig, SbusConfig
@@ -20,7 +20,7 @@ async def probe(port: Port, clock: Clock, settings: ReceiverConfig | None = None
         DeviceError: see the driver's ``run``.
     """
     config = settings or CrsfConfig()
-    look = 0.5  # seconds for which frames are collected
+    look = 0.5  # duration of the frame collection (s)
     async with await port.open() as link:
         stream = DeviceStream(link, clock, parser_of(config).feed)
         frames = await first_frames(stream, config)

@@ -1,9 +1,9 @@
 """SBUS frames of a receiver (Futaba and others); source: the decoder of PX4 (``src/lib/rc/sbus.cpp``).
 
 100000 baud, 8 data bits, even parity, 2 stop bits, the line inverted: an adapter or a transistor must invert it back.
-A frame has 25 bytes, every 7 or 14 ms: 0F, the channels, flags, and 00 (or 04, 14, 24, 34 of SBUS 2). Flag 4 says that
-the radio packet was lost, flag 8 that the receiver has lost its transmitter. There is no sum: a wrong bit is a wrong
-position, so a frame that follows damage counts only once the next one begins where it ends.
+A frame has 25 bytes, every 7 or 14 ms: 0F, the channels, flags, and 00 (or 04, 14, 24, 34 of SBUS 2). Flag 4 marks
+a lost radio packet, flag 8 the loss of the transmitter. There is no checksum: a wrong bit is a wrong
+position, so a frame after damage is accepted only once the next frame begins where it ends.
 """
 
 from typing import Final

@@ -1,4 +1,4 @@
-"""Settings of a RoboClaw that counts encoders."""
+"""Settings of a RoboClaw as encoder counter."""
 
 import math
 from typing import Annotated, Literal
@@ -18,7 +18,7 @@ class RoboclawConfig(Schema):
     counts_per_turn: Annotated[int, Field(ge=8, le=1_000_000)] = 4096
     """Edges of both channels in one turn of the WHEEL"""
     left: Literal[1, 2] = 1
-    """Input of the left wheel; the right wheel has the other one"""
+    """Encoder input of the left wheel; the right wheel has the other input"""
     left_inverted: bool = False
     """Driving forward counts down"""
     right_inverted: bool = False
@@ -26,9 +26,9 @@ class RoboclawConfig(Schema):
     rate: Annotated[float, Field(ge=5, le=50)] = 25.0
     """Readings a second"""
     answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.03
-    """Seconds in which an answer must come"""
+    """Timeout of an answer (s)"""
     max_rate: Annotated[float, Field(gt=0, le=1000)] = 10.0
-    """Greatest rate of a wheel, rad/s; counts that would need more mean that the unit has restarted"""
+    """Maximum rate of a wheel (rad/s); counts that imply a higher rate mean that the unit has restarted"""
 
     @property
     def count(self) -> float:

@@ -76,10 +76,10 @@ class RoboclawDriver:
                 self._publish(stamp)
 
     def _count(self, before: tuple[int, int], now: tuple[int, int], dt: float) -> None:
-        """Add up what was counted in ``dt`` seconds.
+        """Accumulate the counts of ``dt`` seconds.
 
         Raises:
-            DeviceRestartedError: more than wheels turn in that time.
+            DeviceRestartedError: more counts than the wheels can turn in that time.
         """
         steps = [step(old, new) for old, new in zip(before, now, strict=True)]
         if max(map(abs, steps)) * self._config.count > self._config.max_rate * dt:

@@ -23,22 +23,22 @@ THINKING: Final = MILLISECOND
 
 
 class RoboclawEmulator:
-    """A unit with its encoders wired as the settings say.
+    """Unit with its encoders wired according to the settings.
 
     Faults (``inject``): ``stuck left|right on|off`` (an encoder's disc slips on its shaft), ``mirrored left|right
-    on|off`` (its channels are exchanged: it counts the other way), ``silent on|off`` (gives no answers), ``noise
-    COUNT`` (so many answers have a wrong byte), ``reset`` (the supply drops: counters at 0).
+    on|off`` (its channels are exchanged: it counts backwards), ``silent on|off`` (gives no answers), ``noise
+    COUNT`` (COUNT answers have a wrong byte), ``reset`` (the supply drops: counters at 0).
 
     Args:
         clock: time.
-        source: what the wheels do.
-        settings: address, counts per turn, which input is whose.
+        source: source of the wheels' angles.
+        settings: address, counts per turn, assignment of the inputs.
     """
 
     def __init__(self, clock: Clock, source: WheelSource, settings: RoboclawConfig | None = None) -> None:
         self.name = "roboclaw"
         self.received = ReceivedBytes()
-        """Newest bytes from the host."""
+        """Latest bytes from the host."""
         self.signals = Signals(clock.now, dict.fromkeys(("left", "right"), SignalKind.NUMBER), np.random.default_rng(0))
         self._clock = clock
         self._source = source
@@ -48,7 +48,7 @@ class RoboclawEmulator:
         self._silent = False
         self._noise = 0
         self._angles: tuple[float, float] | None = None
-        """Of the wheels at the last reading, rad."""
+        """Angles of the wheels at the last reading (rad)."""
         self._counted = [0.0, 0.0]
         """Left and right, since power-up."""
 
@@ -115,7 +115,7 @@ class RoboclawEmulator:
         end.write(answer)
 
     def _look(self) -> None:
-        """Count what the wheels turned since the last look."""
+        """Count the wheels' rotation since the last call."""
         now = self._source.wheels(self._clock.now())
         before, self._angles = self._angles or now, now
         settings = self._settings

@@ -11,12 +11,12 @@ from enum import IntEnum
 from typing import Final
 
 NAME: Final = b"roboclaw"
-"""In what the unit says of itself, in capitals or not."""
+"""Part of the unit's version text, in any case."""
 ADDRESSES: Final = (0x80, 0x87)
 """Lowest and highest."""
 LONGEST_NAME: Final = 48
 PACKET_GAP: Final = 0.01
-"""Seconds without a byte after which the unit drops what it has of a request."""
+"""Silence after which the unit drops a partial request (s)."""
 COUNTER: Final = 1 << 32
 _COUNTS: Final = struct.Struct(">II")
 _CRC: Final = struct.Struct(">H")

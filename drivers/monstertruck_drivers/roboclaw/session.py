@@ -21,8 +21,8 @@ class RoboclawSession:
     Args:
         link: open link.
         clock: time.
-        address: of the unit.
-        timeout: seconds in which an answer comes.
+        address: address of the unit.
+        timeout: timeout of an answer (s).
     """
 
     def __init__(self, link: Link, clock: Clock, address: int, timeout: float) -> None:
@@ -32,7 +32,7 @@ class RoboclawSession:
         self._timeout = timeout
 
     async def identify(self) -> str:
-        """What the unit calls itself.
+        """Return the unit's version text.
 
         Raises:
             DeviceLostError: unplugged.
@@ -72,7 +72,7 @@ class RoboclawSession:
         return counts(answer)
 
     async def _text(self) -> bytes:
-        """What comes after a question for the version."""
+        """Return the answer to a version request."""
         self._link.discard()
         self._link.write(request(self._address, RoboclawCommand.VERSION))
         answer, until = b"", self._clock.now() + round(self._timeout * SECOND)

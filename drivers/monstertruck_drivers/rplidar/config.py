@@ -9,7 +9,7 @@ from monstertruck_drivers.scanning.config import TurningHeadConfig
 
 
 class RplidarConfig(TurningHeadConfig):
-    """SLAMTEC RPLIDAR; it says itself which model it is and in which modes it scans."""
+    """SLAMTEC RPLIDAR; the unit itself reports its model and scan modes."""
 
     kind: Literal["rplidar"] = "rplidar"
     model: Literal["a1", "a2", "a3", "c1", "s1", "s2"] = "a1"

@@ -34,11 +34,11 @@ STANDS: Final = ": its motor does not turn (an A1's turns with port.dtr false)"
 
 
 class SampleStream:
-    """From the bytes of a stream to samples, each with the time at which it was measured if it came at once.
+    """Decodes the bytes of a stream into samples, each with its measurement time assuming immediate arrival.
 
     Args:
-        mode: of the scan.
-        baud: of the line; None where it has no rate of its own.
+        mode: scan mode.
+        baud: baud rate of the line; None where it has none.
     """
 
     def __init__(self, mode: ScanMode, baud: int | None) -> None:
@@ -68,7 +68,7 @@ class SampleStream:
         assert record.start is not None
         assert following.start is not None
         span = float((following.start - record.start) % TURN_Q6)
-        agree = 0.25  # share by which a record's span may differ from the usual one: else records between were lost
+        agree = 0.25  # tolerated deviation of a record's span (share of the usual): else records were lost
         if self._usual is not None and abs(span - self._usual) <= agree * self._usual:
             self._usual += (span - self._usual) / 8
             self._odd.clear()

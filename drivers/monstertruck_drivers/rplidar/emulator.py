@@ -39,24 +39,24 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
 GREETING: Final = b"RP LIDAR System.\r\nFirmware Ver 1.29 - rc7, HW Ver 7\r\nModel: 18\r\n"
-"""What an A1 says when it starts."""
+"""Startup message of an A1."""
 RANGE: Final = "range"
 """Distances of a record, mm."""
 SCAN: Final = "scan"
 
 
 class RplidarEmulator:
-    """A RPLIDAR.
+    """RPLIDAR with its rotating head.
 
     Faults (``inject``): ``silent on|off`` and ``deaf on|off``, ``health 0|1|2 CODE`` (2: protects itself until it is
-    reset), ``broken on|off`` (protects itself after a reset, too), ``bad_checksum N`` (the next so many records),
-    ``torn`` (the next record begins in its middle), and those of the head.
+    reset), ``broken on|off`` (protects itself after a reset, too), ``bad_checksum N`` (the next N records),
+    ``torn`` (the next record begins in its middle), and the faults of the head.
 
     Args:
         clock: time.
-        source: what it sees.
-        model: by its data sheet.
-        seed: of covers.
+        source: source of the ranges.
+        model: model according to its data sheet.
+        seed: seed of covers.
         firmware: below 1.24 it does not list its modes.
         serial: 32 hexadecimal digits.
     """
@@ -75,7 +75,7 @@ class RplidarEmulator:
         self.received = ReceivedBytes()
         """Bytes the host sent, for tests."""
         self.mode: ScanMode | None = None
-        """In which it scans; None = idle."""
+        """Current scan mode; None = idle."""
         rng = np.random.default_rng(seed)
         self.signals = Signals(clock.now, {RANGE: SignalKind.ARRAY, SCAN: SignalKind.SWITCH}, rng, codes={RANGE: 1})
         self.head = TurningHead(clock, source, model.ranges, model.frequency, rng)
@@ -88,7 +88,7 @@ class RplidarEmulator:
         self._input = b""
         self._ready_at = 0
         self._angle = 0.0
-        """Of the newest standard sample, turns."""
+        """Angle of the latest standard sample (turns)."""
         self.power_cycle()
 
     async def run(self, end: DeviceEnd) -> None:
@@ -150,7 +150,7 @@ class RplidarEmulator:
     # Requests
 
     def _request(self) -> tuple[int, bytes] | None:
-        """The next request: command and payload; what is none is dropped."""
+        """Return the next request as command and payload; drop bytes that form no request."""
         while self._input:
             data = self._input
             if data[0] != SYNC:
@@ -200,10 +200,10 @@ class RplidarEmulator:
                     self._begin(end, modes[number] if number else _first_capsules(modes), forced=False)
 
     def _drive(self, payload: bytes) -> None:
-        """The adapter board sets the motor's speed; a scan goes on."""
+        """Set the motor speed, as the adapter board does; a running scan continues."""
         if self._model.adapter and len(payload) == struct.calcsize("<H"):
             (pwm,) = struct.unpack("<H", payload)
-            default_pwm = 660  # duty cycle, of 1023, at which the head turns as the data sheet says
+            default_pwm = 660  # duty cycle (of 1023) at which the head turns at the data sheet's rate
             self.head.frequency = self._model.frequency * pwm / default_pwm
 
     def _begin(self, end: DeviceEnd, mode: ScanMode, *, forced: bool) -> None:

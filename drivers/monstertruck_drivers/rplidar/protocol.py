@@ -5,13 +5,13 @@ before. An answer begins with a descriptor: A5 5A, 30 bits of length and 2 of mo
 come in one of four forms:
 
 - standard (0x81): one sample in five bytes, checked by three bits only;
-- express (0x82): 32 samples in 84 bytes, each with an angle of its own to be subtracted;
-- ultra (0x84): 96 samples in 132 bytes, of three neighbours one is whole and two are differences; angles follow from
-  the distances, as the maker's own library computes them;
+- express (0x82): 32 samples in 84 bytes, each with an individual angle correction to subtract;
+- ultra (0x84): 96 samples in 132 bytes, one of three neighbours is absolute and two are differences; angles follow from
+  the distances, as in the maker's library;
 - dense (0x85): 40 samples in 84 bytes.
 
-The last three say where they begin; their samples are spread evenly up to the beginning of the next. Angles grow
-clockwise seen from above, 0 is straight ahead.
+The last three state their start angle; their samples are spread evenly up to the start of the next record. Angles
+increase clockwise seen from above, 0 is straight ahead.
 """
 
 import functools
@@ -93,7 +93,7 @@ class RplidarModel(NamedTuple):
 
     title: str
     number: int
-    """As it states itself."""
+    """Model number reported by the unit."""
     baud: int
     ranges: RangeSheet
     modes: tuple[ScanMode, ...]
@@ -167,7 +167,7 @@ def config_request(key: ConfigKey, mode: int = 0) -> bytes:
 
 
 class Descriptor(NamedTuple):
-    """What follows."""
+    """Descriptor of the following answer."""
 
     length: int
     """Bytes of one record."""
@@ -221,7 +221,7 @@ class Record(NamedTuple):
     """Samples as they came in one record."""
 
     start: int | None
-    """Angle at which the samples begin, 1/64 degrees; None: each has its own."""
+    """Start angle of the samples (1/64 degrees); None if each sample has an angle."""
     fresh: bool
     """Whether a stream begins with it."""
     data: bytes
@@ -410,7 +410,7 @@ def _signed(ten_bits: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def ultra_offset(millimetres: Array) -> Array:
-    """Angle to be subtracted at distances (n,), turns: where the triangulating sensor looks from beside its axis."""
+    """Angle to subtract at distances (n,) (turns), as the triangulating sensor is offset from its axis."""
     quarter = np.maximum(millimetres * 4.0, 1.0)
     part = np.floor(98361.0 / quarter)
     near = math.radians(8.0) * 65536.0 - part * 64.0 - part**3 / 98304.0

@@ -36,7 +36,7 @@ QUIET: Final = 0.1
 
 @dataclass(frozen=True, slots=True)
 class ScannerUnit:
-    """What the handshake found."""
+    """Result of the handshake."""
 
     identity: RplidarIdentity
     health: Health
@@ -81,7 +81,7 @@ class RplidarSession:
             health = await self._health()
             if health.status == protected:
                 raise DeviceFaultError(f"{self._link.name}: unit protects itself, code 0x{health.code:04x}")
-        lists_modes_from = (1, 24)  # firmware from which on a unit lists its modes (maker's protocol, GET_LIDAR_CONF)
+        lists_modes_from = (1, 24)  # first firmware that lists its modes (maker's protocol, GET_LIDAR_CONF)
         lists = identity.firmware >= lists_modes_from
         modes, typical = await self._listed_modes() if lists else await self._early_modes()
         return ScannerUnit(identity, health, modes, typical, await self._has_pwm(identity))
@@ -111,14 +111,14 @@ class RplidarSession:
             raise DeviceTimeoutError(f"{self._link.name}: silent for {within:.1f} s") from None
 
     async def stop(self) -> None:
-        """End whatever it is doing, and throw away what it still sends.
+        """Stop the unit and discard the bytes it still sends.
 
         Raises:
             WrongDeviceError: it does not fall silent.
         """
         for _ in range(5):  # requests to stop: half a request of a dead host may swallow the first ones
             self._link.write(request(RplidarCommand.STOP))
-            until = self._clock.now() + round(0.3 * SECOND)  # seconds in which a stream must end
+            until = self._clock.now() + round(0.3 * SECOND)  # seconds within which a stream must end
             while self._clock.now() < until:
                 try:
                     await self._link.read(QUIET)
@@ -215,7 +215,7 @@ class RplidarSession:
         while not head.startswith(ANSWER):
             self._heard += 1
             passed += 1
-            if passed > 4096:  # more than any unit says before it answers
+            if passed > 4096:  # more than any unit sends before it answers
                 raise WrongDeviceError(f"{self._link.name}: {passed} bytes, but no answer of a RPLIDAR")
             head = head[1:] + await self._exactly(1, what)
         return head

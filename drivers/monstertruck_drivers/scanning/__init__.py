@@ -1,1 +1,1 @@
-"""What scanners of all makers have in common."""
+"""Code shared by scanners of all makers."""

@@ -1,7 +1,7 @@
-"""The scanner's millisecond counter on the daemon's clock: drift, slews of either clock, restarts, late scans.
+"""Map the scanner's millisecond counter to the daemon's clock: drift, slews of either clock, restarts, late scans.
 
-A scan arrives a latency after its counter value, and never sooner than the least latency; so the lower envelope of
-(arrival - counter) shows how both clocks run apart, and one comparison of both at the start shows the latency.
+A scan arrives one latency after its counter value, and never sooner than the minimum latency. The lower envelope of
+(arrival - counter) therefore shows the drift between both clocks; one clock comparison at the start shows the latency.
 """
 
 from collections import deque
@@ -13,17 +13,17 @@ from monstertruck_runtime.clock import SECOND
 
 MILLISECOND: Final = 1_000_000
 BLOCK: Final = 10
-"""Scans of which the promptest one stands for all in the estimate of the drift."""
+"""Scans per block; the drift estimate uses only the promptest scan of a block."""
 BLOCKS: Final = 20
-"""Blocks of that estimate, at most."""
+"""Maximum number of blocks in the drift estimate."""
 RECENT: Final = 6
-"""Blocks of the estimate at its start, and after a clock was slewed."""
+"""Blocks in the drift estimate at its start, and after a clock was slewed."""
 BREAK: Final = 3e-3
-"""Difference of the drifts by recent and by all blocks that only a slew explains."""
+"""Difference between the drifts of recent and of all blocks that only a slew explains (s/s)."""
 GREATEST_DRIFT: Final = 0.12
-"""Greatest relative drift of a clock that is slewed: chrony and the kernel slew by a tenth at most."""
+"""Maximum relative drift of a slewed clock: chrony and the kernel slew by at most a tenth."""
 PROMPT: Final = 8
-"""Scans of which one at least is prompt: all above the envelope means that the clocks run apart."""
+"""Scans among which at least one is prompt: if all lie above the envelope, the clocks run apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,59 +31,60 @@ class Anchor:
     """One comparison of both clocks."""
 
     counter: int
-    """Sensor's milliseconds."""
+    """Counter of the sensor (ms)."""
     host: int
-    """The daemon's time when the counter said so, ns."""
+    """Daemon's time at this counter value (ns)."""
     round_trip: int = 0
-    """How long the exchange took, ns; half of it bounds the error."""
+    """Duration of the exchange (ns); half of it bounds the error."""
 
 
 class ClockMap:
-    """Stamps of counter values, never going backwards.
+    """Stamps counter values; stamps never go backwards.
 
     Args:
-        nominal_latency: ns from a counter value to the arrival of its scan, if nothing delays it; used where it cannot
-            be measured (no ``anchor``, or the counter restarted before the first scan), and none that is measured is
-            less, but for a slew: while the drift is not known yet, a fast sensor's scans seem to arrive too soon.
-        anchor: comparison made at start.
-        turn: milliseconds after which the counter starts at 0 again.
+        nominal_latency: time from a counter value to the arrival of its scan without delay (ns). Used where the latency
+            cannot be measured (no ``anchor``, or the counter restarted before the first scan). It is also the lower
+            bound of a measured latency, except for a slew: while the drift is still unknown, scans of a fast sensor
+            seem to arrive too soon.
+        anchor: clock comparison made at the start.
+        turn: counter period (ms); the counter then restarts at 0.
     """
 
     def __init__(self, nominal_latency: int, anchor: Anchor | None = None, *, turn: int = 1 << 24) -> None:
         self._turn = turn * MILLISECOND
         self.restarts = 0
-        """How often the counter restarted."""
+        """Number of counter restarts."""
         self.late = 0
-        """By how much all of the newest scans arrived later than the latency explains, ns; 0 = they do not."""
+        """Delay of all recent scans beyond the latency (ns); 0 if they are on time."""
         self._latency = nominal_latency
         self._least_latency = round(nominal_latency * (1.0 - GREATEST_DRIFT))
         self._reference: int | None = None if anchor is None else anchor.host
         self._counter: int | None = None if anchor is None else anchor.counter
         self._host = 0 if anchor is None else anchor.host
-        self._elapsed = 0  # sensor's ns since the first comparison
+        self._elapsed = 0  # sensor time since the first comparison (ns)
         self._envelope = 0.0
         self._drift = Drift()
         self._settling: list[tuple[int, int]] = []
         self._newest: deque[tuple[int, int]] = deque(maxlen=PROMPT)
-        self._window: deque[tuple[int, int]] = deque(maxlen=60)  # scans of which the promptest one is the envelope
+        self._window: deque[tuple[int, int]] = deque(maxlen=60)  # its promptest scan is the envelope
         self._stamp: int | None = None
 
     @property
     def slews(self) -> int:
-        """How often the drift changed as it does only when a clock is slewed, or no longer is."""
+        """Number of drift changes that only the start or end of a slew explains."""
         return self._drift.breaks
 
     @property
     def drift(self) -> float:
-        """By how much slower than the daemon's the sensor's clock runs, s/s."""
+        """Drift of the sensor's clock (s/s), positive if it runs slower than the daemon's clock."""
         return self._drift.rate
 
     def stamp(self, counter: int, arrival: int) -> int:
-        """The daemon's time, ns, at which the sensor's counter said ``counter``.
+        """Return the daemon's time when the sensor's counter was ``counter`` (ns).
 
         Args:
-            counter: milliseconds, later than that of the previous call.
-            arrival: when the last byte came, ns.
+            counter: counter value (ms), later than in the previous call.
+            arrival: arrival time of the last byte (ns).
         """
         self._follow(counter, arrival)
         stamp = self._elapsed + round(self._envelope) - self._latency
@@ -99,7 +100,7 @@ class ClockMap:
             self._take(0, arrival)
             return
         step = (counter - previous) * MILLISECOND % self._turn
-        # Disagreement of both clocks over one scan that only a restarted counter can explain, ns.
+        # Disagreement of both clocks over one scan that only a counter restart can explain (ns).
         restart = 1000 * MILLISECOND
         if abs(self._signed(step - waited)) > restart:
             self.restarts += 1
@@ -109,22 +110,22 @@ class ClockMap:
         self._take(self._elapsed, arrival - self._elapsed)
 
     def _take(self, elapsed: int, sample: int) -> None:
-        """Find the envelope at a new sample."""
+        """Update the envelope with a new sample."""
         self._newest.append((elapsed, sample))
         prompt = self._lowest(self._newest)
         above = prompt - self._lowest(self._window) if len(self._newest) == PROMPT else 0.0
-        late = 100 * MILLISECOND  # height from which on it does not, ns: no clock jumps, so the scans are late
+        late = 100 * MILLISECOND  # minimum height (ns) of late scans: clocks do not jump, so the scans are late
         self.late = round(above) if above > late else 0
         if not self.late:
             breaks, drift = self.slews, self.drift
             self._drift.add(elapsed, sample)
             slewed = self.slews > breaks or (abs(self.drift - drift) > BREAK and not self._is_steady())
             if slewed and self._reference is not None:
-                # BeamSamples since the slew say nothing of the latency.
+                # Samples since the slew carry no information about the latency.
                 before = self._settling[: max(len(self._settling) - RECENT * BLOCK, BLOCK)]
                 self._find_latency(self._reference, before, drift)
                 self._keep_latency()
-            # Height of such scans above the envelope from which on it follows them, ns: more than the jitter of USB.
+            # Height of recent scans beyond which the envelope follows them (ns): more than the jitter of USB.
             apart = 30 * MILLISECOND
             if above > apart or abs(self.drift - drift) > BREAK:
                 self._window.clear()
@@ -135,23 +136,23 @@ class ClockMap:
         if self._reference is not None:
             self._settling.append((elapsed, sample))
             self._find_latency(self._reference, self._settling, self.drift)
-            settle = 20 * SECOND  # how long the latency is being found, sensor's ns: by then the drift is known
+            settle = 20 * SECOND  # duration of the latency search (sensor's ns): by then the drift is known
             if elapsed > settle:
                 self._keep_latency()
 
     def _is_steady(self) -> bool:
-        """Whether the present drift, which has just been found, explains all samples since the comparison."""
+        """Return whether the drift just found explains all samples since the comparison."""
         third = max(len(self._settling) // 3, 1)
         envelopes = [self._lowest(self._settling[at : at + third]) for at in range(0, len(self._settling), third)]
-        steady = 15 * MILLISECOND  # difference of the envelopes of early and late samples that one drift explains, ns
+        steady = 15 * MILLISECOND  # envelope difference of early and late samples that a constant drift explains (ns)
         return not envelopes or max(envelopes) - min(envelopes) < steady
 
     def _lowest(self, samples: Iterable[tuple[int, int]]) -> float:
-        """The envelope of samples at the newest one's time."""
+        """Return the envelope of samples at the time of the latest sample."""
         return min(sample + self.drift * (self._elapsed - elapsed) for elapsed, sample in samples)
 
     def _restart(self, waited: int, arrival: int) -> None:
-        """The counter started again: by the latency found so far."""
+        """Continue after a counter restart, with the latency found so far."""
         self._keep_latency()
         self._elapsed += waited
         self._newest.clear()
@@ -160,33 +161,33 @@ class ClockMap:
         self._take(self._elapsed, arrival - self._elapsed)
 
     def _find_latency(self, reference: int, samples: Iterable[tuple[int, int]], drift: float) -> None:
-        """The least time from the counter to the arrival, by the comparison at the start."""
+        """Find the minimum time from counter value to arrival, using the comparison at the start."""
         found = round(min(sample - reference - drift * elapsed for elapsed, sample in samples))
         self._latency = max(found, self._least_latency)
 
     def _signed(self, difference: int) -> int:
-        """A difference of counters, ns, as the least one of all that a wrap makes equal."""
+        """Return a counter difference (ns) as its smallest equivalent modulo the counter period."""
         return (difference + self._turn // 2) % self._turn - self._turn // 2
 
     def _keep_latency(self) -> None:
-        """It is no longer looked for."""
+        """Keep the current latency and end the search."""
         self._reference = None
         self._settling.clear()
 
 
 class Drift:
-    """Rate of the lower envelope, by its points in two halves of the newest blocks of samples."""
+    """Rate of the lower envelope, from its points in the two halves of the latest blocks of samples."""
 
     def __init__(self) -> None:
         self.rate = 0.0
-        """Ns per ns."""
+        """Drift (ns/ns)."""
         self.breaks = 0
-        """How often it changed by more than ``BREAK`` at once."""
+        """Number of sudden changes by more than ``BREAK``."""
         self._blocks: deque[tuple[int, int]] = deque(maxlen=BLOCKS)
         self._block: list[tuple[int, int]] = []
 
     def add(self, elapsed: int, sample: int) -> None:
-        """Take a sample, ns, at ``elapsed``, ns."""
+        """Add a sample (ns) taken at ``elapsed`` (ns)."""
         self._block.append((elapsed, sample))
         if len(self._block) < BLOCK:
             return
@@ -202,16 +203,16 @@ class Drift:
             while len(self._blocks) > RECENT:
                 self._blocks.popleft()
         if len(blocks) < BLOCKS // 2 and abs(rate) < BREAK:
-            rate = 0.0  # no more than the jitter may make it
+            rate = 0.0  # jitter alone may cause such a rate
         self.rate = min(max(rate, -GREATEST_DRIFT), GREATEST_DRIFT)
 
     def forget(self) -> None:
-        """The samples start again; the rate stays."""
+        """Drop the samples; keep the rate."""
         self._blocks.clear()
         self._block = []
 
     def _slope(self, blocks: list[tuple[int, int]]) -> float:
-        """The present rate, corrected by how much lower or higher the second half is than the first."""
+        """Return the current rate, corrected by the height difference between the second half and the first."""
         middle = len(blocks) // 2
         low, high = (
             sample - self.rate * elapsed

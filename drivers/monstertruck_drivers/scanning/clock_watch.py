@@ -1,4 +1,4 @@
-"""What becomes of a scanner's clock while it is mapped: reports, and the end of a session whose scans stay late."""
+"""Watch of a mapped scanner clock: reports restarts and slews, and ends a session whose scans stay late."""
 
 from monstertruck_drivers.scanning.clock_map import ClockMap
 from monstertruck_runtime.clock import SECOND
@@ -9,11 +9,11 @@ from monstertruck_schemas.reasons import Reason
 
 
 class ClockWatch:
-    """Stamps of one scanner.
+    """Stamps the scans of one scanner.
 
     Args:
-        events: where restarts and slews of its clock are reported.
-        source: name of its service.
+        events: sink for reports of restarts and slews of the scanner's clock.
+        source: service name of the scanner.
     """
 
     def __init__(self, events: EventSink, source: str) -> None:
@@ -22,16 +22,16 @@ class ClockWatch:
         self._late_since: int | None = None
 
     def stamp(self, mapping: ClockMap, counter: int, arrival: int, port: str) -> int:
-        """The daemon's time at which the scanner's counter said ``counter``, ns.
+        """Return the daemon's time when the scanner's counter was ``counter`` (ns).
 
         Args:
-            mapping: of the present session.
-            counter: as ``ClockMap.stamp``.
-            arrival: likewise.
+            mapping: clock map of the current session.
+            counter: as in ``ClockMap.stamp``.
+            arrival: as in ``ClockMap.stamp``.
             port: name of the port.
 
         Raises:
-            DeviceTimeoutError: scans have arrived late for seconds.
+            DeviceTimeoutError: scans have been late for several seconds.
         """
         restarts, slews = mapping.restarts, mapping.slews
         stamp = mapping.stamp(counter, arrival)
@@ -40,7 +40,7 @@ class ClockWatch:
                 Reason.DEVICE_FAULT, Severity.WARNING, self._source, "sensor's clock restarted", counter=counter
             )
         if mapping.slews > slews and arrival >= self._slew_due:
-            slew_period = 60.0  # least seconds between two reports of clocks that run apart
+            slew_period = 60.0  # minimum interval between reports of clocks that run apart (s)
             self._slew_due = arrival + round(slew_period * SECOND)
             text = f"the sensor's clock and the computer's run apart by {mapping.drift:.1%}: followed"
             self._events(Reason.CLOCK_DRIFT, Severity.WARNING, self._source, text)
@@ -48,8 +48,8 @@ class ClockWatch:
         return stamp
 
     def _check_age(self, mapping: ClockMap, arrival: int, port: str) -> None:
-        too_late = 0.3  # seconds by which scans arrive later than at the start, from which on they are worth little
-        # Seconds of such scans after which the session restarts, and with it the comparison of the clocks.
+        too_late = 0.3  # maximum added latency of a scan since the start (s); later scans are of little use
+        # Maximum duration of late scans (s); then the session restarts, which repeats the clock comparison.
         late_for = 3.0
         if mapping.late < too_late * SECOND:
             self._late_since = None

@@ -1,4 +1,4 @@
-"""The turning head of an emulated scanner: its motor, its own clock, what covers its window."""
+"""Turning head of an emulated scanner: its motor, its own clock, and the covers on its window."""
 
 import math
 from collections.abc import Callable
@@ -12,24 +12,24 @@ from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
 TURNING: Final = 0.5
-"""Share of the set speed from which on the head measures."""
+"""Minimum speed for measurements, as a fraction of the set speed."""
 FAULTS: Final = "cover FROM TO VALUE [SHARE] | cover off | mirror FROM TO | drift PPM | blocked on|off | frequency HZ"
 
 
 class TurningHead:
-    """Turns clockwise; asked for rising instants of its own clock.
+    """Clockwise turning head with a separate clock, queried at increasing instants of that clock.
 
-    Faults (``inject``): ``cover`` puts something over the window between two directions, degrees from straight ahead,
-    left positive: the beams, or a random share of them, give the value (below 20: no return, otherwise mm). ``mirror``
-    puts a mirror there. ``drift`` sets the rate of its clock against the world's; ``blocked`` holds the head;
-    ``frequency`` changes its speed.
+    Faults (``inject``): ``cover`` covers the window between two directions (degrees from straight ahead, left
+    positive): all beams there, or a random fraction of them, return the value (below 20: no return, otherwise mm).
+    ``mirror`` puts a mirror there. ``drift`` sets the rate of its clock relative to the world clock. ``blocked`` holds
+    the head. ``frequency`` changes its speed.
 
     Args:
-        clock: the world's time.
-        source: what it sees.
-        sheet: of its ranges.
-        frequency: turns a second.
-        rng: of the covers.
+        clock: clock of the world.
+        source: source of the beams' ranges.
+        sheet: range limits from the data sheet.
+        frequency: speed (turns/s).
+        rng: random generator of the covers.
     """
 
     def __init__(
@@ -37,38 +37,38 @@ class TurningHead:
     ) -> None:
         self.sheet = sheet
         self.frequency = frequency
-        """Turns a second that the motor is set to; 0 = off."""
+        """Set speed of the motor (turns/s); 0 = off."""
         self._clock, self._source, self._rng = clock, source, rng
         self._rate = 1.0
         self._born, self._elapsed = clock.now(), 0
         self._blocked = False
         self._at, self._turned, self._speed = 0.0, 0.3, 0.0
-        """Instant (s of its own clock), angle (turns) and speed (turns a second) up to which it has turned."""
+        """Latest instant (s, its own clock), with the angle (turns) and speed (turns/s) reached there."""
         self._covers: list[tuple[float, float, Callable[[Array], Array]]] = []
 
     # Time
 
     def now(self) -> int:
-        """Its own clock, ns since it was made."""
+        """Return the time of the head's clock since its creation (ns)."""
         return self._elapsed + round((self._clock.now() - self._born) * self._rate)
 
     def world_time(self, time: int) -> int:
-        """The world's time at an instant of its own clock, ns."""
+        """Return the world's time at an instant of the head's clock (ns)."""
         return self._born + round((time - self._elapsed) / self._rate)
 
     # Motor
 
     @property
     def speed(self) -> float:
-        """Turns a second at the newest instant."""
+        """Speed at the latest instant (turns/s)."""
         return self._speed
 
     def stop(self) -> None:
-        """The supply is off: the head stands."""
+        """Stop the head at once: its supply is off."""
         self._speed = 0.0
 
     def turn(self, times: NDArray[np.int64]) -> Array:
-        """Angles at instants of its own clock, shape (n,), turns; the last one becomes the newest instant."""
+        """Return the angles (n,) at instants of the head's clock (turns); the last becomes the latest instant."""
         target = 0.0 if self._blocked else self.frequency
         passed = times / SECOND - self._at
         spin_up = 0.4  # time constant of the motor, s
@@ -81,12 +81,12 @@ class TurningHead:
     # Beams
 
     def measure(self, times: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Angles, turns, and ranges, m, 0 = no return, at instants of its own clock, (n,), that are over."""
+        """Return angles (turns) and ranges (m, 0 = no return) at past instants (n,) of the head's clock."""
         turned = self.turn(times)
         return turned, self.look(turned, times)
 
     def look(self, turned: Array, times: NDArray[np.int64]) -> Array:
-        """Ranges at angles, turns, and instants, (n,), m; 0 = no return."""
+        """Return the ranges (n,) at angles (turns) and instants (m; 0 = no return)."""
         bearings = -math.tau * turned
         at = np.array([self.world_time(int(time)) for time in times], np.int64)
         ranges = self._source.beams(bearings, at, self.sheet)
@@ -103,10 +103,10 @@ class TurningHead:
         """Start or end a fault.
 
         Returns:
-            Whether it is one of the head's.
+            Whether the head knows this fault.
 
         Raises:
-            InputError: a bad value.
+            InputError: a value is invalid.
         """
         try:
             match fault, values:
@@ -136,11 +136,11 @@ class TurningHead:
         self._covers.append((first, last - first, cover))
 
     def _covered(self, value: int, share: float = 1.0) -> Callable[[Array], Array]:
-        least_code = 20  # values of ``cover`` below are the codes of the URG: no return; others are millimetres
+        least_code = 20  # ``cover`` values below are URG codes: no return; others are millimetres
         shown = 0.0 if value < least_code else value / 1000
         return lambda ranges: np.where(self._rng.random(len(ranges)) < share, shown, ranges)
 
     def _mirrored(self, ranges: Array) -> Array:
-        specular = 0.2  # share of a mirror, in its middle, from which the light comes straight back and dazzles
+        specular = 0.2  # fraction of a mirror, at its centre, that reflects straight back and dazzles
         dazzled = self._rng.random(len(ranges)) < specular
         return np.where(dazzled | (2 * ranges > self.sheet.greatest), 0.0, 2 * ranges)

@@ -1,4 +1,4 @@
-"""Revolutions of a turning head, published as scans."""
+"""Publication of a turning head's revolutions as scans."""
 
 import math
 
@@ -23,11 +23,11 @@ def publish(
 
     Args:
         turn: the revolution.
-        origin: the daemon's time at the zero of the samples' clock, ns.
-        received: when its last sample came, ns.
-        limits: least and greatest range of the scanner, m.
-        config: of the scanner.
-        out: where scans go.
+        origin: daemon's time at the zero of the samples' clock (ns).
+        received: arrival time of its last sample (ns).
+        limits: minimum and maximum range of the scanner (m).
+        config: settings of the scanner.
+        out: publisher of the scans.
     """
     start = math.pi - math.tau * turn.first
     count = len(turn.ranges)

@@ -1,7 +1,7 @@
-"""From samples of a turning head to scans: revolutions are cut at the rear, their samples put onto equal steps.
+"""Convert samples of a turning head to scans: cut revolutions at the rear, resample them to equal angular steps.
 
-A turning head measures at a steady rate while its speed varies, so the number of samples differs from turn to turn.
-Angles are fractions of a turn in the sense in which the head turns, 0 = the scanner's x axis.
+The head measures at a constant rate while its speed varies, so the number of samples differs between revolutions.
+Angles are fractions of a turn in the head's turning direction; 0 is the scanner's x axis.
 """
 
 from typing import Final, NamedTuple
@@ -13,53 +13,53 @@ from monstertruck_drivers.emulation import Array
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM
 
 MISSING: Final = NO_ECHO + 1
-"""Code of a beam that says nothing."""
+"""Code of a beam without information."""
 
 
 class BeamSamples(NamedTuple):
-    """BeamSamples in the order in which they were measured; each of shape (n,)."""
+    """Samples in the order of measurement; each array has shape (n,)."""
 
     turns: Array
-    """Angle, any number of whole turns left out."""
+    """Angle, modulo whole turns (turns)."""
     ranges: Array
-    """m; 0 = no return."""
+    """Range (m); 0 = no return."""
     intensities: NDArray[np.uint8]
-    """Strength of the return, in the scanner's own measure."""
+    """Strength of the return, in the scanner's unit."""
     times: Array
-    """Instants, ns after an instant of the caller's choice."""
+    """Instants after an origin of the caller's choice (ns)."""
 
 
 class HeadTurn(NamedTuple):
-    """One revolution on equal steps."""
+    """One revolution at equal angular steps."""
 
     first: float
-    """Angle of the first beam behind the cut, turns."""
+    """Angle of the first beam after the cut (turns)."""
     ranges: Array
-    """Shape (n,), m; 0 = no return, NaN = no sample."""
+    """Ranges, shape (n,) (m); 0 = no return, NaN = no sample."""
     intensities: NDArray[np.uint8]
-    """Shape (n,)."""
+    """Intensities, shape (n,)."""
     begin: float
-    """Instant of the first beam, ns on the samples' clock."""
+    """Instant of the first beam on the samples' clock (ns)."""
     period: float
-    """Time of a whole turn, ns."""
+    """Duration of a whole turn (ns)."""
 
     @property
     def step(self) -> float:
-        """Angle between neighbouring beams, turns."""
+        """Angle between neighbouring beams (turns)."""
         return 1.0 / len(self.ranges)
 
 
 class TurnCutter:
-    """Collects samples and cuts them into revolutions; what comes before the first cut is dropped."""
+    """Cuts samples into revolutions; drops samples before the first cut."""
 
     def __init__(self) -> None:
         self._parts: list[BeamSamples] = []
         self._at: float | None = None
-        """Angle of the newest sample, in turns since the first one's cut; the whole part numbers the revolution."""
+        """Angle of the latest sample from the first cut (turns); its integer part numbers the revolution."""
         self._begun = False
 
     def add(self, samples: BeamSamples) -> list[BeamSamples]:
-        """Revolutions that became complete, their angles behind the cut, 0 to 1."""
+        """Add samples; returns the completed revolutions, with angles after the cut, 0 to 1."""
         if not len(samples.turns):
             return []
         behind = np.mod(samples.turns - 0.5, 1.0)  # where a revolution is cut
@@ -84,13 +84,13 @@ class TurnCutter:
 
 
 def on_equal_steps(samples: BeamSamples) -> HeadTurn | None:
-    """A revolution on equal steps, each sample at the nearest; None if the samples are too few to tell the step.
+    """Resample a revolution to equal steps, each sample at the nearest step; None if too few samples define the step.
 
-    The nearer of two samples at one step counts. The step is the mean distance of neighbours, and the first beam lies
-    where the samples do on average, so that no sample moves by more than half a step while the head turns evenly.
+    Of two samples at one step, the shorter range is kept. The step is the mean spacing of neighbours. The first beam is
+    at the mean phase of the samples, so no sample moves by more than half a step while the head turns evenly.
 
     Args:
-        samples: of one revolution, angles behind the cut, 0 to 1.
+        samples: one revolution, with angles after the cut, 0 to 1.
     """
     order = np.argsort(samples.turns, kind="stable")
     turns = samples.turns[order]
@@ -115,30 +115,30 @@ def on_equal_steps(samples: BeamSamples) -> HeadTurn | None:
 
 
 def _mean_step(turns: Array) -> float | None:
-    """Mean distance of neighbouring angles, rising, turns, gaps left out; None if they are too few."""
+    """Return the mean spacing of increasing angles, without gaps (turns); None if there are too few angles."""
     apart = np.diff(turns)
-    usual = float(np.median(apart)) if len(apart) >= 16 else 0.0  # BeamSamples without which a revolution has no step
-    gap = 4.0  # neighbours so many usual distances apart have lost samples between them
+    usual = float(np.median(apart)) if len(apart) >= 16 else 0.0  # fewer samples define no step
+    gap = 4.0  # multiple of the median spacing beyond which samples between neighbours were lost
     return float(apart[apart < gap * usual].mean()) if usual > 0.0 else None
 
 
 class ArrivalTimes:
-    """Times the revolutions of a head whose samples carry no time, by when they came.
+    """Times the revolutions of a head whose samples carry no time, from their arrival times.
 
-    No sample comes before it was measured, so the promptest one of a revolution tells where it lies; and no revolution
-    begins later than the one before ended, but for what the head may have slowed down.
+    No sample arrives before its measurement, so the promptest sample fixes a revolution's time. No revolution begins
+    later than the end of the previous one plus the time that the head may have lost by slowing down.
 
     Args:
-        sample_time: from sample to sample, ns.
+        sample_time: interval between samples (ns).
     """
 
     def __init__(self, sample_time: float) -> None:
         self._sample_time = sample_time
         self._next: float | None = None
-        """When the next revolution begins, if the head turns as before."""
+        """Start of the next revolution at unchanged speed (ns)."""
 
     def timed(self, samples: BeamSamples) -> BeamSamples:
-        """A revolution on times of its own; ``samples.times``: as if each had come at once."""
+        """Return a revolution with estimated times; ``samples.times`` are its arrival times, assuming no delay."""
         step = _mean_step(np.sort(samples.turns))
         if step is None:
             return samples
@@ -146,7 +146,7 @@ class ArrivalTimes:
         turned = samples.turns * period
         begin = float((samples.times - turned).min())
         if self._next is not None and abs(begin - self._next) < period / 2:
-            # Share by which a revolution may take longer than its samples tell: the tolerance of a scanner's clock.
+            # Tolerance of a scanner's clock: a revolution may exceed the duration of its samples by this fraction.
             slower = 0.01
             begin = min(begin, self._next + slower * period)
         self._next = begin + period
@@ -154,11 +154,11 @@ class ArrivalTimes:
 
 
 def codes_of(turn: HeadTurn, *, free: bool) -> NDArray[np.uint8]:
-    """Codes of a revolution's beams as ``LaserScan`` has them.
+    """Return the beam codes of a revolution, as in ``LaserScan``.
 
     Args:
         turn: the revolution.
-        free: whether a beam without a return is free as far as the scanner reaches; it says nothing otherwise.
+        free: whether a beam without a return is free up to the scanner's range; otherwise its code is ``MISSING``.
     """
     without = NO_ECHO if free else MISSING
     codes = np.where(turn.ranges > 0.0, VALID_BEAM, np.where(np.isnan(turn.ranges), MISSING, without))

@@ -14,7 +14,7 @@ class SonarConfig(Schema):
     """One sonar."""
 
     address: Annotated[int, Field(ge=0xE0, le=0xFE)]
-    """On the I2C bus, as the maker counts it: even, 224 to 254"""
+    """I2C address in the maker's notation: even, 224 to 254"""
     mount: Mount
     """Place and axis in the base frame"""
 
@@ -51,7 +51,7 @@ class Srf08Config(Schema):
     sonars: dict[FrameId, SonarConfig] = Field(default_factory=five_sonars, min_length=1)
     """Sonars by name"""
     groups: Annotated[tuple[tuple[str, ...], ...], Field(strict=False)] = (("l", "f", "r"), ("fl", "fr"))
-    """Names in the order in which they fire"""
+    """Names of the sonars in firing order"""
     rate: Annotated[float, Field(gt=0, le=20)] = 10.0
     """Messages a second; each has a ping of every sonar"""
     range_min: Annotated[float, Field(gt=0, lt=6)] = 0.15
@@ -61,15 +61,15 @@ class Srf08Config(Schema):
     field_of_view: Annotated[float, Field(gt=0, le=3.1416)] = 0.87
     """Full opening angle of the cones, rad"""
     gain: Annotated[int, Field(ge=0, le=31)] = 16
-    """Greatest gain: more hears weaker echoes, and those of the ping before"""
+    """Maximum gain; a higher gain detects weaker echoes, but also echoes of the previous ping"""
     speed_of_sound: Annotated[float, Field(gt=300, lt=380)] = 343.0
     """m/s; 0.6 more for each degree Celsius"""
     timeout: Annotated[float, Field(gt=0, le=1)] = 0.05
-    """Seconds in which the USB-ISS answers"""
+    """Timeout of the USB-ISS's answer (s)"""
     silence: Annotated[float, Field(gt=0, le=10)] = 1.0
     """Seconds without an answer of any sonar that end the session"""
     stuck_after: Annotated[int, Field(ge=2, le=10_000)] = 20
-    """Equal echoes, to the microsecond, in a row, after which a sonar counts as not answering"""
+    """Consecutive echoes equal to the microsecond after which a sonar is reported as not answering"""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

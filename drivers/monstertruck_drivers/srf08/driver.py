@@ -19,16 +19,16 @@ LATER = 0.004
 class Srf08Driver:
     """Sets gain and range, which modules lose with their supply, fires and reads.
 
-    A sonar that does not answer, or answers the same to the microsecond again and again, is reported as not answering;
-    the others go on.
+    A sonar that does not answer, or repeats its answer to the microsecond, is reported as not answering; the others
+    continue.
 
     Args:
         config: sonars, groups, limits.
-        port: of the USB-ISS.
+        port: port of the USB-ISS.
         clock: time.
         out: ranges.
-        events: sonars that are lost and return.
-        name: of the service.
+        events: loss and return of sonars.
+        name: name of the service.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Srf08Driver:
         self._silent: set[str] = set()
         """Sonars whose loss was reported."""
         self._equal: dict[str, tuple[int, int]] = {}
-        """Newest echo of each sonar, us, and how often it came in a row."""
+        """Latest echo of each sonar (us), and its number of consecutive repetitions."""
 
     async def run(self, ready: Ready) -> None:
         """Serve one session.

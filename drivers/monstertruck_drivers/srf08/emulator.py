@@ -24,7 +24,7 @@ from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
 from monstertruck_runtime.errors import InputError
 
 ANSWER: Final = MILLISECOND
-"""Nanoseconds that a command takes on USB and I2C."""
+"""Duration of a command on USB and I2C (ns)."""
 SOUND: Final = 343.0
 
 
@@ -48,14 +48,14 @@ class Srf08Emulator:
     """A USB-ISS with one SRF08 for each sonar of the settings.
 
     Faults (`inject`): ``silent on|off`` (the USB-ISS), ``dead NAME on|off`` (off the bus), ``stuck NAME on|off`` (the
-    same flight time forever), ``ghost NAME METRES|off`` (an echo that is not there), ``brownout NAME`` (loses gain and
-    range), ``extra`` (a byte that nobody requested).
+    same flight time forever), ``ghost NAME METRES|off`` (a false echo), ``brownout NAME`` (loses gain and
+    range), ``extra`` (an unrequested byte).
 
     Args:
         clock: time.
         source: physics.
         settings: names and addresses.
-        seed: of the timers' jitter.
+        seed: seed of the timers' jitter.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Srf08Emulator:
             data = await end.read()
             now = self._clock.now()
             self.received.extend(data)
-            # 0.02: seconds after which the USB-ISS drops half a command
+            # 0.02: seconds after which the USB-ISS drops an incomplete command
             buffer = data if now - last > 0.02 * SECOND else buffer + data
             last = now
             while (size := _size(buffer)) is not None and size <= len(buffer):
@@ -190,7 +190,7 @@ class Srf08Emulator:
 
 
 def _size(buffer: bytes) -> int | None:
-    """Length of the command that ``buffer`` begins with; None = not yet known."""
+    """Return the length of the command at the start of ``buffer``; None = not yet known."""
     if not buffer:
         return None
     if buffer[0] == ISS:

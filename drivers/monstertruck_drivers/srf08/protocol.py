@@ -1,8 +1,8 @@
 """Bytes to a USB-ISS in I2C mode, and registers of the SRF08 behind it.
 
 Sources: Devantech, "USB-ISS Technical Specification" and "I2C Mode"; "SRF08 Ultrasonic Ranger, Technical
-Specification". An answer of the USB-ISS has no mark of its own and no checksum: only its length is known. What a module
-does not drive on the bus reads as ones, so a module that ranges, or is not there, has the software revision 0xFF.
+Specification". An answer of the USB-ISS has no identifier and no checksum: only its length is known. Bits that no
+module drives on the bus read as ones, so a module that is ranging or absent has the software revision 0xFF.
 """
 
 from enum import IntEnum
@@ -14,7 +14,7 @@ VERSION: Final = bytes((ISS, 0x01))
 """Answered by module number, firmware and mode."""
 MODULE: Final = 0x07
 I2C_100KHZ: Final = 0x60
-"""By the hardware's own controller."""
+"""I2C mode of the hardware controller."""
 IO_INPUTS: Final = 0xAA
 SET_MODE: Final = bytes((ISS, 0x02, I2C_100KHZ, IO_INPUTS))
 """Answered by 0xFF 0x00, or 0x00 and a reason."""
@@ -25,7 +25,7 @@ ADDRESSES: Final = tuple(range(0xE0, 0x100, 2))
 """Addresses that a module may be set to; with the lowest bit set they are for reading."""
 RANGE_IN_MICROSECONDS: Final = 0x52
 ABSENT: Final = 0xFF
-"""Software revision that nobody drives onto the bus."""
+"""Software revision read when no module drives the bus."""
 RANGE_STEP: Final = 0.043
 """Metres of the range register's unit, by the maker's speed of sound."""
 
@@ -44,7 +44,7 @@ class Srf08Reading(NamedTuple):
     revision: int
     light: int
     microseconds: int
-    """Time from the ping to the first echo; 0 = none."""
+    """Time from the ping to the first echo (us); 0 = no echo."""
 
     @property
     def present(self) -> bool:
@@ -77,7 +77,7 @@ def parse_reading(data: bytes) -> Srf08Reading:
 
 
 def range_setting(metres: float) -> int:
-    """Value of the range register with which echoes from up to ``metres`` are waited for."""
+    """Range register value for echoes from up to ``metres``."""
     return max(0, min(255, ceil(metres / RANGE_STEP) - 1))
 
 

@@ -11,7 +11,7 @@ class Srf08Session:
 
     Args:
         link: open link.
-        timeout: seconds in which an answer comes.
+        timeout: timeout of an answer (s).
     """
 
     def __init__(self, link: Link, timeout: float) -> None:
@@ -19,12 +19,12 @@ class Srf08Session:
         self._timeout = timeout
 
     async def ask(self, command: bytes, size: int) -> bytes:
-        """Send a command and take its answer.
+        """Send a command and return its answer.
 
         Raises:
             DeviceLostError: unplugged.
             DeviceTimeoutError: the answer did not come in time.
-            ProtocolError: bytes that nobody requested.
+            ProtocolError: unrequested bytes.
         """
         if count := self._link.discard():
             raise ProtocolError(f"{self._link.name}: {count} bytes too many: answers are out of step")

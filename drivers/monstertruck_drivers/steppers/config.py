@@ -1,4 +1,4 @@
-"""What a configuration file may say about the stepper motors."""
+"""Settings of the stepper motors in the configuration file."""
 
 import math
 from typing import Annotated, Literal, Self
@@ -13,39 +13,39 @@ Seconds = Annotated[float, Field(gt=0)]
 
 
 class StepperConfig(Schema):
-    """Stepper motors on one microcontroller; the defaults are those of motors of 200 steps in half steps.
+    """Stepper motors on one microcontroller; the defaults suit 200-step motors in half steps.
 
-    Motor i turns the body's shaft i. Steppers have no encoder: positions are steps that were commanded, and a motor
-    that loses steps, or is held, is not noticed.
+    Motor i turns the body's shaft i. Steppers have no encoder: positions are commanded steps, and lost steps or a
+    blocked motor go undetected.
     """
 
     kind: Literal["steppers"] = "steppers"
     motors: Annotated[int, Field(ge=1, le=MOTORS)] = MOTORS
-    """Motors that turn shafts; the controller's others are not used"""
+    """Motors that turn shafts; the controller's other motors are unused"""
     steps_per_turn: Annotated[int, Field(ge=4, le=51_200)] = 400
-    """Steps per motor turn, half or micro steps counted; must be what the controller says"""
+    """Steps per motor turn, including half or micro steps; must equal the controller's value"""
     inverted: Annotated[tuple[bool, ...], Field(strict=False)] = (False,) * MOTORS
     """For each motor: driving forward takes negative rates"""
     max_rate: Annotated[float, Field(gt=0, le=MAX_RATE / 1000)] = 250.0
-    """Steps per second: requests are limited to this; less than what makes a motor lose steps"""
+    """Limit of requested rates (steps/s); choose it below the rate at which a motor loses steps"""
     acceleration: Annotated[int, Field(gt=0, le=1_000_000)] = 4000
-    """Acceleration of the controller's ramps, steps/s^2"""
+    """Acceleration of the controller's ramps (steps/s^2)"""
     quick_deceleration: Annotated[int, Field(gt=0, le=1_000_000)] = 8000
-    """Deceleration of its quick stop and of its watchdog, steps/s^2"""
+    """Deceleration of the controller's quick stop and watchdog (steps/s^2)"""
     rate: Annotated[float, Field(ge=5, le=50)] = 20.0
     """Exchanges per second"""
     answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.05
-    """Seconds in which an answer must come"""
+    """Timeout of an answer (s)"""
     command_timeout: Seconds = 0.25
-    """Age of the newest command at which the motors are brought to rest"""
+    """Age of the latest command at which the motors ramp down to rest (s)"""
     quick_stop_after: Seconds = 1.0
-    """Age of the newest command at which they are stopped by quick stop"""
+    """Age of the latest command at which the motors quick-stop (s)"""
     watchdog: Annotated[float, Field(ge=0.05, le=2.0)] = 0.3
-    """Seconds without a request to run after which the controller itself stops the motors"""
+    """Time without a run request after which the controller itself stops the motors (s)"""
 
     @property
     def shafts(self) -> int:
-        """How many driven shafts it serves."""
+        """Number of driven shafts."""
         return self.motors
 
     @property
@@ -55,14 +55,14 @@ class StepperConfig(Schema):
 
     @property
     def motor_limits(self) -> MotorLimits:
-        """What a motor does."""
+        """Limits of a motor."""
         return MotorLimits(
             self.max_rate * self.turn, self.acceleration * self.turn, self.quick_deceleration * self.turn
         )
 
     @property
     def stop_words(self) -> str:
-        """Nothing: the stop script needs the port alone."""
+        """Empty: the stop script needs the port alone."""
         return ""
 
     @model_validator(mode="after")

@@ -43,7 +43,7 @@ MODES: Final = {
 
 
 class MotorSetpoints(NamedTuple):
-    """What the motors shall do."""
+    """Set-points of the motors."""
 
     state: MotorState
     rates: tuple[int, ...] = ()
@@ -51,10 +51,10 @@ class MotorSetpoints(NamedTuple):
 
 
 def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: StepperConfig) -> MotorSetpoints:
-    """What the newest commands of all shafts mean together; the host's own deadman is here.
+    """Combine the latest commands of all shafts into set-points; implements the host's deadman.
 
     Args:
-        commands: newest one of every shaft, if any.
+        commands: latest command of every shaft, if any.
         now: time, ns.
         config: signs, limits and time-outs.
     """
@@ -77,18 +77,18 @@ class StepperDriver:
 
     Args:
         config: see ``StepperConfig``.
-        port: where the controller hangs.
+        port: port of the controller.
         clock: time.
-        commands: ``cmd/drive`` of the first shaft; those of the others follow.
-        commands_2: of the second.
-        commands_3: of the third.
-        commands_4: of the fourth.
+        commands: ``cmd/drive`` of the first shaft.
+        commands_2: the same for the second shaft.
+        commands_3: the same for the third shaft.
+        commands_4: the same for the fourth shaft.
         out: ``sensor/drive`` of the first shaft, ``stamp`` in the middle of the exchange.
-        out_2: of the second.
-        out_3: of the third.
-        out_4: of the fourth.
+        out_2: the same for the second shaft.
+        out_3: the same for the third shaft.
+        out_4: the same for the fourth shaft.
         events: identity, restarts, a noisy line.
-        name: of the service.
+        name: name of the service.
     """
 
     def __init__(
@@ -118,9 +118,9 @@ class StepperDriver:
         self._steps = [0] * config.motors
         """Counted over sessions and restarts of the controller."""
         self._last: tuple[Status, int] | None = None
-        """Newest status, and when it came."""
+        """Latest status and its arrival time."""
         self._asked = MotorState.OFF
-        """What the controller was asked for last."""
+        """State last requested from the controller."""
 
     async def run(self, ready: Ready) -> None:
         """One session, from the stop of motors that may still turn to the stop at its end.
@@ -202,7 +202,7 @@ class StepperDriver:
         return wanted is not MotorState.RUN and wanted is not self._asked
 
     async def _until(self, due: int) -> None:
-        """Wait for the next cycle, or for a command that stops running motors; the last shaft's is the newest."""
+        """Wait for the next cycle, or for a command that stops running motors; the last shaft's is the latest."""
         while (left := due - self._clock.now()) > 0:
             last = self._commands[-1]
             if await last.next_within(left / SECOND, lambda _: not self._is_urgent()) is None or self._is_urgent():
@@ -232,7 +232,7 @@ class StepperDriver:
             DeviceRestartedError: it did, while it was in use.
         """
         now = self._clock.now()
-        uptime_slack = 200  # ms by which the controller's uptime may lag behind the host's time between two answers
+        uptime_slack = 200  # tolerated lag of the controller's uptime behind the host's time between two answers (ms)
         if self._last is not None:
             before, then = self._last
             passed = (status.uptime_ms - before.uptime_ms) % (1 << 32)

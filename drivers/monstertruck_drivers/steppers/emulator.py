@@ -37,21 +37,21 @@ from monstertruck_runtime.errors import InputError
 TICK_US: Final = 10
 """Timer period, microseconds."""
 COASTING: Final = 1e6
-"""Rpm/s at which a rotor without current stops: friction of its gear and wheel."""
+"""Deceleration of a rotor without current, from friction of its gear and wheel (rpm/s)."""
 
 
 class StepperEmulator:
     """The controller with its motors.
 
-    Faults (``inject``): ``overload MOTOR on|off`` (the rotor stands), ``silent on|off`` (gives no answers), ``late
-    SECONDS [COUNT]`` (answers), ``reset`` (the processor restarts in the middle of whatever it does), ``noise COUNT``
-    (so many answers have a wrong byte), ``runaway`` (the firmware disobeys with all motors, see ``DisobedientMotor``).
+    Faults (``inject``): ``overload MOTOR on|off`` (the rotor blocks), ``silent on|off`` (gives no answers), ``late
+    SECONDS [COUNT]`` (answers), ``reset`` (the processor restarts at any point), ``noise COUNT``
+    (COUNT answers have a wrong byte), ``runaway`` (the firmware disobeys with all motors, see ``DisobedientMotor``).
 
     Args:
         clock: time.
-        plants: what the motors turn; free motors take the missing places.
-        motors: it has.
-        steps_per_turn: of each.
+        plants: loads of the motors; free motors take the missing places.
+        motors: number of motors.
+        steps_per_turn: steps per turn of each motor.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class StepperEmulator:
     ) -> None:
         self.name = "steppers"
         self.received = ReceivedBytes()
-        """Newest bytes from the host."""
+        """Latest bytes from the host."""
         numbers = [f"{what}_{motor}" for what in ("position", "rate") for motor in range(1, motors + 1)]
         kinds = dict.fromkeys(["state", "bad_lines", "time", *numbers], SignalKind.NUMBER)
         kinds |= dict.fromkeys([f"run_{motor}" for motor in range(1, motors + 1)], SignalKind.ORDER)
@@ -90,7 +90,7 @@ class StepperEmulator:
         self._state = MotorState.OFF
         self._rates = [0.0] * self._identity.motors
         self._ordered = [0.0] * self._identity.motors
-        """Rates of the newest orders, steps/s."""
+        """Rates of the latest orders (steps/s)."""
         self._counters = [FreeMotor() for _ in self._plants]
         for counter in self._counters:
             counter.reading(now)
@@ -223,7 +223,7 @@ class StepperEmulator:
         self._drive()
 
     def _disobeyed(self, rates: list[float] | None) -> list[float] | None:
-        """What the firmware makes of commanded rates."""
+        """Return the rates that the firmware applies for commanded rates."""
         if (runaway := self._runaway) is None:
             return rates
         now, asked = self._clock.now(), [None] * self._identity.motors if rates is None else rates
@@ -247,7 +247,7 @@ class StepperEmulator:
 
     @property
     def _rpm(self) -> float:
-        """Of one step/s."""
+        """Shaft speed at one step/s (rpm)."""
         return 60.0 / self._identity.steps_per_turn
 
     def _status(self) -> Status:

@@ -1,8 +1,8 @@
 """Line protocol of a microcontroller with up to four stepper motors; pure codec. Written out in ``docs/devices.md``.
 
 A line is ``:BODY*CCCC`` and LF: BODY is words of printable ASCII, one space apart, CCCC the CRC-16/CCITT-FALSE of BODY
-in capital hex digits. The host asks, the controller answers every whole line once, with the sequence number asked
-with; it says nothing unasked. The first word of a request is a capital letter, of an answer the same in small:
+in capital hex digits. The controller answers every complete line of the host once, with the request's sequence
+number, and sends nothing else. The first word of a request is a capital letter, of its answer the same in small:
 
 ======================= ==================================================== ==========================================
 request                 meaning                                              answer
@@ -16,8 +16,8 @@ request                 meaning                                              ans
 ======================= ==================================================== ==========================================
 
 A status is ``s SEQ STATE BAD UPTIME POSITION... RATE...``: state, damaged lines since power-up (0-65535, wraps), uptime
-in ms (32 bits, wraps), the steps commanded so far (signed 32 bits, wrap) and the present rate of every motor. A request
-that cannot be carried out is answered ``e SEQ CODE``; a damaged line not at all.
+in ms (32 bits, wraps), the steps commanded so far (signed 32 bits, wrap) and the current rate of every motor. The
+answer to a request that cannot be carried out is ``e SEQ CODE``; a damaged line gets no answer.
 """
 
 from binascii import crc_hqx
@@ -40,7 +40,7 @@ _MASK = 0xFFFF_FFFF
 
 
 class MotorState(IntEnum):
-    """What the motors do."""
+    """State of the motors."""
 
     OFF = 0
     """Coils off: they turn freely. So after power-up."""
@@ -66,7 +66,7 @@ class RefusalCode(IntEnum):
 
 
 class LineError(ValueError):
-    """A line that is no line of this protocol."""
+    """Line outside this protocol."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,10 +82,10 @@ class Line:
         return b"%b%b*%04X%b" % (_START, body, crc(body), _END)
 
     def integers(self, count: int | None = None) -> tuple[int, ...]:
-        """The words as whole numbers.
+        """Return the words as integers.
 
         Raises:
-            LineError: another number of words, or one that is no plain decimal number.
+            LineError: wrong number of words, or a word that is not a plain decimal number.
         """
         if count is not None and len(self.words) != count:
             raise LineError(f"{self.verb}: {len(self.words)} words, expected {count}")
@@ -123,13 +123,13 @@ def decode(line: bytes) -> Line:
 
 
 class Splitter:
-    """Cuts a stream of bytes into lines; what is no line of the protocol is counted and dropped."""
+    """Splits a stream of bytes into lines; counts and drops everything outside the protocol."""
 
     def __init__(self) -> None:
         self.bad = 0
         """Lines that were dropped."""
         self.strange = b""
-        """Beginning of the newest of them."""
+        """Beginning of the latest dropped bytes."""
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> list[Line]:
@@ -170,7 +170,7 @@ class Identity:
 
     @classmethod
     def of(cls, line: Line) -> "Identity":
-        """From an answer to ``I``.
+        """Parse an answer to ``I``.
 
         Raises:
             LineError: something else.
@@ -188,7 +188,7 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What the controller does."""
+    """Status of the controller."""
 
     state: MotorState
     bad_lines: int
@@ -200,7 +200,7 @@ class Status:
 
     @classmethod
     def of(cls, line: Line, motors: int) -> "Status":
-        """From an answer of a controller with so many motors.
+        """Parse an answer of a controller with ``motors`` motors.
 
         Raises:
             LineError: something else.

@@ -34,18 +34,18 @@ class RequestRefusedByDeviceError(ProtocolError):
 
 
 class StepperSession:
-    """One session. An answer belongs to its question by the sequence number: late ones are dropped.
+    """One session. The sequence number matches an answer to its request; late answers are dropped.
 
     Args:
         link: open link.
         clock: time.
-        timeout: seconds in which an answer must come.
+        timeout: timeout of an answer (s).
     """
 
     def __init__(self, link: Link, clock: Clock, timeout: float) -> None:
         self.splitter = Splitter()
         self.asked = 0
-        """When the newest question was sent, ns."""
+        """Send time of the latest request (ns)."""
         self.heard = False
         """A line of the protocol came."""
         self._link = link

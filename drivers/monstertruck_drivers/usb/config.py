@@ -1,4 +1,4 @@
-"""Configuration of the USB tree: where a device hangs, how hubs are judged, what may be switched."""
+"""Configuration of the USB tree: places of devices, judgement of hubs, switching of ports."""
 
 from enum import StrEnum
 from typing import Annotated, Self
@@ -13,11 +13,11 @@ from monstertruck_schemas.base import Schema
 
 Seconds = Annotated[float, Field(ge=0, le=60)]
 Baud = Annotated[int, Field(ge=4800, le=1_000_000)]
-"""Of a serial line, bits per second."""
+"""Rate of a serial line (bit/s)."""
 
 
 class UsbPortConfig(Schema):
-    """A device by hub and port: the place stays when ttyUSB numbers change."""
+    """Device place by hub and port, which stays the same when ttyUSB numbers change."""
 
     hub: Annotated[
         str, Field(pattern=r"^(usb[0-9]+|[0-9]+-[0-9]+(\.[0-9]+)*|[a-zA-Z][^\s/\"]*-usb-0:(0|[0-9]+(\.[0-9]+)*))$")
@@ -25,17 +25,17 @@ class UsbPortConfig(Schema):
     """The hub by topology, as ``find-port`` writes it: "pci-0000:00:14.0-usb-0:1", with "usb-0:0" for a root hub; or \
 its kernel's name, which may change with the next boot: "1-1", or "usb1" for a root hub"""
     port: Annotated[int, Field(ge=1, le=31)]
-    """Port of that hub"""
+    """Port of the hub"""
     interface: Annotated[int, Field(ge=0, le=31)] = 0
-    """USB interface that is the serial line; a Maestro's commands are 0"""
+    """USB interface of the serial line; a Maestro takes commands at 0"""
     baud: Baud | None = None
-    """Bits per second; null = the device's own. USB-CDC devices ignore it"""
+    """Baud rate (bit/s); null selects the device's default. USB-CDC devices ignore it"""
     dtr: bool = True
     """Level of the line DTR while the port is open; false lets an RPLIDAR's motor turn"""
     rts: bool = True
     """Level of the line RTS while the port is open"""
     framing: Framing | None = None
-    """Bits of a byte; null = the device's own"""
+    """Bits of a byte; null selects the device's default"""
     usb_id: Annotated[str, Field(pattern=r"^[0-9a-f]{4}:[0-9a-f]{4}$")] | None = None
     """Expected vendor:product, checked before the first byte; None leaves it to the handshake"""
     latency_ms: Annotated[int, Field(ge=1, le=255)] = 1
@@ -43,7 +43,7 @@ its kernel's name, which may change with the next boot: "1-1", or "usb1" for a r
 
     @property
     def device(self) -> str:
-        """Kernel's name of whatever is plugged in there."""
+        """Name of a device plugged in at this place."""
         return device_name(self.hub, self.port)
 
     @property
@@ -52,7 +52,7 @@ its kernel's name, which may change with the next boot: "1-1", or "usb1" for a r
         return place(self.device)
 
     def at_present(self, sysfs: Sysfs) -> Self:
-        """The same place by the kernel's names of this moment; itself if its controller is not there."""
+        """Return this place with current kernel names; itself if its controller is absent."""
         name = at_present(sysfs, self.device)
         if name == self.device:
             return self
@@ -60,7 +60,7 @@ its kernel's name, which may change with the next boot: "1-1", or "usb1" for a r
 
 
 class CycleMethod(StrEnum):
-    """How a port is switched off and on."""
+    """Method to switch a port off and on."""
 
     AUTHORIZED = "authorized"
     """The kernel drops the device and enumerates it again; power stays on."""
@@ -74,14 +74,14 @@ class PowerConfig(Schema):
     """Switching of single ports."""
 
     method: CycleMethod | None = None
-    """None = ports are never switched"""
+    """Method to switch ports; None disables switching"""
     after: Annotated[int, Field(ge=1, le=100)] | None = None
-    """Short sessions in a row after which a port is cycled unasked; None = only on request"""
+    """Number of consecutive short sessions before a port is cycled automatically; None = only on request"""
     off_time: Annotated[float, Field(ge=0.1, le=30)] = 2.0
-    """Seconds without power"""
+    """Time without power (s)"""
     cut: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Roles of devices whose port is switched off, and stays off, when a motor turns and neither quick stop nor power
-    stage off stops it: where the port feeds the motor's controller, or a relay in its supply"""
+    stage off stops it; for ports that feed the motor's controller, or a relay in its supply"""
 
     @model_validator(mode="after")
     def _method_known(self) -> Self:
@@ -93,22 +93,22 @@ class PowerConfig(Schema):
 
 
 class UsbConfig(Schema):
-    """How the USB tree is watched."""
+    """Settings for watching the USB tree."""
 
     rescan: Annotated[float, Field(ge=0.2, le=60)] = 5.0
-    """Seconds between two checks of the tree when nothing is announced"""
+    """Interval between checks of the tree without announcements (s)"""
     together: Seconds = 0.2
-    """Seconds without a further loss after which losses are judged: those behind one hub are one loss of the hub"""
+    """Time without a further loss before losses are judged (s): losses behind one hub are one loss of the hub"""
     settle: Seconds = 0.5
-    """Seconds without change behind a returned hub before its devices start"""
+    """Time without change behind a returned hub before its devices start (s)"""
     empty_timeout: Seconds = 3.0
-    """Seconds a returned hub may stay empty until its devices count as unplugged"""
+    """Maximum time for a returned hub to stay empty before its devices are considered unplugged (s)"""
     stagger: Seconds = 0.3
-    """Seconds between the start of a device that loads the hub and the one before it"""
+    """Delay of a device that loads the hub after the start of its predecessor (s)"""
     start_apart: tuple[str, ...] = Field(default_factory=started_apart)
-    """Roles that load the hub when they start; all others start as soon as its devices keep still"""
+    """Roles that load the hub when they start; all others start as soon as the hub's devices are stable"""
     start_order: tuple[str, ...] = Field(default_factory=start_order)
-    """Roles in the order they start behind a returned hub: what stops the truck first, what loads the bus last"""
+    """Start order of roles behind a returned hub: devices that stop the truck first, devices that load the bus last"""
     over_current_hold: Seconds = 10.0
-    """Seconds a device is not started after its port reported over-current"""
+    """Delay of a device's start after its port reported over-current (s)"""
     power: PowerConfig = PowerConfig()

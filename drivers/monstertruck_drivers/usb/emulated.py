@@ -1,7 +1,7 @@
-"""An emulated machine with USB hubs: a sysfs tree in a folder, announcements, cables that can be pulled.
+"""Emulated machine with USB hubs: a sysfs tree in a folder, announcements, cables that can be pulled.
 
-The folder looks like ``/sys`` and ``/dev`` of a real machine as far as this package reads and writes them. Serial
-nodes lead to emulated ports; so everything above runs as on a robot, on either clock.
+The folder contains the parts of ``/sys`` and ``/dev`` that this package reads and writes. Serial nodes lead to emulated
+ports, so all code above runs as on a robot, with either clock.
 """
 
 import errno
@@ -21,19 +21,19 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.threads import inline
 
 ENUMERATION: Final = 0.12
-"""Seconds between two devices of a hub that comes back."""
+"""Interval between the devices of a returning hub (s)."""
 
 
 @dataclass(slots=True)
 class _HubOrDevice:
-    """A hub or device that exists, plugged in or not."""
+    """Existing hub or device, plugged in or not."""
 
     name: str
     usb_id: str
     title: str
     serial: str | None
     ports: int = 0
-    """Of a hub; 0 = a device."""
+    """Number of ports of a hub; 0 for a device."""
     node: str | None = None
     """``ttyUSB``, ``ttyACM`` or ``video``."""
     interface: int = 0
@@ -45,21 +45,21 @@ class _HubOrDevice:
 
 @dataclass(slots=True)
 class EmulatedWatcher:
-    """Announces what the emulated machine does; ``deaf`` = no udev, nothing is announced."""
+    """Announces changes of the emulated machine; ``deaf``: no udev and no announcements."""
 
     deaf: bool = False
     _hint: Callable[[], None] | None = field(default=None)
 
     def start(self, hint: Callable[[], None]) -> None:
-        """Listen."""
+        """Start listening."""
         self._hint = hint
 
     def stop(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         self._hint = None
 
     def announce(self) -> None:
-        """Something changed."""
+        """Announce a change."""
         if self._hint is not None and not self.deaf:
             self._hint()
 
@@ -68,7 +68,7 @@ class EmulatedUsb:
     """Hubs and devices in a folder.
 
     Args:
-        folder: gets ``sys`` and ``dev``; must exist.
+        folder: existing folder that receives ``sys`` and ``dev``.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -76,11 +76,11 @@ class EmulatedUsb:
         self.sysfs = _EmulatedSysfs(folder / "sys", self)
         self.dev = folder / "dev"
         self.refused: set[str] = set()
-        """Attributes that may not be written, as for a user without rights: ``latency_timer`` ..."""
+        """Attributes that refuse writes, as for a user without permission: ``latency_timer`` ..."""
         self.busy_numbers: set[int] = set()
         """Node numbers still taken by a process that has a vanished node open."""
         self.controllers: dict[int, str] = {}
-        """Controllers of buses, as root hubs give them for their serial number."""
+        """Controllers by bus number; root hubs report them as serial number."""
         self.commands: list[Sequence[str]] = []
         """Programs that were run."""
         self._devices: dict[str, _HubOrDevice] = {}
@@ -89,13 +89,13 @@ class EmulatedUsb:
         self.dev.mkdir()
 
     def machine(self, clock: Clock) -> Machine:
-        """What the code under test takes for its computer."""
+        """Return the computer for the code under test."""
         return Machine(clock, self.sysfs, self.dev, inline, self._run, self._serial)
 
-    # What there is
+    # Hubs and devices
 
     def add_hub(self, name: str, *, ports: int = 4) -> None:
-        """Create a hub and plug it in; root hubs come by themselves."""
+        """Create a hub and plug it in; root hubs are created automatically."""
         self._add_root(parent_of(name))
         self._devices[name] = _HubOrDevice(name, "05e3:0608", "USB2.0 Hub", None, ports=ports)
         self.plug(name)
@@ -120,35 +120,35 @@ class EmulatedUsb:
             node: ``ttyUSB`` (FTDI), ``ttyACM`` (CDC) or ``video``; None = no node.
             interface: USB interface of the node.
             serial: serial number.
-            cable: what a serial node leads to.
+            cable: emulated port behind a serial node.
         """
         self._add_root(parent_of(name))
         self._devices[name] = _HubOrDevice(name, usb_id, title, serial, node=node, interface=interface, cable=cable)
         self.plug(name)
 
     def _add_root(self, hub: str | None) -> None:
-        """Create a root hub that is not there yet."""
+        """Create a root hub unless it exists."""
         if hub is not None and hub.startswith("usb") and hub not in self._devices:
             controller = self.controllers.get(int(hub.removeprefix("usb")))
             self._devices[hub] = _HubOrDevice(hub, "1d6b:0002", "xHCI Host Controller", controller, ports=8)
             self.plug(hub)
 
     def knows(self, name: str) -> bool:
-        """Whether such a hub or device exists, plugged in or not."""
+        """Return whether the hub or device exists, plugged in or not."""
         return name in self._devices
 
     def present(self, name: str) -> bool:
-        """Whether it shows in the tree."""
+        """Return whether the hub or device appears in the tree."""
         return (self.sysfs.root / DEVICES / name).exists()
 
-    # What happens to it
+    # Changes
 
     def plug(self, name: str, *, number: int | None = None) -> None:
-        """Plug one hub or device in; nothing happens while its hub is not there.
+        """Plug in one hub or device; no effect while its hub is absent.
 
         Args:
             name: place.
-            number: of its node; None = lowest that is free.
+            number: number of its node; None selects the lowest free number.
         """
         device = self._devices[name]
         device.plugged = True
@@ -175,22 +175,22 @@ class EmulatedUsb:
         self.watcher.announce()
 
     def unplug(self, name: str) -> None:
-        """Pull one hub or device out, and whatever hangs on it."""
+        """Unplug one hub or device, and all devices behind it."""
         self._devices[name].plugged = False
         self._vanish(name)
 
     def lose_hub(self, name: str) -> None:
-        """The hub drops off the bus: its devices vanish, then itself, though every cable is in."""
+        """Drop a hub off the bus: its devices vanish, then the hub, although every cable is plugged in."""
         self._vanish(self._devices[name].name)
 
     async def return_hub(self, name: str, clock: Clock, *, first: float = 0.2, between: float = ENUMERATION) -> None:
-        """The hub is enumerated again, then, one after the other, what is plugged into it.
+        """Enumerate a hub again, then its plugged devices in sequence.
 
         Args:
-            name: the hub.
-            clock: time.
-            first: seconds until the hub itself is there.
-            between: seconds until each of its devices is.
+            name: name of the hub.
+            clock: clock for the delays.
+            first: delay of the hub itself (s).
+            between: delay before each of its devices (s).
         """
         await clock.sleep(first)
         self.plug(name)
@@ -208,10 +208,10 @@ class EmulatedUsb:
         self.plug(to)
 
     def renumber(self, buses: Mapping[str, str]) -> None:
-        """Controllers restart: all behind them is enumerated again, with other numbers of the buses.
+        """Restart controllers: all devices behind them are enumerated again, with other bus numbers.
 
         Args:
-            buses: new number by old one.
+            buses: new bus number by old bus number.
         """
         for bus in buses:
             self._vanish(f"usb{bus}")
@@ -228,7 +228,7 @@ class EmulatedUsb:
                 self.plug(name)
 
     def claim(self, name: str) -> None:
-        """A program takes the interface of a device's node through usbfs, as brltty does: the node goes."""
+        """Let a program claim the interface of a device's node through usbfs, as brltty does: the node vanishes."""
         device = self._devices[name]
         self._unbind(device)
         interface = f"{name}:1.{device.interface}"
@@ -237,7 +237,7 @@ class EmulatedUsb:
         self.watcher.announce()
 
     def over_current(self, name: str) -> None:
-        """The port ``name`` hangs on draws too much and says so."""
+        """Report over-current at the port of ``name``."""
         name = self._devices[name].name
         attribute = f"{port_directory(name)}/over_current_count"
         seen = self.sysfs.number(attribute) or 0
@@ -245,16 +245,16 @@ class EmulatedUsb:
         self.watcher.announce()
 
     def suspend_when_idle(self, name: str) -> None:
-        """Some power saver lets the kernel suspend the device, now and after every replug."""
+        """Let the kernel suspend the device, now and after every replug, as a power saver would."""
         self._devices[name].autosuspend = True
         self._write(f"{DEVICES}/{name}", {"power/control": "auto"})
         self.watcher.announce()
 
     def written(self, path: str, value: str) -> None:
-        """The code under test set an attribute: do what the kernel does.
+        """React like the kernel to an attribute written by the code under test.
 
         Raises:
-            PermissionError: it is among ``refused``.
+            PermissionError: the attribute is in ``refused``.
         """
         attribute = Path(path).name
         if attribute in self.refused:
@@ -267,13 +267,13 @@ class EmulatedUsb:
             self._unbind(device) if value == "0" else self._bind(device, None)
             self.watcher.announce()
 
-    # How it is done
+    # Implementation
 
     def _behind(self, hub: str) -> list[str]:
         return sorted((name for name in self._devices if hub in ancestors(name)), key=sort_key)
 
     def _vanish(self, name: str) -> None:
-        """Children first, as the kernel does."""
+        """Remove a hub or device, children first, as the kernel does."""
         for child in [*reversed(self._behind(name)), name]:
             if not self.present(child):
                 continue
@@ -284,7 +284,7 @@ class EmulatedUsb:
             self.watcher.announce()
 
     def _bind(self, device: _HubOrDevice, number: int | None) -> None:
-        """Drivers take the device: interface and node appear."""
+        """Bind drivers to the device: interface and node appear."""
         if device.node is None:
             return
         taken = {other.node_name for other in self._devices.values()} | {
@@ -295,7 +295,7 @@ class EmulatedUsb:
         interface = f"{DEVICES}/{device.name}:1.{device.interface}"
         link = self.sysfs.root / DEVICES / device.name / f"{device.name}:1.{device.interface}"
         if device.node == "ttyUSB":
-            self._write(f"{interface}/{device.node_name}", {"latency_timer": "16"})  # an FTDI's own setting
+            self._write(f"{interface}/{device.node_name}", {"latency_timer": "16"})  # default of an FTDI
         else:
             kind = "video4linux" if device.node == "video" else "tty"
             self._write(f"{interface}/{kind}/{device.node_name}", {})
@@ -321,7 +321,7 @@ class EmulatedUsb:
         return next((device for device in devices if Path(port_directory(device.name)).name == folder), None)
 
     def _switch(self, device: _HubOrDevice | None, *, on: bool) -> None:
-        """A port's power; what hangs there follows it."""
+        """Switch a port's power; its device vanishes or appears."""
         if device is not None and not on:
             self._vanish(device.name)
         elif device is not None and device.plugged:
@@ -350,7 +350,7 @@ class EmulatedUsb:
         return SerialPort(path, baud, dtr=dtr, rts=rts, low_latency=low_latency, framing=framing)
 
     async def _run(self, arguments: Sequence[str]) -> tuple[int, str]:
-        """The only program there is: a uhubctl that switches one port."""
+        """Run the only existing program: a uhubctl that switches one port."""
         self.commands.append(arguments)
         if list(arguments[:1]) != ["uhubctl"] or "uhubctl" in self.refused:
             raise FileNotFoundError(errno.ENOENT, "No such file or directory", arguments[0])
@@ -364,7 +364,7 @@ class EmulatedUsb:
 
 
 class _EmulatedSysfs(Sysfs):
-    """Attributes that act when written."""
+    """Sysfs whose attributes take effect when written."""
 
     def __init__(self, root: Path, usb: EmulatedUsb) -> None:
         super().__init__(root)
@@ -374,7 +374,7 @@ class _EmulatedSysfs(Sysfs):
         if not (self.root / path).exists():
             raise FileNotFoundError(errno.ENOENT, "No such file or directory", path)
         self._usb.written(path, text)
-        if (self.root / path).exists():  # unless the device went with it
+        if (self.root / path).exists():  # unless the device vanished by the write
             (self.root / path).write_text(f"{text}\n")
 
 

@@ -1,9 +1,9 @@
-"""Makes one event of everything a hub loses at once, and lets its devices start one after the other.
+"""Combine simultaneous losses behind a hub into one event, and start the hub's devices in sequence.
 
-A ``HubCoordinator`` compares snapshots. Losses are judged together after a short while: where a hub is gone, or all
-of its several devices are, the topmost such hub is the event, and whatever was behind it waits for the hub. Once the
-tree behind the returned hub keeps still, its devices may start in order of safety. Those that load the hub start apart
-from the one before: a lidar and a camera draw their in-rush then, interfaces drew theirs when they were plugged in. A
+A ``HubCoordinator`` compares snapshots and judges losses together after a short while. If a hub is gone, or all of its
+several devices are, the topmost such hub is the event, and everything behind it waits for the hub. Once the tree behind
+the returned hub is stable, its devices may start in order of safety. Devices that load the hub start with a delay after
+their predecessor: a lidar and a camera draw their in-rush at the start, interfaces drew theirs when plugged in. A
 device may also have to wait because its port reported over-current.
 """
 
@@ -39,21 +39,21 @@ NAME: Final = ServiceName.USB.value
 
 @dataclass(slots=True)
 class _Slot:
-    """What is known of one place of the tree."""
+    """State of one place in the tree."""
 
     device: UsbDevice | None = None
-    """As last seen."""
+    """Device last seen here."""
     present: bool = False
     replugs: int = 0
     free_at: int | None = 0
-    """Instant from which its device may start; None = not before its hub says so."""
+    """Earliest start of its device (ns); None while it waits for its hub."""
     held_until: int = 0
     over_current: int = 0
 
 
 @dataclass(slots=True)
 class _HubOutage:
-    """A hub that is gone, or whose devices are; ends when they may start."""
+    """Outage of a hub or of all its devices; ends when the devices may start."""
 
     hub: str
     since: int
@@ -63,20 +63,20 @@ class _HubOutage:
 
 
 class HubCoordinator:
-    """Knows who must wait for a hub.
+    """Decides which devices must wait for a hub.
 
     Args:
-        config: times and order.
+        config: times and start order.
         ports: configured place of every role.
-        clock: time.
-        events: hubs lost and returned, devices moved, over-current.
+        clock: clock of the daemon.
+        events: sink for events: hubs lost and returned, devices moved, over-current.
     """
 
     def __init__(self, config: UsbConfig, ports: Mapping[str, UsbPortConfig], clock: Clock, events: EventSink) -> None:
         self._config = config
         self._ports = ports
         self._places: dict[str, str] = {}
-        """Place of each role: the kernel's name; until the first look-up, the configured one."""
+        """Place of each role by its kernel name; the configured name before the first look-up."""
         self._roles: dict[str, str] = {}
         """Role of each place."""
         self._locate(lambda name: name)
@@ -90,9 +90,9 @@ class HubCoordinator:
         """Root hubs by controller and speed, as last seen."""
         self._turn = asyncio.Event()
         self.on_miss: Callable[[], None] = lambda: None
-        """Called when a port found nothing plugged in: the tree is worth a look."""
+        """Called when a port found no device plugged in, to have the tree read."""
 
-    # What a port asks
+    # Queries of a port
 
     async def wait_to_start(self, role: str) -> None:
         """Wait until the device of ``role`` may start; returns at once for roles without a USB port."""
@@ -105,12 +105,12 @@ class HubCoordinator:
 
     @property
     def waiting(self) -> frozenset[str]:
-        """Roles that may not start at this moment."""
+        """Roles that may not start now."""
         slots = ((role, self._slots.get(name)) for role, name in self._places.items())
         return frozenset(role for role, slot in slots if slot is not None and self._waits(slot))
 
     def waits_for(self, role: str) -> str | None:
-        """What keeps the device of ``role`` from starting, in words; None if it may start."""
+        """Return in words why the device of ``role`` may not start; None if it may start."""
         name = self._places.get(role, "")
         slot = self._slots.get(name)
         if slot is None or not self._waits(slot):
@@ -126,7 +126,7 @@ class HubCoordinator:
     # Called by the watching service
 
     def update(self, snapshot: TreeSnapshot) -> None:
-        """Take a new snapshot of the tree into account, and whatever has come due since the last one."""
+        """Process a new snapshot of the tree, and everything due since the last one."""
         now = self._clock.now()
         self._follow_buses(snapshot)
         self._locate(snapshot.at_present)
@@ -146,7 +146,7 @@ class HubCoordinator:
         self._call_turn()
 
     def next_due(self) -> int | None:
-        """Instant at which ``update`` has something to decide although nothing changes; None = never."""
+        """Return when ``update`` must decide even without a change in the tree (ns); None if never."""
         dues = [max(self._judging.values()) + _ns(self._config.together)] if self._judging else []
         dues += [
             outage.changed + self._pause(outage) for outage in self._outages.values() if self._slots[outage.hub].present
@@ -154,7 +154,7 @@ class HubCoordinator:
         return min(dues, default=None)
 
     def stop_watching(self) -> None:
-        """The tree is not read any more: no device waits for it."""
+        """Release all waiting devices, because the tree is no longer read."""
         self._judging.clear()
         self._outages.clear()
         self._looked = False
@@ -163,7 +163,7 @@ class HubCoordinator:
         self._call_turn()
 
     def tree(self) -> tuple[UsbNode, ...]:
-        """Everything there, and every configured device that is not; parents before children."""
+        """Return all present nodes and all absent configured devices, parents before children."""
         names = sorted({*self._slots, *self._places.values()}, key=sort_key)
         return tuple(node for name in names if (node := self._node(name)) is not None)
 
@@ -174,7 +174,7 @@ class HubCoordinator:
         self._roles = {name: role for role, name in self._places.items()}
 
     def _follow_buses(self, snapshot: TreeSnapshot) -> None:
-        """Carry the state of places over when their controller came back with other bus numbers."""
+        """Transfer the state of places whose controller came back with other bus numbers."""
         roots = {(root.controller, root.speed): root.name for root in snapshot.roots()}
         buses = {
             before.removeprefix("usb"): root.removeprefix("usb")
@@ -227,14 +227,14 @@ class HubCoordinator:
             if self._looked:
                 if before is None or not _alike(before, slot.device):
                     self._report_if_moved(name, slot.device)
-                if slot.device.hub:  # a new hub's devices start one after the other, too
+                if slot.device.hub:  # the devices of a new hub also start in sequence
                     self._outages[name] = _HubOutage(name, now, now, {name}, announced=False)
 
     def _outage_of(self, name: str) -> _HubOutage | None:
         return next((self._outages[hub] for hub in (name, *ancestors(name)) if hub in self._outages), None)
 
     def _judge(self, now: int) -> None:
-        """Decide what the losses of the last moment were, once all that belong together have come."""
+        """Judge recent losses once all related losses have arrived."""
         if not self._judging or now - max(self._judging.values()) < _ns(self._config.together):
             return
         lost, self._judging = self._judging, {}
@@ -253,7 +253,7 @@ class HubCoordinator:
             self._report_lost(hub, members)
 
     def _lost_hub(self, name: str, lost: Mapping[str, int]) -> str | None:
-        """Topmost hub whose loss explains that of ``name``; None if it vanished alone."""
+        """Return the topmost hub whose loss explains the loss of ``name``; None if it vanished alone."""
         device = self._slots[name].device
         top = name if device is not None and device.hub else None
         for hub in ancestors(name):
@@ -263,12 +263,12 @@ class HubCoordinator:
         return top
 
     def _back(self, outage: _HubOutage) -> list[str]:
-        """Devices behind the hub that are there again, in the order they shall start."""
+        """Return the returned devices behind the hub, in start order."""
         back = [name for name in outage.members if self._slots[name].present and not self._is_hub(name)]
         return sorted(back, key=self._start_rank)
 
     def _pause(self, outage: _HubOutage) -> int:
-        """Nanoseconds without change after which a returned hub's devices may start."""
+        """Return the time without change before the devices of a returned hub may start (ns)."""
         return _ns(self._config.settle if self._back(outage) else self._config.empty_timeout)
 
     def _release(self, now: int) -> None:
@@ -286,7 +286,7 @@ class HubCoordinator:
                 self._report_returned(outage, back, now)
 
     def _stagger(self, starting: list[str], now: int) -> None:
-        """Start the devices of one hub, each that loads it apart from the one before: hubs do not load each other."""
+        """Schedule the devices of one hub; a device that loads it starts with a delay: hubs do not load each other."""
         turns = accumulate(name != starting[0] and self._loads(name) for name in starting)
         for turn, name in zip(turns, starting, strict=True):
             self._slots[name].free_at = now + turn * _ns(self._config.stagger)
@@ -314,7 +314,7 @@ class HubCoordinator:
                 Reason.OVER_CURRENT, Severity.ERROR, NAME, text, ports=",".join(hit), roles=self._roles_at(hit)
             )
 
-    # Telling
+    # Reports
 
     def _report_lost(self, hub: str, members: set[str]) -> None:
         devices = sorted((name for name in members if not self._is_hub(name)), key=sort_key)
@@ -346,7 +346,7 @@ class HubCoordinator:
         )
 
     def _report_if_moved(self, name: str, device: UsbDevice) -> None:
-        """A device that looks like a missing one came at another place. It is reported, never used there."""
+        """Report a device that looks like a missing one at another place; it is never used there."""
         for other, slot in self._slots.items():
             known = slot.device
             wanted = other in self._roles or other in self._outages
@@ -377,7 +377,7 @@ class HubCoordinator:
         held = slot.held_until > self._clock.now()
         there = UsbState.PRESENT if slot.present else UsbState.ABSENT
         device = slot.device
-        # Before the first look nothing is known of a configured device.
+        # Before the first look a configured device is unknown.
         now_there = device if slot.present else None
         tty = now_there.tty if now_there is not None else None
         return UsbNode(
@@ -414,21 +414,21 @@ def _ns(seconds: float) -> int:
 
 
 PERIOD: Final = SECOND
-"""Nanoseconds between two trees when nothing changes."""
+"""Interval between published trees without a change (ns)."""
 
 
 class UsbService:
-    """Reads the tree when something is announced, missed or due, and every few seconds anyway.
+    """Reads the tree on an announcement, a missed device or a due decision, and every few seconds anyway.
 
     Without this service no device waits for a hub.
 
     Args:
         config: times.
-        machine: whose tree.
-        hubs: gets every snapshot.
+        machine: computer with the tree.
+        hubs: receives every snapshot.
         watcher: source of announcements.
-        out: the tree, on change and once a second.
-        events: devices the kernel may suspend.
+        out: publisher of the tree, on change and once per second.
+        events: sink for events about devices that the kernel may suspend.
     """
 
     name = NAME
@@ -472,14 +472,14 @@ class UsbService:
             self._hubs.stop_watching()
 
     async def _woken(self) -> bool:
-        """Sleep until something is announced (True) or due (False)."""
+        """Sleep until an announcement (True) or a due time (False)."""
         seconds = (min(self._next_look(), self._publish_at) - self._clock.now()) / SECOND
         with suppress(TimeoutError):
             async with self._clock.deadline(max(seconds, 0.0)):
                 await self._wake.wait()
         if not self._wake.is_set():
             return False
-        await self._clock.sleep(0.02)  # seconds in which announcements are gathered: a hub announces dozens at once
+        await self._clock.sleep(0.02)  # time to gather announcements (s): a hub sends dozens at once
         self._wake.clear()
         return True
 
@@ -490,8 +490,8 @@ class UsbService:
     async def _look(self) -> None:
         snapshot = await self._machine.offload(lambda: read_tree(self._machine.sysfs))
         self._hubs.update(snapshot)
-        waiting_rescan = 0.5  # seconds between two looks while a driver waits for a hub
-        # Who waits for a hub does not ask for a look, so without announcements one has to be quick oneself.
+        waiting_rescan = 0.5  # interval between reads of the tree while a driver waits for a hub (s)
+        # A driver waiting for a hub does not request a read, so without announcements the service must read often.
         rescan = min(self._config.rescan, waiting_rescan) if self._hubs.waiting else self._config.rescan
         self._look_at = self._clock.now() + round(rescan * SECOND)
         for node in self._hubs.tree():
@@ -506,7 +506,7 @@ class UsbService:
             severity = Severity.WARNING
             what = 'the kernel may suspend it; udev rule: ACTION=="add", SUBSYSTEM=="usb", ATTR{power/control}="on"'
         self._events(Reason.AUTOSUSPEND, severity, node.role or NAME, f"{place(node.name)}: {what}")
-        self._wake.set()  # the tree shows it
+        self._wake.set()  # to publish the change in the tree
 
     def _publish(self) -> None:
         nodes, now = self._hubs.tree(), self._clock.now()
@@ -517,7 +517,7 @@ class UsbService:
 
 
 async def keep_awake(machine: Machine, name: str) -> bool:
-    """Forbid the kernel to suspend a device; False if that is not permitted."""
+    """Forbid the kernel to suspend a device; returns False if not permitted."""
 
     def write() -> bool:
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""A port named by hub and port number: its present node is opened, its adapter made quick, its power switched."""
+"""USB port given by hub and port number: open its current node, lower its adapter's latency, switch its power."""
 
 from collections import defaultdict
 from threading import Lock
@@ -43,12 +43,12 @@ def lower_latency(sysfs: Sysfs, node: Node, latency_ms: int) -> bool:
     """Lower the latency timer of an adapter. Blocks.
 
     Args:
-        sysfs: where the adapter's attributes are.
-        node: serial node, as just read.
-        latency_ms: wanted.
+        sysfs: sysfs with the adapter's attributes.
+        node: serial node, just read.
+        latency_ms: desired latency (ms).
 
     Returns:
-        Whether that is not permitted, and the port has to be opened with low latency instead.
+        True if writing is not permitted, so the port must be opened with low latency instead.
     """
     if node.latency_ms is None or node.latency_ms <= latency_ms:
         return False
@@ -64,12 +64,12 @@ def _timer(node: Node) -> str:
 
 
 class PortPower:
-    """Cycles ports, every one at most after 1, 2, 4 ... 60 s.
+    """Cycles ports; the minimum interval per port grows: 1, 2, 4 ... 60 s.
 
     Args:
         config: method and times.
-        machine: where the ports are.
-        events: reports every power cycle.
+        machine: computer with the ports.
+        events: sink for reports of every power cycle.
     """
 
     def __init__(self, config: PowerConfig, machine: Machine, events: EventSink) -> None:
@@ -77,18 +77,18 @@ class PortPower:
         self._machine = machine
         self._events = events
         self._cycles: dict[str, tuple[int, int]] = {}
-        """Number of cycles and instant of the newest one, by the port's name by topology: buses get other numbers."""
+        """Number of cycles and time of the latest (ns), by the port's topology name, because bus numbers change."""
         self._writing: defaultdict[str, Lock] = defaultdict(Lock)
-        """By first attribute: keeps writes of one port in their order, also after a caller was cancelled."""
+        """Locks by first attribute; they keep the writes of one port in order, even after a caller was cancelled."""
 
     async def cycle(self, name: str) -> None:
-        """Switch the port ``name`` hangs on off and on; its device vanishes and comes back.
+        """Switch the port of ``name`` off and on; its device vanishes and comes back.
 
         Args:
-            name: of the device's place, by topology or the kernel's.
+            name: topology name or kernel name of the device's place.
 
         Raises:
-            DeviceError: switching is not configured, a hub hangs there, or the machine refused.
+            DeviceError: switching is not configured, the device is a hub, or the machine refused.
             BusyError: too soon after the last cycle of this port.
         """
         method = self.config.method
@@ -105,7 +105,7 @@ class PortPower:
             elif method is CycleMethod.PORT:
                 await self._toggle(await self._halves(name), "1", "0", self.config.off_time)
             else:
-                settled = 0.5  # seconds a device is left unauthorized
+                settled = 0.5  # time without authorization (s)
                 await self._toggle([f"{DEVICES}/{name}/authorized"], "0", "1", settled)
         except OSError as error:
             raise DeviceError(f"{place(name)} cannot be switched by {method.value!r}: {error}") from error
@@ -114,7 +114,7 @@ class PortPower:
         )
 
     async def switch_off(self, name: str) -> None:
-        """Take the power from the port ``name`` hangs on, until it is cycled; ``name`` as for ``cycle``.
+        """Cut the power of the port of ``name`` until the port is cycled; ``name`` as in ``cycle``.
 
         Raises:
             DeviceError: the machine refused.
@@ -135,9 +135,9 @@ class PortPower:
     def _pace(self, name: str, topology: str) -> None:
         now = self._machine.clock.now()
         count, last = self._cycles.get(topology, (0, now))
-        if now - last > 600 * SECOND:  # seconds without a cycle after which the pause starts from the first one again
+        if now - last > 600 * SECOND:  # time without a cycle that resets the pause (s)
             count = 0
-        longest_pause = 60  # seconds between two cycles of one port
+        longest_pause = 60  # maximum pause between cycles of one port (s)
         if count:
             pause = min(1 << (count - 1), longest_pause)
             left = pause - (now - last) / SECOND
@@ -146,7 +146,7 @@ class PortPower:
         self._cycles[topology] = (min(count + 1, longest_pause), now)
 
     async def _halves(self, name: str) -> list[str]:
-        """Attributes of the port: a USB 3 hub is two hubs to the kernel, and power is off once both ports are."""
+        """Return the port's attributes: to the kernel a USB 3 hub is two hubs; power is off once both ports are off."""
         sysfs, port = self._machine.sysfs, port_directory(name)
         peer = f"{port}/peer/disable"
         there = await self._machine.offload(lambda: sysfs.text(peer))
@@ -170,7 +170,7 @@ class PortPower:
             await self._write_all(attributes, on)
 
     async def _cycle_by_uhubctl(self, name: str) -> None:
-        """Off and on by one run each: its own ``cycle``, ended between them, would leave the port without power."""
+        """Switch off and on in two runs: ``cycle`` of uhubctl, if ended midway, would leave the port without power."""
         try:
             await self._uhubctl(name, "off")
             await self._machine.clock.sleep(self.config.off_time)
@@ -185,11 +185,11 @@ class PortPower:
 
 
 BRAILLE: Final = frozenset(("0403:6001", "10c4:ea60", "1a86:7523"))
-"""Adapters that brltty of Ubuntu 22.04 takes for braille displays."""
+"""Adapters that brltty of Ubuntu 22.04 mistakes for braille displays."""
 
 
 def why_no_node(device: UsbDevice, kind: str, interface: int) -> str:
-    """Why a device that is plugged in has no node, in words."""
+    """Return in words why a plugged-in device has no node."""
     who = f"{device.usb_id} {device.title}".rstrip()
     if interface not in device.held:
         return f"{who} has no {kind} at interface {interface}"
@@ -199,17 +199,17 @@ def why_no_node(device: UsbDevice, kind: str, interface: int) -> str:
 
 
 OPEN_TIMEOUT: Final = 2.0
-"""Seconds a fresh node may refuse: it is announced before its driver and permissions are in place."""
+"""Maximum time for a fresh node to refuse (s): it is announced before its driver and permissions are in place."""
 
 
 class HubNode:
-    """Resolves hub and port to the present node of one kind; never looks anywhere else.
+    """Resolves hub and port to the current node of one kind; never searches another place.
 
     Args:
-        config: the place.
-        machine: where it is looked up.
-        hubs: who must wait for a hub; None = the port does not wait.
-        role: the device's role, for ``hubs``.
+        config: place of the device.
+        machine: computer for the look-up.
+        hubs: coordinator of waiting devices; None if the port does not wait.
+        role: role of the device, for ``hubs``.
         kind: ``tty`` or ``video4linux``.
     """
 
@@ -232,7 +232,7 @@ class HubNode:
         """Wait for the device's turn to start, then find its node.
 
         Raises:
-            DeviceLostError: nothing is plugged in, or it has no such node (yet).
+            DeviceLostError: no device is plugged in, or it has no such node (yet).
             WrongDeviceError: another kind of device is plugged in.
         """
         if self._hubs is not None:
@@ -263,10 +263,10 @@ class HubPort:
     """Serial port of the device at a hub's port; implements ``Port``.
 
     Args:
-        config: the place.
-        machine: where it is looked up.
-        events: an adapter's latency that cannot be lowered.
-        hubs: who must wait for a hub; None = the port does not wait.
+        config: place of the device.
+        machine: computer for the look-up.
+        events: sink for reports of an adapter whose latency cannot be lowered.
+        hubs: coordinator of waiting devices; None if the port does not wait.
         power: switches the port after several short sessions, where configured.
         role: the device's role.
     """
@@ -295,10 +295,10 @@ class HubPort:
         """Wait for the device's turn, find its node, open it.
 
         Raises:
-            DeviceLostError: nothing is plugged in.
-            DeviceWedgedError: the kernel does not finish opening or closing it.
+            DeviceLostError: no device is plugged in.
+            DeviceWedgedError: the kernel does not finish opening or closing the port.
             WrongDeviceError: another kind of device is plugged in.
-            PortBusyError: another process holds it.
+            PortBusyError: another process holds the port.
         """
         await self._cycle_if_hopeless()
         give_up = self._machine.clock.now() + round(OPEN_TIMEOUT * SECOND)
@@ -312,8 +312,7 @@ class HubPort:
                 if self._machine.clock.now() >= give_up:
                     raise
                 retry = 0.05
-                # Seconds until the next attempt at a port that another program holds; each looks through all processes
-                # for it.
+                # Retry interval for a port held by another program (s); each attempt searches all processes.
                 busy_retry = 0.5
                 pause = busy_retry if isinstance(error, PortBusyError) else retry
             else:

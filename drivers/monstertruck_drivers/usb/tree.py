@@ -1,11 +1,10 @@
-"""Reads the USB tree from sysfs: names, parents, identities, nodes. Pure: one look, no state.
+"""Read the USB tree from sysfs: names, parents, identities, nodes. Pure: one look, no state.
 
-Names are the kernel's: ``usb1`` is the root hub of bus 1, ``1-2`` hangs on its port 2, ``1-2.3`` on port 3 of the
-hub there; ``1-2.3:1.0`` is interface 0 of that device in configuration 1, and ``1-2:1.0/1-2-port3`` the port itself.
+Names are kernel names: ``usb1`` is the root hub of bus 1, ``1-2`` is on its port 2, ``1-2.3`` on port 3 of the hub
+there; ``1-2.3:1.0`` is interface 0 of that device in configuration 1, and ``1-2:1.0/1-2-port3`` is the port itself.
 
-Numbers of buses follow the order in which their controllers were found, which may differ between two boots, and after a
-controller's restart. Names by topology do not change: udev's ``ID_PATH`` names the controller instead, as in
-``pci-0000:00:14.0-usb-0:2.3``.
+Bus numbers follow the order of controller detection, which may change at every boot and after a controller's restart.
+Names by topology do not change: udev's ``ID_PATH`` names the controller instead, as in ``pci-0000:00:14.0-usb-0:2.3``.
 """
 
 import re
@@ -28,26 +27,26 @@ _PORT = re.compile(r".+-port(\d+)")
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A device node of one interface."""
+    """Device node of one interface."""
 
     name: str
     """``ttyUSB0``, ``ttyACM0``, ``video0``: never an identity, it changes with every replug."""
     kind: str
-    """Class it belongs to: ``tty`` or ``video4linux``."""
+    """Device class: ``tty`` or ``video4linux``."""
     interface: int
     path: str
-    """Its driver's folder in sysfs."""
+    """Folder of its driver in sysfs."""
     latency_ms: int | None = None
     """FTDI latency timer; None for other chips."""
 
 
 @dataclass(frozen=True, slots=True)
 class UsbDevice:
-    """A hub or device at one look."""
+    """Snapshot of a hub or device."""
 
     name: str
     devnum: int
-    """Address; a new one is given at every enumeration, so it distinguishes a replug from no change."""
+    """Address; every enumeration assigns a new one, so it distinguishes a replug from no change."""
     usb_id: str
     hub: bool
     title: str
@@ -55,12 +54,12 @@ class UsbDevice:
     autosuspend: bool
     nodes: tuple[Node, ...]
     held: frozenset[int] = frozenset()
-    """Interfaces that a program has taken from the kernel's drivers, through usbfs."""
+    """Interfaces that a program has claimed from the kernel's drivers through usbfs."""
     speed: int = 0
-    """Megabits per second; 0 = unknown. Distinguishes the two root hubs of a USB 3 controller."""
+    """Speed (Mbit/s), 0 if unknown; distinguishes the two root hubs of a USB 3 controller."""
 
     def find(self, kind: str, interface: int = 0) -> Node | None:
-        """First node of ``kind`` on ``interface``."""
+        """Return the first node of ``kind`` on ``interface``."""
         return next((node for node in self.nodes if (node.kind, node.interface) == (kind, interface)), None)
 
     @property
@@ -71,18 +70,18 @@ class UsbDevice:
 
 @dataclass(frozen=True, slots=True)
 class TreeSnapshot:
-    """The whole tree at one look."""
+    """Snapshot of the whole tree."""
 
     devices: dict[str, UsbDevice]
     over_current: dict[str, int]
-    """Over-current conditions a port has counted since its hub came, by the name a device there has."""
+    """Over-current events counted by each port since its hub appeared, by the name of a device there."""
 
     def at_present(self, name: str) -> str:
         """See the function of this name."""
         return _at_present(name, self.roots(), lambda place: place in self.devices)
 
     def roots(self) -> "list[Root]":
-        """Root hubs whose controller is known."""
+        """Return the root hubs whose controller is known."""
         return [
             Root(device.speed, name, device.serial)
             for name, device in self.devices.items()
@@ -91,16 +90,16 @@ class TreeSnapshot:
 
 
 class Root(NamedTuple):
-    """A root hub."""
+    """Root hub with its controller."""
 
     speed: int
-    """Megabits per second."""
+    """Speed (Mbit/s)."""
     name: str
     controller: str
 
 
 def device_name(hub: str, port: int) -> str:
-    """Name of whatever hangs on ``port`` of ``hub``."""
+    """Return the name of a device on ``port`` of ``hub``."""
     root = _ROOT.fullmatch(hub)
     if topology := _BY_TOPOLOGY.fullmatch(hub):
         ports = str(port) if topology["ports"] == "0" else f"{topology['ports']}.{port}"
@@ -109,7 +108,7 @@ def device_name(hub: str, port: int) -> str:
 
 
 def parent_of(name: str) -> str | None:
-    """Name of the hub ``name`` hangs on; None for a root hub."""
+    """Return the parent hub of ``name``; None for a root hub."""
     if topology := _BY_TOPOLOGY.fullmatch(name):
         if topology["ports"] == "0":
             return None
@@ -122,28 +121,28 @@ def parent_of(name: str) -> str | None:
 
 
 def ancestors(name: str) -> Iterator[str]:
-    """Hubs above ``name``, nearest first."""
+    """Yield the hubs above ``name``, nearest first."""
     while (parent := parent_of(name)) is not None:
         yield parent
         name = parent
 
 
 def port_of(name: str) -> int:
-    """Port of the parent that ``name`` hangs on; 0 for a root hub."""
+    """Return the port of ``name`` on its parent; 0 for a root hub."""
     return int(re.split(r"[.:-]", name)[-1]) if "-" in name else 0
 
 
 def place(name: str) -> str:
-    """Where ``name`` is, in words."""
+    """Return the place of ``name`` in words."""
     hub = parent_of(name)
     return name if hub is None else f"hub {hub} port {port_of(name)}"
 
 
 def port_directory(name: str) -> str:
-    """Sysfs folder of the port ``name`` hangs on.
+    """Return the sysfs folder of the port of ``name``.
 
     Raises:
-        ValueError: a root hub hangs on no port.
+        ValueError: ``name`` is a root hub, which has no port.
     """
     hub = parent_of(name)
     if hub is None:
@@ -152,17 +151,17 @@ def port_directory(name: str) -> str:
 
 
 def sort_key(name: str) -> tuple[int, ...]:
-    """Orders names by bus and ports, parents before children."""
+    """Return a sort key that orders names by bus and ports, parents before children."""
     return tuple(int(number) for number in re.findall(r"\d+", name))
 
 
 def is_topology(name: str) -> bool:
-    """Whether a name is one by topology, not the kernel's."""
+    """Return whether a name is a name by topology, not a kernel name."""
     return _BY_TOPOLOGY.fullmatch(name) is not None
 
 
 def topology_of(sysfs: Sysfs, name: str) -> str:
-    """The name by topology of a place; the kernel's where its controller is unknown."""
+    """Return the name by topology of a place; its kernel name if the controller is unknown."""
     root = next((hub for hub in ancestors(name) if _ROOT.fullmatch(hub)), name)
     controller = sysfs.text(f"{DEVICES}/{root}/serial")
     if not controller:
@@ -172,9 +171,10 @@ def topology_of(sysfs: Sysfs, name: str) -> str:
 
 
 def at_present(sysfs: Sysfs, name: str) -> str:
-    """The kernel's present name of a place that is named by topology; ``name`` itself where it is none, or not there.
+    """Return the current kernel name of a place given by topology.
 
-    A controller of USB 3 has two root hubs: the one where something is there, else the one of USB 2.
+    Returns ``name`` itself if it is not a name by topology, or absent. Of the two root hubs of a USB 3 controller, the
+    hub with a device at the place is used, otherwise the USB 2 hub.
     """
     if not is_topology(name):
         return name
@@ -200,18 +200,18 @@ def _at_present(name: str, roots: list[Root], is_there: Callable[[str], bool]) -
 
 
 def renumbered(name: str, buses: Mapping[str, str]) -> str:
-    """The name that a place has after buses got other numbers.
+    """Return the name of a place after a change of bus numbers.
 
     Args:
-        name: one of the kernel's.
-        buses: new number by old one.
+        name: kernel name.
+        buses: new bus number by old bus number.
     """
     prefix, number, ports = re.split(r"(\d+)", name, maxsplit=1)
     return f"{prefix}{buses.get(number, number)}{ports}"
 
 
 def read_tree(sysfs: Sysfs) -> TreeSnapshot:
-    """Read every hub and device. Devices that vanish while being read are left out."""
+    """Read every hub and device; omit devices that vanish meanwhile."""
     entries = sysfs.names(DEVICES)
     interfaces: dict[str, list[str]] = {}
     for entry in entries:
@@ -230,7 +230,7 @@ def read_tree(sysfs: Sysfs) -> TreeSnapshot:
 
 
 def read_device(sysfs: Sysfs, name: str) -> UsbDevice | None:
-    """Read one device; None if there is none."""
+    """Read one device; None if it is absent."""
     entries = sysfs.names(f"{DEVICES}/{name}")
     return _read_device(sysfs, name, [entry for entry in entries if _INTERFACE.fullmatch(entry)])
 
@@ -264,7 +264,7 @@ def _number(interface: str) -> int:
 
 
 def _nodes(sysfs: Sysfs, entry: str, interface: int) -> Iterator[Node]:
-    """Nodes of one interface: below ``tty`` for CDC, one folder deeper for USB serial adapters."""
+    """Return the nodes of one interface: below ``tty`` for CDC, one folder deeper for USB serial adapters."""
     path = f"{DEVICES}/{entry}"
     for kind in ("tty", "video4linux"):
         for name in sysfs.names(f"{path}/{kind}"):

@@ -1,4 +1,4 @@
-"""What a configuration file may say about VESCs: the motors on one port, the servo output, the battery."""
+"""Settings of VESCs in the configuration file: the motors on one port, the servo output, the battery."""
 
 import math
 from typing import Annotated, Literal, Self
@@ -36,9 +36,9 @@ class VescServoConfig(Schema):
     min: Position = 0.15
     max: Position = 0.85
     dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
-    """From a steering command to the first movement of the wheels, s; null = not measured"""
+    """Dead time from a steering command to the first movement of the wheels (s); null = not measured"""
     lag: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Time constant with which the wheels then turn, s; null = not measured"""
+    """Time constant of the wheels' movement after the dead time (s); null = not measured"""
 
     @model_validator(mode="after")
     def _centre_within_limits(self) -> Self:
@@ -90,17 +90,17 @@ class VescConfig(Schema):
     servo: VescServoConfig | None = None
     """Servo output, which steers the front axle; null = another device steers, or nothing does"""
     battery: PackConfig | None = None
-    """Pack that supplies the first controller, by its own reading; null = not measured here"""
+    """Pack that supplies the first controller, measured by that controller; null = not measured here"""
     battery_rate: Annotated[float, Field(gt=0, le=50)] = 10.0
     """Battery readings per second"""
     rate: Annotated[float, Field(ge=10, le=100)] = 40.0
     """Exchanges per second with every controller; at 115200 baud one takes 9 ms"""
     answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.03
-    """Seconds in which an answer must come"""
+    """Timeout of an answer (s)"""
     command_timeout: Seconds = 0.25
-    """Age of the newest command at which the motors brake"""
+    """Age of the latest command at which the motors brake (s)"""
     watchdog: Annotated[float, Field(ge=0.05, le=1.0)] = 0.1
-    """Seconds without a set-point after which the controller itself brakes; written to it at every start"""
+    """Time without a set-point after which the controller itself brakes (s); written to it at every start"""
 
     @property
     def shafts(self) -> int:
@@ -109,7 +109,7 @@ class VescConfig(Schema):
 
     @property
     def motor_limits(self) -> MotorLimits:
-        """What a motor does."""
+        """Limits of a motor."""
         return MotorLimits(
             self.max_motor_rpm * RAD_S_PER_RPM,
             self.deceleration_rpm_s * RAD_S_PER_RPM,

@@ -39,19 +39,19 @@ from monstertruck_schemas.sensor import Battery, DriveFeedback, DriveMode, Steer
 
 
 class VescSetpoint(NamedTuple):
-    """What the motors shall do."""
+    """Set-points of the motors."""
 
     mode: DriveMode
     """DISABLED, QUICK_STOP or ENABLED."""
     rpm: tuple[float, ...] = ()
-    """Of ENABLED: motor speeds, forward positive."""
+    """Motor speeds for ENABLED (rpm), forward positive."""
 
 
 def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: VescConfig) -> VescSetpoint:
-    """Return what the newest commands of all shafts mean together; stale ones brake.
+    """Combine the latest commands of all shafts into set-points; stale commands brake.
 
     Args:
-        commands: newest one of every shaft, if any.
+        commands: latest command of every shaft, if any.
         now: time, ns.
         config: limits and time-outs.
     """
@@ -81,22 +81,22 @@ class VescDriver:
 
     Args:
         config: see ``VescConfig``.
-        port: where the first controller hangs.
+        port: port of the first controller.
         clock: time.
-        commands: ``cmd/drive`` of the first shaft; those of the others follow.
-        commands_2: of the second.
-        commands_3: of the third.
-        commands_4: of the fourth.
+        commands: ``cmd/drive`` of the first shaft.
+        commands_2: the same for the second shaft.
+        commands_3: the same for the third shaft.
+        commands_4: the same for the fourth shaft.
         steering_commands: ``cmd/steering``.
         drive: feedback of the first motor, whose current explains the battery's sag.
         out: ``sensor/drive`` of the first shaft, ``stamp`` in the middle of the exchange.
-        out_2: of the second.
-        out_3: of the third.
-        out_4: of the fourth.
-        steering: position that was sent to the servo, as an angle; None when another device steers.
+        out_2: the same for the second shaft.
+        out_3: the same for the third shaft.
+        out_4: the same for the fourth shaft.
+        steering: position sent to the servo, as an angle; None when another device steers.
         battery: pack voltage; None when the battery is measured elsewhere.
         events: identity, restarts, faults.
-        name: of the service.
+        name: name of the service.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class VescDriver:
         """Faults that were reported and are still there."""
         self._sent = DriveMode.DISABLED
         self._position: float | None = None
-        """Newest one sent to the servo."""
+        """Latest position sent to the servo."""
 
     async def run(self, ready: Ready) -> None:
         """One session, from the brake of motors that may still turn to the stop at its end.
@@ -203,7 +203,7 @@ class VescDriver:
         return wanted is not DriveMode.ENABLED and wanted is not self._sent
 
     async def _until(self, session: VescSession, due: int) -> None:
-        """Wait for the next cycle, or for a command that stops running motors; the last shaft's is the newest."""
+        """Wait for the next cycle, or for a command that stops running motors; the last shaft's is the latest."""
         while (left := due - self._clock.now()) > 0:
             last = self._commands[-1]
             if await last.next_within(left / SECOND, lambda _: not self._is_urgent()) is None or self._is_urgent():
@@ -287,7 +287,7 @@ class VescDriver:
         out.put(SteeringFeedback(stamp=stamp, received=received, seq=out.next_seq(), front=angle, rear=0.0))
 
     async def _make_safe(self, session: VescSession) -> None:
-        """Brake until the motors rest, then let them coast; after the deadline the watchdog goes on braking."""
+        """Brake until the motors rest, then let them coast; after the deadline the watchdog continues braking."""
         config = self._config
         rest = config.standstill_rpm * config.pole_pairs
         with contextlib.suppress(DeviceLostError):

@@ -1,10 +1,10 @@
-"""The device side of VESCs: the connected controller and those behind it on its CAN bus.
+"""Device side of VESCs: the connected controller and the controllers behind it on its CAN bus.
 
-Habits of the real thing: it says nothing unasked, and nothing to a damaged packet or an unknown one; set-points are not
-answered; a set-point that stops coming ends in the watchdog's brake current, which is 0 as delivered, so the motor
-coasts for as long as it likes; the speed controller gives no torque below its least speed; a fault takes the motor for
-half a second; the answer of a controller behind CAN comes without a word of where it is from; temporary settings and
-counters are gone after a power-up; the servo output keeps its newest position.
+Real VESCs send nothing without a request, and do not answer damaged packets, unknown packets or set-points. When
+set-points stop, the watchdog applies its brake current; the factory setting is 0, so the motor coasts freely. The speed
+controller gives no torque below its minimum speed. A fault releases the motor for half a second. Answers from behind
+CAN do not name their sender. Temporary settings and counters are lost at power-up. The servo output keeps its latest
+position.
 """
 
 import asyncio
@@ -50,11 +50,11 @@ class EmulatedController:
 
     Args:
         now: clock.
-        plant: what the motor turns.
-        settings: of the driver: pole pairs, braking.
-        can_id: of its own.
-        signals: of the whole device.
-        place: of the motor, from 1 on, for the signals' names.
+        plant: load of the motor.
+        settings: driver settings: pole pairs, braking.
+        can_id: CAN id of this controller.
+        signals: signals of the whole device.
+        place: number of the motor, from 1, for the signals' names.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class EmulatedController:
     def fail(self, code: int) -> None:
         """Take a fault: the motor coasts, and obeys nothing for a while; 0 ends one that stays."""
         self.fault = code
-        fault_stop = 500 * MILLISECOND  # for which the controller takes no set-point after a fault
+        fault_stop = 500 * MILLISECOND  # time after a fault in which the controller takes no set-point
         self._blocked_until = self._clock.now() + fault_stop
         self._turn(None)
 
@@ -125,7 +125,7 @@ class EmulatedController:
         self._turn(share * free, self._config.deceleration_rpm_s)
 
     def obey_again(self) -> None:
-        """Apply a disobedience that began or ended to the present target."""
+        """Apply the start or end of a disobedience to the current target."""
         self._turn(*self._asked)
 
     def settings(self) -> bytes:
@@ -134,7 +134,7 @@ class EmulatedController:
         return bytes((PacketId.GET_APPCONF,)) + SIGNATURE + bytes((self.can_id,)) + watchdog + self._tail
 
     def apply(self, payload: bytes) -> bool:
-        """Take temporary settings; False if their signature is another firmware's."""
+        """Take temporary settings; return False if their signature belongs to another firmware."""
         if payload[1:5] != SIGNATURE or len(payload) < SETTINGS_SIZE:
             return False
         self.watchdog = WatchdogSetting.of(bytes((PacketId.GET_APPCONF,)) + payload[1:])
@@ -178,17 +178,17 @@ class EmulatedController:
 class VescEmulator:
     """All controllers on one port.
 
-    Faults (``inject``): ``silent on|off`` (gives no answers), ``late SECONDS [COUNT]`` (answers), ``noise COUNT`` (so
-    many answers have a wrong byte), ``reset`` (all restart), ``fault CODE [MOTOR]`` (0 ends it), ``no_store on|off``
-    (firmware that knows no temporary settings), ``firmware MAJOR MINOR``, ``runaway`` (all disobey, see
-    ``DisobedientMotor``).
+    Faults (``inject``): ``silent on|off`` (gives no answers), ``late SECONDS [COUNT]`` (answers), ``noise COUNT`` (the
+    next COUNT answers have a wrong byte), ``reset`` (all restart), ``fault CODE [MOTOR]`` (0 ends it),
+    ``no_store on|off`` (firmware that knows no temporary settings), ``firmware MAJOR MINOR``, ``runaway`` (all disobey,
+    see ``DisobedientMotor``).
 
     Args:
         clock: time.
-        plants: what the motors turn; free motors take the missing places.
-        servos: steering servos, of which the output moves the one on channel 0; None = nothing is connected.
-        settings: which controllers there are.
-        own_id: CAN id of the connected one.
+        plants: loads of the motors; free motors take the missing places.
+        servos: steering servos; the output moves the servo on channel 0. None = not connected.
+        settings: list of controllers.
+        own_id: CAN id of the connected controller.
     """
 
     def __init__(
@@ -202,7 +202,7 @@ class VescEmulator:
     ) -> None:
         self.name = "vesc"
         self.received = ReceivedBytes()
-        """Newest bytes from the host."""
+        """Latest bytes from the host."""
         config = settings or VescConfig()
         count = config.shafts
         reported, ordered = ("erpm", "tachometer", "current", "volts"), ("run", "stop")
@@ -211,7 +211,7 @@ class VescEmulator:
         kinds["servo"] = SignalKind.ORDER
         self.signals = Signals(clock.now, kinds, np.random.default_rng(0))
         self.position: float | None = None
-        """Of the servo output; None = no pulses yet."""
+        """Position of the servo output; None = no pulses yet."""
         self._clock = clock
         self._servos = servos
         self._silent, self._no_store = False, False
@@ -299,7 +299,7 @@ class VescEmulator:
                     self._take(end, payload)
 
     async def _watch(self) -> None:
-        watch_period = 10 * MILLISECOND  # in which the watchdog looks
+        watch_period = 10 * MILLISECOND  # period of the watchdog's checks
         while True:
             await self._clock.sleep(watch_period / SECOND)
             for controller in self.controllers:
@@ -308,14 +308,14 @@ class VescEmulator:
     def _take(self, end: DeviceEnd, payload: bytes) -> None:
         controller, delay = self._own, 0.0005  # seconds from the end of a request to its answer
         if payload[0] == PacketId.FORWARD_CAN and len(payload) > 2:
-            # Seconds that an answer of some 80 bytes takes in frames of 8 bytes at 500 kbit/s, both ways.
+            # Round trip of an answer of some 80 bytes in frames of 8 bytes at 500 kbit/s (s).
             can_delay = 0.003
             controller, delay = self._by_id.get(payload[1]), can_delay
             payload = payload[2:]
         if payload[0] == PacketId.SET_SERVO_POS and len(payload) == 3:
             self._set_servo(int.from_bytes(payload[1:], "big", signed=True) / SERVO_SCALE)
         elif controller is not None and (answer := self._obey(controller, payload)) is not None:
-            restart_of_apps = 0.05  # seconds for which a change of settings keeps the answer back
+            restart_of_apps = 0.05  # seconds by which a change of settings delays the answer
             late = restart_of_apps if payload[0] == PacketId.SET_APPCONF_NO_STORE else 0.0
             self._send(end, answer, delay + late)
 

@@ -43,7 +43,7 @@ class PacketId(IntEnum):
 
 
 class PacketError(ValueError):
-    """A payload that is not what it should be."""
+    """Malformed or unexpected payload."""
 
 
 def frame(payload: bytes) -> bytes:
@@ -65,7 +65,7 @@ class Deframer:
         self.bad = 0
         """Bytes that belonged to no packet."""
         self.strange = b""
-        """Newest of them."""
+        """Latest of them."""
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
@@ -155,7 +155,7 @@ class FirmwareIdentity:
 
     @classmethod
     def of(cls, payload: bytes) -> Self:
-        """From a payload.
+        """Parse a payload.
 
         Raises:
             PacketError: something else.
@@ -196,13 +196,13 @@ class MotorValues:
     fault: int
     controller_id: int
     celsius: float = 25.0
-    """Of its transistors."""
+    """Temperature of the transistors."""
     timed_out: bool = False
     """Its watchdog has taken the motor."""
 
     @classmethod
     def of(cls, payload: bytes) -> Self:
-        """From a payload; later firmware may append fields.
+        """Parse a payload; later firmware may append fields.
 
         Raises:
             PacketError: something else.
@@ -225,7 +225,7 @@ class MotorValues:
         )
 
     def payload(self) -> bytes:
-        """The answer that states it; what is not used reads 0."""
+        """Encode the answer; unused fields read 0."""
         return _VALUES.pack(
             PacketId.GET_VALUES,
             round(10 * self.celsius),
@@ -253,16 +253,16 @@ _WATCHDOG_AT: Final = 6
 
 @dataclass(frozen=True, slots=True)
 class WatchdogSetting:
-    """What the controller does when it gets no set-point: it brakes."""
+    """Watchdog of the controller: it brakes when it gets no set-point."""
 
     milliseconds: int
-    """Without a set-point until it acts; 0 = never."""
+    """Time without a set-point until the watchdog acts (ms); 0 = never."""
     brake_current: float
-    """A; 0 = it coasts."""
+    """Brake current (A); 0 = the motor coasts."""
 
     @classmethod
     def of(cls, settings: bytes) -> Self:
-        """From an answer to ``GET_APPCONF``.
+        """Parse an answer to ``GET_APPCONF``.
 
         Raises:
             PacketError: something else.
@@ -287,7 +287,7 @@ FAULTS: Final = (
 
 
 def fault_text(code: int) -> str:
-    """What a fault code means."""
+    """Return the meaning of a fault code."""
     return f"{code} ({FAULTS[code]})" if code < len(FAULTS) else str(code)
 
 

@@ -22,22 +22,22 @@ from monstertruck_runtime.errors import DeviceMismatchError, DeviceTimeoutError,
 ATTEMPTS: Final = 3
 """Tries of the requests of a session's beginning."""
 SETTINGS_TIMEOUT: Final = 0.5
-"""Seconds for an answer of some 500 bytes, or one for which the controller restarts its applications."""
+"""Timeout of an answer of some 500 bytes, or after which the controller restarts its applications (s)."""
 
 
 class VescSession:
-    """One session. Packets carry no sequence number: an answer is known by its kind and, of values, by its CAN id.
+    """One session. Packets carry no sequence number: the kind, and for values the CAN id, identify an answer.
 
     Args:
         link: open link.
         clock: time.
-        timeout: seconds in which an answer must come.
+        timeout: timeout of an answer (s).
     """
 
     def __init__(self, link: Link, clock: Clock, timeout: float) -> None:
         self.deframer = Deframer()
         self.asked = 0
-        """When the newest question was sent, ns."""
+        """Send time of the latest request (ns)."""
         self.heard = False
         """A whole packet came."""
         self._link = link

@@ -30,12 +30,12 @@ TABLES_SEGMENT: Final = b"\xff\xc4" + (2 + len(_TABLES)).to_bytes(2, "big") + _T
 
 
 def complete(data: bytes) -> bytes:
-    """The picture from its FF D8 to its FF D9, with Huffman tables.
+    """Return the picture from its FF D8 to its FF D9, with Huffman tables.
 
     Headers are followed; the compressed part is not decoded, so that a flipped bit in it shows in the picture only.
 
     Args:
-        data: what the camera sent; zeros behind the picture are cut off.
+        data: bytes from the camera; zeros after the picture are cut off.
 
     Raises:
         ValueError: cut off, or no JPEG; the text says where it ends to be one.
@@ -50,7 +50,7 @@ def complete(data: bytes) -> bytes:
 
 
 def _follow(data: bytes) -> tuple[int, bool]:
-    """Where the scan begins, and whether Huffman tables come before it."""
+    """Return the start of the scan, and whether Huffman tables precede it."""
     if not data.startswith(START):
         raise ValueError(f"begins with {data[:2].hex(' ')} instead of FF D8")
     at, has_tables, has_frame = len(START), False, False

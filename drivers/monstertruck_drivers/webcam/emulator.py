@@ -53,20 +53,20 @@ REFUSALS: Final = {"EINVAL": errno.EINVAL, "EBUSY": errno.EBUSY, "ENOSPC": errno
 
 
 class WebcamEmulator:
-    """A camera that streams rendered JPEGs while a host wants them.
+    """Camera that streams rendered JPEGs while a host requests them.
 
     The world is asked on the loop; drawing and compressing happens in ``offload``.
 
     Faults (``inject``): ``drop N`` (pictures counted, but not sent), ``corrupt N`` (start marker overwritten),
     ``truncate N`` (the second half is missing), ``bare on|off`` (no Huffman tables), ``jump SECONDS`` (added to all
-    stamps from now on), ``stuck on|off`` (streams nothing, says nothing), ``refuse EINVAL|EBUSY|ENOSPC|off`` (at the
+    stamps from now on), ``stuck on|off`` (streams and answers nothing), ``refuse EINVAL|EBUSY|ENOSPC|off`` (at the
     next openings), ``vanish [SECONDS]`` (gone from USB in mid-stream, and back).
 
     Args:
         clock: time.
-        view: what is to be seen.
-        offload: where pictures are drawn: a thread, or ``inline`` on the virtual clock.
-        usb: the port it hangs on, for ``vanish``.
+        view: source of the pictures.
+        offload: runs the drawing: in a thread, or ``inline`` on the virtual clock.
+        usb: port of the camera, for ``vanish``.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class WebcamEmulator:
         while True:
             await self._wanted.wait()
             session = self._session
-            schedule = Schedule(self._clock, self._rate, ahead=-self._clock.now())  # a clock of its own
+            schedule = Schedule(self._clock, self._rate, ahead=-self._clock.now())  # separate clock
             while self._wanted.is_set() and session == self._session:
                 stamp = await schedule.next()
                 if self._wanted.is_set() and session == self._session:

@@ -1,4 +1,4 @@
-"""What an emulated camera says over its port: the answers and pictures a real one gives through the kernel.
+"""Packets of an emulated camera: the answers and pictures that a real camera gives through the kernel.
 
 Host to camera: lines ``OPEN <width> <height> <rate>`` and ``CLOSE``. Camera to host: packets of a header with its
 own CRC-32 and a payload, little-endian.
@@ -21,7 +21,7 @@ HEADER_SIZE: Final = _HEADER.size + _CRC.size
 
 
 class PacketKind(IntEnum):
-    """What a packet is."""
+    """Kind of a packet."""
 
     GRANTED = 1
     """Streaming begins; the payload is the mode."""
@@ -63,7 +63,7 @@ def decode_mode(payload: bytes) -> Mode:
 
 
 class PacketParser:
-    """Bytes in, packets out, however they are cut; after lost bytes it goes on at the next correct header."""
+    """Extracts packets from bytes, however they are cut; after lost bytes it resumes at the next correct header."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()

@@ -56,7 +56,7 @@ class RenderedSource:
 
 
 class RenderedStream:
-    """Newest picture of a streaming emulator."""
+    """Latest picture of a streaming emulator."""
 
     def __init__(self, link: Link, parser: PacketParser, mode: Mode) -> None:
         self.mode = mode
@@ -85,7 +85,7 @@ PTYS: Final = Path("/dev/pts")
 
 
 class PathSource:
-    """Checks at every opening whether the path leads to a pty, behind which only an emulator can be.
+    """Checks at every opening whether the path leads to a pty, which only an emulator can serve.
 
     Args:
         path: node, symlink or glob pattern, see ``V4l2Source``.

@@ -1,4 +1,4 @@
-"""Where pictures come from: the interface that the real and the emulated camera share."""
+"""Picture source: the interface shared by the real and the emulated camera."""
 
 import errno
 from dataclasses import dataclass
@@ -32,19 +32,19 @@ class CameraFrame:
     """One picture as the camera gave it: not checked yet."""
 
     stamp: int | None
-    """Nanoseconds of CLOCK_MONOTONIC at the exposure; None = not known."""
+    """Time of exposure on CLOCK_MONOTONIC (ns); None = unknown."""
     sequence: int
     """The camera's own count."""
     data: bytes
     damaged: bool = False
-    """The kernel says that it is incomplete."""
+    """The kernel marked the picture as incomplete."""
 
 
 class FrameStream(Protocol):
     """A camera that is sending."""
 
     mode: Mode
-    """What it granted, not always what was requested."""
+    """Granted mode; it may differ from the requested one."""
 
     async def next(self) -> CameraFrame:
         """Wait for a picture newer than the last one; those in between are dropped.
@@ -95,7 +95,7 @@ _HINTS: Final = {
 
 
 def device_error(name: str, doing: str, error: OSError) -> DeviceError:
-    """What an error number of the kernel means for a camera; EINVAL while ``set the format`` is a mismatch."""
+    """Translate a kernel error number for a camera; EINVAL during ``set the format`` is a mismatch."""
     number = error.errno or 0
     kind = _KINDS.get(number, DeviceError)
     if number == errno.EINVAL and doing == SET_FORMAT:
@@ -104,4 +104,4 @@ def device_error(name: str, doing: str, error: OSError) -> DeviceError:
 
 
 SET_FORMAT: Final = "set the format"
-"""The step at which a camera refuses a mode."""
+"""Step in which a camera refuses a mode."""

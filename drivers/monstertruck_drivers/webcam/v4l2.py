@@ -26,7 +26,7 @@ MJPG: Final = int.from_bytes(b"MJPG", "little")
 CAP_CAPTURE: Final = 0x1
 CAP_STREAMING: Final = 0x04000000
 CAP_DEVICE_CAPS: Final = 0x80000000
-"""The node's own capabilities are given in addition to those of the whole device."""
+"""The node's capabilities are reported in addition to the whole device's capabilities."""
 FLAG_ERROR: Final = 0x40
 TIMESTAMP_MONOTONIC: Final = 0x2000
 
@@ -94,9 +94,9 @@ class Capability:
     driver: str
     card: str
     bus: str
-    """Where it hangs: ``usb-0000:00:14.0-1.2``."""
+    """Bus address, such as ``usb-0000:00:14.0-1.2``."""
     flags: int
-    """Of the node, not of the whole device."""
+    """Capabilities of the node, not of the whole device."""
 
     @property
     def captures(self) -> bool:
@@ -122,7 +122,7 @@ class Filled:
     """Nanoseconds of CLOCK_MONOTONIC; None = of another clock."""
     sequence: int
     offset: int
-    """Where to map it."""
+    """Offset for mapping the buffer."""
     length: int
 
     @classmethod

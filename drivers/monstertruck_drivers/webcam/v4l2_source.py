@@ -164,7 +164,7 @@ class _Starting:
 
 
 class V4l2Stream:
-    """Newest picture of a streaming camera."""
+    """Latest picture of a streaming camera."""
 
     def __init__(self, camera: Camera, offload: Offload) -> None:
         self.mode = camera.mode
@@ -245,7 +245,7 @@ def pixel_formats(path: str, kernel: v4l2.Kernel) -> list[int]:
 
 @contextmanager
 def asked(path: str, kernel: v4l2.Kernel) -> Iterator[tuple[int, v4l2.Capability]]:
-    """Open a node and ask what it is; closed again behind the context."""
+    """Open a node and query its capabilities; close it at the end of the context."""
     with _doing(path, "ask it what it is"):
         fd = kernel.open(path)
         try:

@@ -1,4 +1,4 @@
-"""IMU driver: what the unit streams becomes angular velocities and specific forces."""
+"""IMU driver: converts the unit's stream into angular velocities and specific forces."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from monstertruck_schemas.sensor import Imu
 
 
 class ImuSample(NamedTuple):
-    """What was measured at one instant."""
+    """Measurement at one instant."""
 
     force: Wt61Packet
     rate: Wt61Packet

@@ -21,16 +21,16 @@ SLEEP: Final = "toggle_sleep"
 
 
 class Wt61Emulator:
-    """A WT61 that streams from power-up on.
+    """WT61 that streams from power-up on.
 
-    Faults (`inject`): ``frozen on|off`` (the same packets again and again), ``silent on|off``, ``asleep on|off``
-    (standby, which the command for it ends), ``bad_checksum N`` (the next so many packets), ``inverted on|off``
-    (mounted upside down by somebody: yaw rate with the wrong sign), ``half_packet``.
+    Faults (`inject`): ``frozen on|off`` (repeats the same packets), ``silent on|off``, ``asleep on|off``
+    (standby, which the command for it ends), ``bad_checksum N`` (the next N packets), ``inverted on|off``
+    (mounted upside down: yaw rate with the wrong sign), ``half_packet``.
 
     Args:
         clock: time.
         source: physics.
-        seed: of the converters' noise.
+        seed: seed of the converters' noise.
     """
 
     def __init__(self, clock: Clock, source: ImuSource, *, seed: int = 0) -> None:

@@ -1,7 +1,7 @@
 """Packets of the WT61 (WitMotion, "WT61 communication protocol").
 
 A packet has eleven bytes: 0x55, kind, four signed 16-bit numbers with the low byte first, and the sum of the ten bytes
-before it. The unit streams acceleration, angular velocity and angle one after the other, unasked. Commands are FF AA
+before it. The unit streams acceleration, angular velocity and angle in turn, without a request. Commands are FF AA
 and one byte.
 """
 
@@ -57,7 +57,7 @@ class Wt61Packet(NamedTuple):
 
     @property
     def celsius(self) -> float:
-        """Of acceleration and angular velocity packets."""
+        """Temperature in acceleration and angular velocity packets (degrees Celsius)."""
         return self.temperature / 340 + 36.53
 
 
