@@ -1,4 +1,4 @@
-"""A board that somebody holds before a camera: how it is held, what it looks like, and what a lidar sees of it."""
+"""Calibration board held in front of a camera: its pose, its appearance, and the ranges a lidar measures to it."""
 
 import math
 from functools import cache
@@ -13,21 +13,21 @@ from monstertruck_sim.world.config import HeldBoard
 from monstertruck_sim.world.noise import BOARD, generator
 
 ASIDE: float = 0.5
-"""Greatest distance of the board's middle from the camera's axis, as a share of half the picture's width."""
+"""Maximum lateral offset of the board's centre from the optical axis, as a fraction of half the image width."""
 BELOW: float = 0.4
-"""Greatest distance above or below the axis, as a share of half the picture's width."""
+"""Maximum vertical offset from the axis, as a fraction of half the image width."""
 
 
 class BoardHolder:
-    """Somebody who holds a board before a camera, every while another way.
+    """A person who holds a board in front of a camera and changes its pose at intervals.
 
     Args:
-        board: and for how long it is held still.
-        field_of_view: of the camera, rad.
-        seed: of how it is held.
+        board: the board, and for how long each pose is held.
+        field_of_view: field of view of the camera (rad).
+        seed: seed of the board poses.
 
     Raises:
-        NotInstalledError: the extra ``vision`` is not there.
+        NotInstalledError: the extra ``vision`` is not installed.
     """
 
     def __init__(self, board: HeldBoard, field_of_view: float, seed: int) -> None:
@@ -35,22 +35,22 @@ class BoardHolder:
         self._board, self._field_of_view, self._seed = board, field_of_view, seed
 
     def panel_at(self, time_ns: int, place: CameraPlace) -> FlatPanel:
-        """The board at an instant, before a camera that is at ``place`` then."""
+        """Return the board at an instant, in front of a camera that is then at ``place``."""
         slot = time_ns // round(self._board.hold * SECOND)
         return held(self._board, place, generator(self._seed, BOARD, slot), self._field_of_view)
 
 
 def held(board: HeldBoard, place: CameraPlace, rng: np.random.Generator, field_of_view: float) -> FlatPanel:
-    """The board somewhere in a camera's view, turned by up to 30 degrees, and leaning by 17 to 40."""
+    """Return the board at a random place in a camera's view, turned by up to 30 degrees and leaning by 17 to 40."""
     texture = board_texture(board.columns, board.rows, board.square, board.marker)
     wide, high = (printed * board.printed_scale for printed in (board.width, board.height))
     away = rng.uniform(0.9, 1.7) * max(wide, high) / math.tan(field_of_view / 2)
     aside, below = rng.uniform(-ASIDE, ASIDE), rng.uniform(-BELOW, BELOW)
     aside, below = (part * away * math.tan(field_of_view / 2) for part in (aside, below))
-    upright = 0.35  # turn about the camera's axis, rad, at most
+    upright = 0.35  # maximum rotation about the optical axis, rad
     spin, tilt = rng.uniform(-upright, upright), rng.uniform(-0.55, 0.55)
     lean = float(rng.choice((-1.0, 1.0))) * rng.uniform(0.3, 0.7)
-    # Its axes in the camera's: right and down, turned about the axis, then tilted.
+    # Board axes in the camera frame: right and down, rotated about the optical axis, then tilted.
     right = np.array((math.cos(spin) * math.cos(tilt), math.sin(spin) * math.cos(tilt), math.sin(tilt)))
     down = np.array((-math.sin(spin) * math.cos(lean), math.cos(spin) * math.cos(lean), math.sin(lean)))
     down = down - right * float(down @ right)
@@ -68,12 +68,12 @@ def held(board: HeldBoard, place: CameraPlace, rng: np.random.Generator, field_o
 
 
 def panel_ranges(panel: FlatPanel, origin: Array, directions: Array) -> Array:
-    """Distances at which beams meet a panel, m; inf = they do not; (n,).
+    """Return the range of each beam to a panel, (n,), m; inf for a miss.
 
     Args:
-        panel: in the map.
-        origin: of the beams in the map, m, (3,).
-        directions: unit vectors in the map, (n, 3).
+        panel: panel in the map frame.
+        origin: origin of the beams in the map frame, (3,), m.
+        directions: unit vectors in the map frame, (n, 3).
     """
     normal = np.cross(panel.right, panel.down)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -87,14 +87,14 @@ def panel_ranges(panel: FlatPanel, origin: Array, directions: Array) -> Array:
 
 @cache
 def board_texture(columns: int, rows: int, square: float, marker: float) -> NDArray[np.uint8]:
-    """The print, ``SQUARE_PIXELS`` pixels a square.
+    """Draw the board's print, ``square_pixels`` pixels per square.
 
     Raises:
-        NotInstalledError: the extra ``vision`` is not there.
+        NotInstalledError: the extra ``vision`` is not installed.
     """
     cv2 = opencv("sim.world.board")
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     board = cv2.aruco.CharucoBoard((columns, rows), square, marker, family)
-    square_pixels = 40  # pixels of a board's square in its texture
+    square_pixels = 40  # pixels per board square in the texture
     drawn = board.generateImage((columns * square_pixels, rows * square_pixels), marginSize=0)
     return np.asarray(drawn, dtype=np.uint8)

@@ -1,7 +1,7 @@
-"""Everything that can be chosen about the simulated world; the defaults are the truck's.
+"""Settings of the simulated world; the defaults describe the truck.
 
-These are the *true* values of the plant. The daemon has its own calibration, so a hidden error
-is made by changing a value here and not there. ``noise: false`` leaves the physics and drops every random part.
+These are the *true* values of the plant. The daemon has its own calibration: to create a hidden error, change a value
+here only. ``noise: false`` keeps the physics and disables every random part.
 """
 
 from math import radians
@@ -31,25 +31,25 @@ class ServoModelConfig(Schema):
     us_per_degree: float = -10.48
     """Pulse change per degree of servo angle, us."""
     rate: Positive = 6.0
-    """Greatest servo speed, rad/s (0.17 s for 60 degrees)."""
+    """Maximum servo speed, rad/s (0.17 s for 60 degrees)."""
     dead_time: NotNegative = 0.0
     """Delay from a new pulse to the first movement, s."""
     lag: NotNegative = 0.0
-    """Time constant with which the arm then turns, s; 0: at its greatest speed"""
+    """Time constant of the arm's movement, s; 0: the arm turns at its maximum speed"""
     dead_band_us: NotNegative = 2.0
-    """The servo does not move for a smaller change of its pulse, us."""
+    """Smallest pulse change that moves the servo, us."""
     resolution_us: Positive = 1.0
-    """Steps in which the servo measures its pulse, us."""
+    """Resolution of the servo's pulse measurement, us."""
     left_stop_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
-    """Angle at which something stops the arm on its way to the left."""
+    """Angle of the arm's mechanical stop on the left."""
     right_stop_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
 
 
 class MotorConfig(Schema):
-    """Drive motor and what lies between it and the ground."""
+    """Drive motor and drivetrain."""
 
     inverted: bool = True
-    """The controller's positive sense drives the truck backwards."""
+    """Whether a positive controller speed drives the truck backwards."""
     ratio: Positive = 644.0
     """Motor turns per wheel turn."""
     lag: Positive = 0.02
@@ -61,17 +61,17 @@ class MotorConfig(Schema):
     coast_rpm_s: Positive = 30_000.0
     """Deceleration of the unpowered motor by friction, rpm/s."""
     torque_constant: Positive = 0.0127
-    """Nm/A (24 V at 18000 rpm)."""
+    """Torque constant, Nm/A (24 V at 18000 rpm)."""
     efficiency: Annotated[float, Field(gt=0, le=1)] = 0.5
     """Efficiency of all gear stages together."""
     idle_current: NotNegative = 0.08
-    """Current of the unloaded turning motor, A."""
+    """No-load current of the turning motor, A."""
     peak_current: NotNegative = 2.0
-    """The controller's limit, which a motor that is held draws, A."""
+    """Current limit of the controller, drawn by a blocked motor, A."""
     rotor_inertia: NotNegative = 1e-6
-    """kg m^2."""
+    """Moment of inertia of the rotor, kg m^2."""
     winding_resistance: NotNegative = 2.0
-    """Ohm."""
+    """Resistance of the winding, ohm."""
     current_noise: NotNegative = 0.01
     """Standard deviation of the measured current, A."""
 
@@ -91,67 +91,67 @@ class LinkageConfig(Schema):
 
     @property
     def polynomials(self) -> SteeringPolynomials:
-        """For the kinematics.
+        """Steering polynomials for the kinematics.
 
         Raises:
-            KinematicsError: wheels that do not follow their servo.
+            KinematicsError: the wheels do not follow their servo.
         """
         front, rear = (AxlePolynomials(a.left_from_servo, a.right_from_left) for a in (self.front, self.rear))
         return SteeringPolynomials(front, rear)
 
 
 class SkidModelConfig(Schema):
-    """What a skid-steer robot does besides what its body's parameters say."""
+    """Effects of a skid-steer robot that its body parameters do not cover."""
 
     wheel_gains: Annotated[tuple[Positive, ...], Field(strict=False)] = ()
-    """Effective over nominal radius of the wheel on every shaft: motors and wheels are not identical; empty = all 1"""
+    """Ratio of effective to nominal wheel radius per shaft, as motors and wheels are not identical; empty: all 1"""
     reversal_turn: float = 0.0
-    """Turn at each reversal of the direction of travel, on average, left positive, rad"""
+    """Mean turn at each reversal of the direction of travel, left positive, rad"""
     reversal_spread: NotNegative = 0.0
-    """Its standard deviation, rad"""
+    """Standard deviation of ``reversal_turn``, rad"""
     drift_x: float = 0.0
-    """Slide of a robot whose wheels turn, in the map frame, m/s"""
+    """Slide along x of the map frame while the wheels turn, m/s"""
     drift_y: float = 0.0
-    """m/s"""
+    """Slide along y of the map frame while the wheels turn, m/s"""
 
 
 class SimTruckConfig(Schema):
     """Body, wheels and tyres.
 
     Tyre slip: an axle travels at its wheels' angle less ``slip_angle`` times its lateral acceleration (gravity on a
-    side slope included); the body covers less ground than the wheels roll by ``slip_per_newton`` times the pull.
-    Both carry a slow random part. A wheel that is not steered rolls along its own axis.
+    side slope included). The body travels less than the wheels roll, by ``slip_per_newton`` times the pull.
+    Both have a slow random part. An unsteered wheel rolls along its own axis.
     """
 
     body: AnyBody = TruckBody()
-    """Kind of robot, as the daemon's own ``body``"""
+    """Kind of robot, as in the daemon's ``body``"""
     dynamics: Literal["kinematic", "single_track"] = "kinematic"
-    """How tyres hold a body with steered axles: by their slip angles, or with the inertia of the single-track model
-    (linear tyres, blended into rolling below 0.15 m/s), whose stiffnesses then replace the slip angles."""
+    """Lateral dynamics of a body with steered axles: slip angles, or the single-track model with inertia (linear tyres,
+    blended into rolling below 0.15 m/s), where the stiffnesses replace the slip angles."""
     yaw_inertia: Positive = 0.20
-    """kg m^2; of the single-track model"""
+    """Yaw moment of inertia, kg m^2; single-track model only"""
     front_stiffness: Positive = 120.0
-    """Cornering stiffness of the front axle's tyres, N/rad; of the single-track model"""
+    """Cornering stiffness of the front axle's tyres, N/rad; single-track model only"""
     rear_stiffness: Positive = 120.0
-    """Cornering stiffness of the rear axle's tyres, N/rad; of the single-track model"""
+    """Cornering stiffness of the rear axle's tyres, N/rad; single-track model only"""
     wheelbase: Positive = 0.32
-    """m."""
+    """Wheelbase, m."""
     track: Positive = 0.26
-    """m."""
+    """Track, m."""
     wheel_radius: Positive = 0.075
-    """m."""
+    """Wheel radius, m."""
     length: Positive = 0.47
     """Length of the footprint, centred on the geometric centre, m."""
     width: Positive = 0.34
     """Width of the footprint, m."""
     mass: Positive = 7.25
-    """kg."""
+    """Mass of the robot, kg."""
     rolling_resistance: NotNegative = 0.05
-    """Rolling resistance as a share of the weight."""
+    """Rolling resistance as a fraction of the weight."""
     front_slip_angle: NotNegative = 0.06
-    """rad per m/s^2."""
+    """Front slip angle per lateral acceleration, rad per m/s^2."""
     rear_slip_angle: NotNegative = 0.04
-    """rad per m/s^2; less than in front: the truck understeers a little."""
+    """Rear slip angle per lateral acceleration, rad per m/s^2; less than in front: the truck understeers slightly."""
     slip_angle_noise: NotNegative = 0.004
     """Standard deviation of the random part of each axle's slip angle, rad."""
     slip_per_newton: NotNegative = 0.0005
@@ -159,23 +159,23 @@ class SimTruckConfig(Schema):
     slip_noise: NotNegative = 0.005
     """Standard deviation of the random part of the longitudinal slip ratio."""
     steering: Literal["corrected", "as_published", "2016"] | LinkageConfig = "corrected"
-    """Linkage polynomials: a set of the sources', or a truck's own."""
+    """Linkage polynomials: one of the published sets, or custom ones."""
     front_servo: ServoModelConfig = ServoModelConfig(channel=1)
     rear_servo: ServoModelConfig = ServoModelConfig(channel=0)
     front_right_servo: ServoModelConfig | None = None
-    """Where every wheel has its own servo: the front right wheel's; ``front_servo`` is the front left one's."""
+    """Servo of the front right wheel if every wheel has its own servo; ``front_servo`` is then the front left servo."""
     rear_right_servo: ServoModelConfig | None = None
-    """The rear right wheel's; ``rear_servo`` is the rear left one's."""
+    """Servo of the rear right wheel; ``rear_servo`` is then the rear left servo."""
     motor: MotorConfig = MotorConfig()
-    """Each of the motors"""
+    """Parameters of each motor"""
     skid: SkidModelConfig = SkidModelConfig()
     """Slip of a skid-steer body"""
 
     def chassis(self) -> Chassis:
-        """True kinematics.
+        """Return the true kinematics.
 
         Raises:
-            KinematicsError: dimensions no robot can have.
+            KinematicsError: the dimensions are impossible.
         """
         drivetrain = DriveTrain(self.motor.ratio, self.wheel_radius)
         polynomials = self.steering.polynomials if isinstance(self.steering, LinkageConfig) else self.steering
@@ -184,7 +184,7 @@ class SimTruckConfig(Schema):
 
     @property
     def servos(self) -> tuple[ServoModelConfig, ...]:
-        """Front and rear, or front left, front right, rear left and rear right."""
+        """Steering servos: front and rear, or front left, front right, rear left and rear right."""
         if self.front_right_servo is None or self.rear_right_servo is None:
             return self.front_servo, self.rear_servo
         return self.front_servo, self.front_right_servo, self.rear_servo, self.rear_right_servo
@@ -212,31 +212,31 @@ class SimTruckConfig(Schema):
 
 
 class MechanicsConfig(Schema):
-    """Masses, springs and friction of the truck, for engine ``mujoco``; the whole mass is ``truck.mass``."""
+    """Masses, springs and friction of the truck for engine ``mujoco``; the total mass is ``truck.mass``."""
 
     wheel_mass: Positive = 0.281
     """Mass of one wheel, kg."""
     axle_mass: Positive = 0.45
     """Mass of one axle without its wheels, kg."""
     mass_height: Positive = 0.12
-    """Height of the centre of the mass on the springs over the ground, m."""
+    """Height of the centre of the sprung mass above the ground, m."""
     wheel_width: Positive = 0.08
-    """m."""
+    """Width of a wheel, m."""
     droop: Positive = 0.010
-    """How far an axle sinks below its place at rest before its stop, m."""
+    """Downward travel of an axle from its rest position to its stop, m."""
     bump: Positive = 0.030
-    """How far it rises before its stop, m."""
+    """Upward travel of an axle from its rest position to its stop, m."""
     damping: Positive = 0.35
-    """Damping of the suspension as a share of the critical one."""
+    """Damping ratio of the suspension (1: critical)."""
     axle_roll_deg: Annotated[float, Field(gt=0, le=45)] = 10.0
-    """Greatest roll of an axle against the chassis."""
+    """Maximum roll of an axle relative to the chassis, degrees."""
     friction: Positive = 0.5
     """Coefficient of friction between tyres and ground."""
     tyre_stiffness: NotNegative = 60.0
-    """Force of one rolling tyre by a small slip angle, N/rad (half an axle's of the single-track model), and by a small
-    slip ratio, N; 0: rigid wheels"""
+    """Force of one rolling tyre per slip angle, N/rad (half the axle stiffness of the single-track model), and per
+    slip ratio, N, for small slip; 0: rigid wheels"""
     relaxation: Annotated[float, Field(ge=0.01)] = 0.04
-    """Distance rolled in which a tyre's deflection gives way, m"""
+    """Relaxation length of a tyre, m"""
 
 
 class BatteryModelConfig(Schema):
@@ -246,13 +246,13 @@ class BatteryModelConfig(Schema):
     """Cells in series."""
     capacity_ah: Positive = 5.0
     charge: Fraction = 0.95
-    """Charge at the start, as a share of the capacity."""
+    """Initial charge as a fraction of the capacity."""
     resistance: NotNegative = 0.08
-    """Resistance of cells and wiring, acts at once, ohm."""
+    """Instantaneous resistance of cells and wiring, ohm."""
     recovery_resistance: NotNegative = 0.04
-    """Additional sag that builds up and recovers with ``recovery_time``, ohm."""
+    """Resistance of the additional sag that builds up and recovers with ``recovery_time``, ohm."""
     recovery_time: Positive = 20.0
-    """s."""
+    """Time constant of the additional sag, s."""
     electronics_w: NotNegative = 25.0
     """Constant load of computer, sensors and hubs, W."""
     divider: Positive = 10.0
@@ -260,42 +260,42 @@ class BatteryModelConfig(Schema):
     channel: Annotated[int, Field(ge=0, le=5)] = 5
     """Analog input of the servo controller."""
     analog_offset: float = 0.0
-    """Added at the analog input by the drop along the ground wire, V."""
+    """Offset at the analog input due to the voltage drop along the ground wire, V."""
     filter_time: Positive = 0.1
     """Time constant of the divider's RC low-pass, s."""
     analog_noise: NotNegative = 0.003
-    """Standard deviation at the analog input, V."""
+    """Standard deviation of the voltage at the analog input, V."""
 
 
 class LidarConfig(Schema):
-    """The lidar: its true mount and its faults. Directions, rate and range are those of the device that is emulated."""
+    """True mount and faults of the lidar. The emulated device defines beam directions, rate and range."""
 
     x: float = 0.14
-    """Mount before the geometric centre, m."""
+    """Distance of the mount ahead of the geometric centre, m."""
     y: float = 0.0
     """Distance to the left of the geometric centre, m."""
     yaw: float = 0.0
-    """Direction of its middle beam, left positive, rad."""
+    """Direction of the middle beam, left positive, rad."""
     pitch: float = 0.0
-    """Nose down positive, rad: its plane on the mount."""
+    """Pitch of the scanning plane on the mount, nose down positive, rad."""
     roll: float = 0.0
-    """Right side down positive, rad."""
+    """Roll of the scanning plane on the mount, right side down positive, rad."""
     height: Positive = 0.25
-    """Height of the scanning plane over the ground, m."""
+    """Height of the scanning plane above the ground, m."""
     first_step: Annotated[int, Field(ge=0, le=768)] = 44
     """First step of 0..768 at which a URG-04LX measures."""
     last_step: Annotated[int, Field(ge=0, le=768)] = 725
-    """Its last one."""
+    """Last step at which a URG-04LX measures."""
     min_range: NotNegative | None = None
-    """Shortest range, m; null: by the device's data sheet."""
+    """Minimum range, m; null: from the device's data sheet."""
     max_range: Positive | None = None
-    """Longest range, m; null: by the device's data sheet."""
+    """Maximum range, m; null: from the device's data sheet."""
     accuracy_sigmas: Positive = 2.0
-    """How many standard deviations the data sheet's bound on the error is."""
+    """Error bound of the data sheet in standard deviations."""
     dropout: Fraction = 0.002
-    """Chance of a single beam to fail."""
+    """Probability that a single beam fails."""
     wall_height: Positive = 0.6
-    """Height of everything in the map, m: beams tilted upwards pass over it."""
+    """Height of everything in the map, m; beams tilted upwards may pass over it."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -307,90 +307,90 @@ class LidarConfig(Schema):
 
 
 class CameraConfig(Schema):
-    """The webcam: its true mount, lens and noise."""
+    """True mount, lens and noise of the webcam."""
 
     x: float = 0.18
-    """Mount before the geometric centre, m."""
+    """Distance of the mount ahead of the geometric centre, m."""
     y: float = 0.0
     """Distance to the left of the geometric centre, m."""
     height: Positive = 0.25
-    """Over the ground, m."""
+    """Height above the ground, m."""
     yaw: float = 0.0
-    """Direction in which it looks, left positive, rad."""
+    """Viewing direction, left positive, rad."""
     pitch: float = 0.0
-    """Downwards positive, rad."""
+    """Pitch, downwards positive, rad."""
     roll: float = 0.0
-    """Right side down positive, rad."""
+    """Roll, right side down positive, rad."""
     field_of_view: Annotated[float, Field(gt=0.1, lt=2.5)] = radians(63.0)
-    """Horizontal, of the lens without its distortion, rad."""
+    """Horizontal field of view of the lens without distortion, rad."""
     k1: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
-    """Radial distortion, second order."""
+    """Radial distortion coefficient, second order."""
     k2: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
-    """Fourth order."""
+    """Radial distortion coefficient, fourth order."""
     noise: Annotated[float, Field(ge=0, le=50)] = 0.0
-    """Standard deviation of a pixel's grey, of 255."""
+    """Standard deviation of the pixel noise, grey levels of 255."""
     reach: Positive = 30.0
-    """Nothing farther away is drawn, m."""
+    """Maximum drawing distance, m."""
     rendered: bool = False
-    """Pictures are rendered in three dimensions, with shadows (40 ms each by software); engine mujoco only."""
+    """Whether to render images in three dimensions with shadows (40 ms each in software); engine mujoco only."""
 
 
 class TagConfig(Schema):
     """An AprilTag of family 36h11 in the world: upright, as on a wall, or lying."""
 
     tag: Annotated[int, Field(ge=0, le=586)]
-    """Its number."""
+    """Tag number."""
     x: float
-    """Position of its middle in the map, m."""
+    """x of the tag's centre in the map, m."""
     y: float
-    """m."""
+    """y of the tag's centre in the map, m."""
     z: float = 0.25
-    """Over the ground, m."""
+    """Height above the ground, m."""
     yaw: float = 0.0
-    """Direction that it faces, rad; of a lying one that of its upper edge."""
+    """Direction the tag faces, rad; for a lying tag, the direction of its upper edge."""
     size: Annotated[float, Field(gt=0.01, le=1)] = 0.1
-    """Side of its black square, m."""
+    """Side of the black square, m."""
     lies: bool = False
-    """It faces upwards."""
+    """Whether the tag lies, facing upwards."""
 
 
 class HeldBoard(BoardConfig):
-    """A ChArUco board that somebody holds before a camera, every while another way."""
+    """A ChArUco board that a person holds in front of a camera, changing its pose at intervals."""
 
     hold: Annotated[float, Field(ge=0.05, le=60)] = 1.5
-    """Seconds for which it is held still"""
+    """Time for which each pose is held, s"""
     printed_scale: Annotated[float, Field(gt=0.1, lt=10)] = 1.0
-    """Size of the true board as a share of the sizes above"""
+    """Ratio of the true board size to the sizes above"""
 
 
 class RoofTag(Schema):
-    """An AprilTag that lies on the robot, its upper edge towards the front; seen in three dimensions only."""
+    """An AprilTag lying on the robot, upper edge towards the front; visible in three dimensions only."""
 
     tag: Annotated[int, Field(ge=0, le=586)]
     x: float = 0.0
-    """Distance of its middle ahead of the geometric centre, m."""
+    """Distance of the tag's centre ahead of the geometric centre, m."""
     y: float = 0.0
     """Distance to the left of the geometric centre, m."""
     z: float = 0.3
-    """Over the ground, m."""
+    """Height above the ground, m."""
     size: Annotated[float, Field(gt=0.01, le=1)] = 0.08
-    """Side of its black square, m."""
+    """Side of the black square, m."""
 
 
 class Iron(Schema):
-    """Magnetic error of the truck's own metal: measured = soft * true + hard, per device axis x, y, z."""
+    """Magnetic error due to the truck's metal: measured = soft * true + hard, per device axis x, y, z."""
 
     hard_x: float = 0.0
-    """mG."""
+    """Hard-iron offset in x, mG."""
     hard_y: float = 0.0
-    """mG."""
+    """Hard-iron offset in y, mG."""
     hard_z: float = 0.0
-    """mG."""
+    """Hard-iron offset in z, mG."""
     soft_x: float = 1.0
     soft_y: float = 1.0
     soft_z: float = 1.0
     soft_xy: float = 0.0
-    """Share of x that shows in y, and of y in x."""
+    """Fraction of the x field measured in y, and of the y field in x."""
 
 
 class CompassModelConfig(Schema):
@@ -399,15 +399,15 @@ class CompassModelConfig(Schema):
     north_yaw: float = 1.5707963267948966
     """Direction of magnetic north in the map frame, rad."""
     horizontal_field: Positive = 250.0
-    """mG."""
+    """Horizontal field strength, mG."""
     vertical_field: float = -390.0
-    """Upwards, mG (northern hemisphere: down)."""
+    """Vertical field, upwards positive, mG (northern hemisphere: downwards)."""
     deviation_deg: NotNegative = 0.4
-    """Greatest error of a fixed smooth curve over the heading."""
+    """Maximum error of the deviation curve, which is fixed and smooth over the heading, degrees."""
     noise_deg: NotNegative = 0.1
-    """Standard deviation of heading, pitch and roll."""
+    """Standard deviation of heading, pitch and roll, degrees."""
     tilt_bias_deg: NotNegative = 0.2
-    """Greatest fixed error of pitch and of roll."""
+    """Maximum fixed error of pitch and of roll, degrees."""
     motor_field: float = 5.0
     """Field along the device's y per ampere of motor current, mG/A (1.1 degrees at 1 A)."""
     temperature_c: float = 25.0
@@ -415,23 +415,23 @@ class CompassModelConfig(Schema):
 
 
 class HornConfig(Schema):
-    """How a servo of the lidar's mount was put together."""
+    """Assembly of a servo of the lidar mount."""
 
     zero: float | None = None
-    """Position at which the lidar is parallel to the body, steps; None: as the driver's settings say."""
+    """Position at which the lidar is parallel to the body, steps; None: from the driver settings."""
     direction: Literal[-1, 1] | None = None
-    """+1 where a rising position turns the joint positively (REP 103); None: as the driver's settings say."""
+    """+1 if a rising position turns the joint positively (REP 103); None: from the driver settings."""
 
 
 class MountConfig(Schema):
-    """The lidar's mount with its two servos."""
+    """Lidar mount with two servos."""
 
     pitch: HornConfig = HornConfig()
     roll: HornConfig = HornConfig()
 
 
 class SonarPlace(Schema):
-    """A sonar on the body: place from the geometric centre, m, and direction of its axis, rad, left positive."""
+    """Sonar mount: position relative to the geometric centre, m, and direction of the axis, left positive, rad."""
 
     x: float
     y: float
@@ -445,41 +445,41 @@ FIVE_SONARS: dict[str, SonarPlace] = {
     "fr": SonarPlace(x=0.10, y=-0.05, yaw=-0.7854),
     "r": SonarPlace(x=0.05, y=-0.05, yaw=-1.5708),
 }
-"""Left, front left, front, front right, right. FL is 0.05 m ahead of L, which is 0.05 m left of the middle; the other
-values are chosen."""
+"""Left, front left, front, front right, right. FL is 0.05 m ahead of L, and L is 0.05 m left of the centre line; the
+other values are assumptions."""
 
 
 class SonarModelConfig(Schema):
     """Ultrasonic range finders.
 
     ``beam``: range along the axis to walls that reflect in all directions. ``cone``: nearest echo from anywhere in the
-    cone; walls are mirrors for sound that meets them at more than ``critical_angle`` from the normal, edges and corners
-    reflect in all directions, and a sonar takes the sound of another one for its own.
+    cone. Walls are mirrors for sound that meets them at more than ``critical_angle`` from the normal; edges and corners
+    reflect in all directions. A sonar mistakes the sound of another sonar for its own.
     """
 
     model: Literal["beam", "cone"] = "cone"
     field_of_view: Annotated[float, Field(gt=0, lt=3)] = 0.87
     """Full opening angle of the cone, rad."""
     range_min: NotNegative = 0.15
-    """Least range, m: what is nearer is reported as this range."""
+    """Minimum range, m; nearer objects are reported at this range."""
     range_max: Positive = 3.0
-    """Greatest range, m."""
+    """Maximum range, m."""
     noise: NotNegative = 0.005
     """Standard deviation of a range, m."""
     noise_share: NotNegative = 0.01
-    """Standard deviation that grows with the range, of the range; added to ``noise`` in quadrature."""
+    """Range-proportional standard deviation, as a fraction of the range; added to ``noise`` in quadrature."""
     dropout: Fraction = 0.0
-    """Chance that an echo is missed."""
+    """Probability that an echo is missed."""
     critical_angle: Annotated[float, Field(gt=0, le=1.5708)] = 0.45
-    """Greatest angle from a wall's normal at which sound comes back, rad; ``cone`` only."""
+    """Maximum angle from a wall's normal at which sound returns, rad; ``cone`` only."""
     cross_talk: bool = True
-    """A sonar hears what others sent; ``cone`` only."""
+    """Whether a sonar hears the pings of others; ``cone`` only."""
     audible: Positive = 6.0
-    """Farthest wall whose echo is heard, m: what comes back from beyond ``range_max`` may meet the next ping."""
+    """Maximum distance of a wall with an audible echo, m; an echo from beyond ``range_max`` may meet the next ping."""
     sonars: dict[FrameId, SonarPlace] = FIVE_SONARS
-    """Mounts by name."""
+    """Sonar mounts by name."""
     height: NotNegative = 0.12
-    """Height of all sonars over the ground, m: on a body that leans some look over the walls."""
+    """Height of all sonars above the ground, m; on a leaning body some sonars look over the walls."""
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -492,91 +492,91 @@ class SonarModelConfig(Schema):
 
 
 class ImuModelConfig(Schema):
-    """Gyroscopes and accelerometers at the geometric centre; axes x forward, y left, z up."""
+    """IMU at the geometric centre; axes x forward, y left, z up."""
 
     rate_noise: NotNegative = 0.003
     """Standard deviation of each angular velocity, rad/s."""
     rate_bias: NotNegative = 0.01
-    """Greatest fixed error of each angular velocity, rad/s."""
+    """Maximum fixed error of each angular velocity, rad/s."""
     rate_scale: Positive = 1.0
     """Scale factor of the measured rate about z."""
     acceleration_noise: NotNegative = 0.05
-    """Standard deviation of each axis, m/s^2."""
+    """Standard deviation of each acceleration, m/s^2."""
     acceleration_bias: NotNegative = 0.1
-    """Greatest fixed error of each axis, m/s^2."""
+    """Maximum fixed error of each acceleration, m/s^2."""
     temperature_c: float = 30.0
 
 
 class GroundTilt(Schema):
-    """The ground is level, or follows the profile in the map's folder."""
+    """Level ground, or the ground profile in the map's folder."""
 
     kind: Literal["ground"] = "ground"
 
 
 class RoughPatch(Schema):
-    """A rectangle of rough ground: waves along x and along y, added to the ground's height."""
+    """A rectangle of rough ground: waves along x and along y, added to the height of the ground."""
 
     x: float
-    """Position of its middle, m."""
+    """x of the centre, m."""
     y: float
-    """m."""
+    """y of the centre, m."""
     length: Positive = 1.0
-    """Along x, m."""
+    """Length along x, m."""
     width: Positive = 1.0
-    """Along y, m."""
+    """Width along y, m."""
     height: Positive = 0.02
     """Amplitude, m."""
     wavelength: Positive = 0.45
-    """m."""
+    """Wavelength, m."""
 
 
 class SinusoidTilt(Schema):
-    """The body rocks with time, on any ground."""
+    """Sinusoidal rocking of the body, on any ground."""
 
     kind: Literal["sinusoid"]
     pitch_deg: float = 15.0
-    """Amplitude, nose down positive."""
+    """Pitch amplitude, nose down positive, degrees."""
     roll_deg: float = 0.0
-    """Amplitude, right side down positive; a quarter period after pitch."""
+    """Roll amplitude, right side down positive, degrees; lags pitch by a quarter period."""
     frequency: Positive = 0.5
-    """Hz."""
+    """Frequency, Hz."""
 
 
 class SteadyTilt(Schema):
-    """The body stands on blocks, on any ground."""
+    """Constant tilt of a body on blocks, on any ground."""
 
     kind: Literal["steady"]
     pitch_deg: float = 0.0
-    """Nose down positive."""
+    """Pitch, nose down positive, degrees."""
     roll_deg: float = 0.0
-    """Right side down positive."""
+    """Roll, right side down positive, degrees."""
 
 
 TiltConfig = Annotated[GroundTilt | SinusoidTilt | SteadyTilt, Field(discriminator="kind")]
 
 
 class Spot(Schema):
-    """A place in the map frame, m."""
+    """Position in the map frame, m."""
 
     x: float
     y: float
 
 
 class PersonConfig(Schema):
-    """Somebody who walks through the world: an upright cylinder."""
+    """A person who walks through the world, modelled as an upright cylinder."""
 
     waypoints: Annotated[tuple[Spot, ...], Field(strict=False)] = ()
-    """Walked to in turn, the first one again after the last one; the first is the start. Empty: drawn by the seed"""
+    """Way-points, walked in a loop from the first. Empty: random, from the seed"""
     speed: Annotated[float, Field(gt=0, le=3)] = 0.8
-    """m/s on average; every leg is up to a fifth slower or faster"""
+    """Mean speed, m/s; each leg is up to a fifth slower or faster"""
     radius: Annotated[float, Field(gt=0, le=1)] = 0.2
-    """m"""
+    """Radius of the cylinder, m"""
     pause: NotNegative = 2.0
-    """Seconds of standing at a way-point, on average"""
+    """Mean pause at a way-point, s"""
     distance: NotNegative = 0.8
-    """Metres kept from robots and other people ahead"""
+    """Distance kept from robots and other people ahead, m"""
     before: Literal["stop", "turn", "walk_on"] = "stop"
-    """What is done before them: stop and, after 3 s, turn back; turn aside; or walk on until they are touched"""
+    """Reaction to a robot or person ahead: stop and turn back after 3 s; turn aside; or keep walking until contact"""
 
     @model_validator(mode="after")
     def _somewhere(self) -> Self:
@@ -586,16 +586,16 @@ class PersonConfig(Schema):
 
 
 class Hills(Schema):
-    """Random smooth ground, drawn by a seed of its own: hills, or with a short wave the roughness of a meadow."""
+    """Random smooth ground with a separate seed: hills, or the roughness of a meadow with a short wavelength."""
 
     kind: Literal["hills"]
     height: NotNegative = 0.05
-    """Standard deviation, m."""
+    """Standard deviation of the height, m."""
     wavelength: Annotated[float, Field(ge=0.15)] = 2.0
-    """Shortest wave, m."""
+    """Shortest wavelength, m."""
     seed: Annotated[int, Field(ge=0)] = 1
     flat: NotNegative = 0.5
-    """Radius of level ground around the start of every robot of the world, m."""
+    """Radius of level ground around the start of every robot in the world, m."""
 
 
 class Slope(Schema):
@@ -603,14 +603,14 @@ class Slope(Schema):
 
     kind: Literal["slope"]
     x: float = 0.0
-    """Where it begins, m."""
+    """x of the foot of the slope, m."""
     y: float = 0.0
-    """m."""
+    """y of the foot of the slope, m."""
     direction: float = 0.0
-    """Direction in which it rises, rad."""
+    """Uphill direction, rad."""
     angle_deg: Annotated[float, Field(ge=-40, le=40)] = 10.0
     length: Positive = 2.0
-    """Length seen from above, m."""
+    """Horizontal length, m."""
 
 
 class UprightStep(Schema):
@@ -618,88 +618,88 @@ class UprightStep(Schema):
 
     kind: Literal["step"]
     x: float
-    """Position of its middle, m."""
+    """x of the centre, m."""
     y: float
-    """m."""
+    """y of the centre, m."""
     yaw: float = 0.0
-    """rad."""
+    """Yaw, rad."""
     length: Positive = 0.1
-    """m."""
+    """Length, m."""
     width: Positive = 1.0
-    """m."""
+    """Width, m."""
     height: Positive = 0.03
-    """m."""
+    """Height, m."""
 
 
 class Ditch(Schema):
-    """A furrow with sloping sides, straight from one place to another."""
+    """A straight furrow with sloping sides."""
 
     kind: Literal["ditch"]
     x: float
-    """Position of its middle, m."""
+    """x of the centre, m."""
     y: float
-    """m."""
+    """y of the centre, m."""
     yaw: float = 0.0
-    """Along it, rad."""
+    """Direction along the ditch, rad."""
     length: Positive = 2.0
-    """m."""
+    """Length, m."""
     width: Positive = 0.3
     """Width at the top, m."""
     depth: Positive = 0.05
-    """m."""
+    """Depth, m."""
 
 
 class Rubble(Schema):
-    """Flat stones scattered over a rectangle, drawn by a seed of its own."""
+    """Flat stones scattered at random over a rectangle, with a separate seed."""
 
     kind: Literal["rubble"]
     x: float = 0.0
-    """Position of its middle, m."""
+    """x of the rectangle's centre, m."""
     y: float = 0.0
-    """m."""
+    """y of the rectangle's centre, m."""
     length: Positive = 2.0
-    """Along x, m."""
+    """Length along x, m."""
     width: Positive = 2.0
-    """Along y, m."""
+    """Width along y, m."""
     count: Annotated[int, Field(ge=1, le=200)] = 40
     height: Positive = 0.04
-    """Height of the highest one, m."""
+    """Height of the highest stone, m."""
     size: Positive = 0.25
     """Longest side, m."""
     seed: Annotated[int, Field(ge=0)] = 1
 
 
 class HeightImage(Schema):
-    """Heights from a grey picture: black is 0, white is ``height``."""
+    """Heights from a greyscale image: black is 0, white is ``height``."""
 
     file: Path
-    """PNG, 8 or 16 bit"""
+    """PNG file, 8 or 16 bit"""
     resolution: Positive = 0.05
     """Side of a pixel, m."""
     height: float = 1.0
-    """m."""
+    """Height of a white pixel, m."""
     x: float = 0.0
-    """Position of its lower left corner, m."""
+    """x of the lower left corner, m."""
     y: float = 0.0
-    """m."""
+    """y of the lower left corner, m."""
 
 
 GroundFeature = Annotated[Hills | Slope | UprightStep | Ditch | Rubble, Field(discriminator="kind")]
 
 
 SOLID_BODIES: Final = ("truck", "ackermann", "skid_steer", "differential", "omni", "mecanum")
-"""Bodies with rigid parts: the first three on the truck's axles, the others on wheels with springs of their own."""
+"""Bodies with a rigid-body model: the first three on the truck's axles, the others on individually sprung wheels."""
 
 
 class WorldConfig(Schema):
     """One simulated world, and one robot in it."""
 
     map: str = "loop"
-    """Name of a built-in world, or path of a map_server YAML file (its ground: ``NAME.profile.yaml`` next to it)."""
+    """Name of a built-in world, or path of a map_server YAML file (ground: ``NAME.profile.yaml`` next to it)."""
     start: Pose2D | None = None
-    """Pose of the truck's geometric centre in the map frame; None: the built-in world's own, else the origin."""
+    """Pose of the truck's geometric centre in the map frame; None: start of the built-in world, else the origin."""
     engine: Literal["plane", "mujoco"] = "plane"
-    """What moves the robot: kinematics in the plane, or rigid bodies in three dimensions (extra sim3d)."""
+    """Physics engine: kinematics in the plane, or rigid bodies in three dimensions (extra sim3d)."""
     noise: bool = True
     truck: SimTruckConfig = SimTruckConfig()
     mechanics: MechanicsConfig = MechanicsConfig()
@@ -714,17 +714,17 @@ class WorldConfig(Schema):
     rough: Annotated[tuple[RoughPatch, ...], Field(strict=False)] = ()
     """Patches of rough ground"""
     ground: Annotated[tuple[GroundFeature, ...], Field(strict=False)] = ()
-    """What makes the ground uneven, added up; engine mujoco only"""
+    """Features of uneven ground, summed; engine mujoco only"""
     height_image: HeightImage | None = None
-    """A picture of the ground, added to it; engine mujoco only"""
+    """Height image, added to the ground; engine mujoco only"""
     mjcf: Path | None = None
-    """MJCF file whose geometries stand in the world and do not move; engine mujoco only"""
+    """MJCF file with fixed geometries of the world; engine mujoco only"""
     people: Annotated[tuple[PersonConfig, ...], Field(strict=False, max_length=50)] = ()
-    """Who walks through it"""
+    """People who walk through the world"""
     tags: Annotated[tuple[TagConfig, ...], Field(strict=False, max_length=500)] = ()
-    """AprilTags on its walls, seen by the camera; extra vision"""
+    """AprilTags in the world, visible to the camera; extra vision"""
     board: HeldBoard | None = None
-    """Somebody holds it before the robot's camera, where the lidar sees it, too; null = nobody does; extra vision"""
+    """Board held in front of the robot's camera, also visible to the lidar; null: no board; extra vision"""
     roof: RoofTag | None = None
     """A tag on the robot; engine mujoco only"""
 

@@ -1,4 +1,4 @@
-"""People who walk through the world: upright cylinders on their way from way-point to way-point."""
+"""People who walk through the world from way-point to way-point, modelled as upright cylinders."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -12,31 +12,31 @@ from monstertruck_sim.world.noise import PEOPLE, generator
 from monstertruck_sim.world.obstacles import Disc
 
 STEP_S = 0.02
-"""Seconds between two checks of the path ahead."""
+"""Interval between checks of the path ahead (s)."""
 SIDE = 0.25
-"""What is further than this from the way somebody sweeps is passed, m."""
+"""Lateral clearance: a person walks past obstacles further than this from the swept path (m)."""
 _TRIES = 400
 
 Free = Callable[[float, float, float], bool]
-"""Whether a disc at x, y of a radius touches nothing of the map, m."""
+"""Return whether a disc (x, y, radius; m) is clear of the map."""
 Round = tuple[float, float, float]
-"""A circle around another body: x, y, radius, m."""
+"""Circle around another body: x, y, radius (m)."""
 Place = tuple[float, float]
 
 
 class Person:
-    """Somebody who walks; everything random comes from the seed and the number.
+    """A walking person; all random values derive from the seed and the index.
 
     Args:
-        name: in reports of contacts.
-        config: way-points and habits.
-        seed: of the world.
-        index: number among the people.
-        free: the map.
-        bounds: where way-points are drawn: least and greatest x, then y, m.
+        name: name in contact reports.
+        config: way-points and behaviour.
+        seed: seed of the world.
+        index: index among the people.
+        free: free-space test of the map.
+        bounds: area for random way-points: minimum and maximum x, then y (m).
 
     Raises:
-        ValueError: a way-point, or the way between two, is not free; or no free place can be drawn.
+        ValueError: a way-point or the leg between two is not free, or no free place can be drawn.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Person:
         self.name = name
         self.radius = config.radius
         self.speed = 0.0
-        """m/s."""
+        """Speed (m/s)."""
         self._config, self._free, self._bounds = config, free, bounds
         self._rng = generator(seed, PEOPLE, index)
         self._given: list[Place] = [(point.x, point.y) for point in config.waypoints]
@@ -59,7 +59,7 @@ class Person:
         self._require_free()
         self.x, self.y = self._given[0] if self._given else self._drawn_place()
         self._before = (self.x, self.y)
-        """Where the present leg began."""
+        """Start of the current leg."""
         self._pace = config.speed
         self._pausing = float(self._rng.uniform(0.0, 2.0)) * config.pause
         self._waited = 0.0
@@ -69,21 +69,21 @@ class Person:
 
     @property
     def pace(self) -> float:
-        """Speed of the present leg, m/s."""
+        """Speed on the current leg (m/s)."""
         return self._pace
 
     @property
     def disc(self) -> Disc:
-        """Where the person is."""
+        """Footprint of the person."""
         return Disc(self.x, self.y, self.radius)
 
     def step(self, now_ns: int, others: Sequence[Round], touched: Callable[[Disc], bool]) -> None:
-        """Walk on for ``STEP_S``, until ``now_ns``.
+        """Walk for ``STEP_S``, until ``now_ns``.
 
         Args:
             now_ns: elapsed time of the world.
             others: circles around robots and the other people.
-            touched: whether a disc there would overlap another body; it is asked about places that are walked to.
+            touched: returns whether a disc would overlap another body; called for each candidate position.
         """
         if not self._trail:
             self._trail.append((now_ns - 1, self.x, self.y))
@@ -95,7 +95,7 @@ class Person:
         self._trail.append((now_ns, self.x, self.y))
 
     def places(self, times_ns: Array) -> Array:
-        """Centres at elapsed times of the last 0.8 s, (2, n), m."""
+        """Return the centres at elapsed times within the last 0.8 s: (2, n), m."""
         if not self._trail:
             return np.repeat([[self.x], [self.y]], len(times_ns), axis=1)
         at, xs, ys = np.array(self._trail, dtype=float).T
@@ -104,7 +104,7 @@ class Person:
     def _walk(self, others: Sequence[Round], touched: Callable[[Disc], bool]) -> None:
         dx, dy = self._target[0] - self.x, self._target[1] - self.y
         left = hypot(dx, dy)
-        if left < 0.05:  # a way-point nearer than this is reached, m
+        if left < 0.05:  # distance at which a way-point is reached, m
             self._pausing = float(self._rng.uniform(0.0, 2.0)) * self._config.pause
             self._choose()
             return
@@ -117,12 +117,12 @@ class Person:
                 self._waited = 0.0
                 return
         self._waited += STEP_S
-        if self._waited > 3.0:  # seconds of waiting for somebody else after which the next way-point is chosen
+        if self._waited > 3.0:  # longest wait for another body before another way-point is chosen, s
             self._waited = 0.0
             self._turn_back()
 
     def _way_on(self, ahead: float, others: Sequence[Round]) -> float | None:
-        """Direction to walk in; None: stand."""
+        """Return the direction to walk in, or None to stand."""
         if self._config.before == "walk_on" or not self._blocked(ahead, others):
             return ahead
         if self._config.before == "turn":
@@ -144,7 +144,7 @@ class Person:
         return False
 
     def _choose(self) -> None:
-        """The next way-point, and the pace to it."""
+        """Choose the next way-point and the pace of the leg."""
         self._before = (self.x, self.y)
         self._pace = self._config.speed * float(self._rng.uniform(0.8, 1.2))
         if self._given:
@@ -152,7 +152,7 @@ class Person:
             self._target = self._given[self._next]
             return
         for _ in range(_TRIES):
-            # (1.0, 4.0): least and greatest length of a drawn leg, m
+            # (1.0, 4.0): minimum and maximum length of a random leg, m
             length, heading = self._rng.uniform(1.0, 4.0), self._rng.uniform(-pi, pi)
             place = self.x + length * cos(heading), self.y + length * sin(heading)
             if self._clear((self.x, self.y), place):

@@ -21,51 +21,51 @@ from monstertruck_sim.world.truck_plant import TruckPlant
 
 
 class PlanOutline:
-    """The robot's rectangle in the plane, among what is in its surroundings.
+    """Rectangular footprint of the robot in its surroundings.
 
     Args:
         scene: the surroundings.
-        truck: its size.
-        name: of the robot.
+        truck: size of the robot.
+        name: name of the robot.
     """
 
     def __init__(self, scene: Surroundings, truck: SimTruckConfig, name: str) -> None:
         self.scene, self._truck, self.name = scene, truck, name
         self._half_diagonal = hypot(truck.length, truck.width) / 2
         self._free: Pose2 | None = None
-        """Pose with free room around."""
+        """Pose with free space around it."""
         self._known: tuple[Obstacle, ...] = ()
         """Obstacles at the time of ``_free``."""
 
     def box(self, pose: Pose2, room: float = 0.0) -> Box:
-        """It at a pose, grown by ``room`` all around."""
+        """Return the footprint at a pose, grown by ``room`` on all sides."""
         x, y, yaw = pose
         return Box(x, y, self._truck.length + 2 * room, self._truck.width + 2 * room, yaw)
 
     def pace(self, twist: Twist2) -> float:
-        """Speed of its fastest point, m/s."""
+        """Return the speed of the fastest point (m/s)."""
         vx, vy, wz = twist
         return hypot(vx, vy) + abs(wz) * self._half_diagonal
 
     def blocked(self, pose: Pose2, twist: Twist2) -> None:
-        """It cannot move on to a pose: a contact with who is there."""
+        """Report a contact with the bodies that block the move to a pose."""
         self.scene.report(self.box(pose), self.name, self.pace(twist))
 
     def overlap(self, x: float, y: float, yaw: float) -> float:
-        """How deep it reaches into things, robots and people, m; 0 = free."""
+        """Return the penetration into obstacles, robots and people (m); 0 if free."""
         pose = (x, y, yaw)
         return self._fixed(pose) + self.scene.moving_overlap(self.box(pose), self.name)
 
     def cast(
         self, xs: Array, ys: Array, angles: Array, reach: float, times_ns: NDArray[np.int64] | None = None
     ) -> Array:
-        """Ranges to walls, things, people and the other robots."""
+        """Return the ranges to walls, obstacles, people and other robots."""
         return self.scene.cast(xs, ys, angles, reach, times_ns, self.name)
 
     def _fixed(self, pose: Pose2) -> float:
         if self._known is not self.scene.obstacles:
             self._free, self._known = None, self.scene.obstacles
-        # metres around the footprint: known to be free, they spare the contact test until the truck has crossed them
+        # margin around the footprint known to be free, m: no contact test is needed until the truck has crossed it
         room = 0.05
         if self._free is not None and self._way(self._free, pose) < room:
             return 0.0
@@ -73,34 +73,34 @@ class PlanOutline:
         return 0.0 if self._free else self._depth(pose)
 
     def _way(self, a: Pose2, b: Pose2) -> float:
-        """No point of the footprint is further from its place at the other pose than this, m."""
+        """Return an upper bound on the displacement of any footprint point between two poses (m)."""
         return hypot(b[0] - a[0], b[1] - a[1]) + abs(b[2] - a[2]) * self._half_diagonal
 
     def _depth(self, pose: Pose2, room: float = 0.0) -> float:
-        """How deep the footprint, grown by ``room`` all around, reaches into things that do not move, m."""
+        """Return the penetration of the footprint, grown by ``room`` on all sides, into fixed objects (m)."""
         return self.scene.fixed_overlap(self.box(pose, room))
 
 
 class Space(ABC):
-    """What is around one robot.
+    """Surroundings of one robot.
 
     Args:
-        footprint: of the robot, in its surroundings.
+        footprint: footprint of the robot in its surroundings.
     """
 
     def __init__(self, footprint: PlanOutline) -> None:
         self._scene = footprint.scene
         self.contact = footprint.overlap
-        """How deep the footprint at a pose reaches into things, m; 0 = free."""
+        """Penetration of the footprint at a pose into its surroundings (m); 0 if free."""
         self.cast: Caster = footprint.cast
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """Things in it that are not on its map."""
+        """Obstacles that are not on the map."""
         return self._scene.obstacles
 
     def add(self, obstacle: Obstacle) -> None:
-        """Put something into it: seen by the lidar, stops robots.
+        """Add an obstacle that the lidar sees and that stops robots.
 
         Raises:
             InputError: there is no room for more.
@@ -108,10 +108,10 @@ class Space(ABC):
         self._scene.set_obstacles((*self.obstacles, obstacle))
 
     def remove(self, obstacle: Obstacle) -> None:
-        """Take it away again.
+        """Remove an obstacle.
 
         Raises:
-            InputError: it is not there.
+            InputError: the obstacle is not in the world.
         """
         if obstacle not in self.obstacles:
             raise InputError(f"obstacle {obstacle}: not in the world")
@@ -120,7 +120,7 @@ class Space(ABC):
 
     @abstractmethod
     def set_tilt(self, tilt: TiltConfig) -> None:
-        """From now on tilt the robot in another way.
+        """Set the tilt of the robot from now on.
 
         Raises:
             InputError: the engine computes the tilt itself.
@@ -128,21 +128,21 @@ class Space(ABC):
 
 
 class Engine(NamedTuple):
-    """What moves one robot, and what is around it."""
+    """Physics and surroundings of one robot."""
 
     plant: Plant
     space: Space
     sweep: Sweep
     solids: Solids | None = None
-    """What sonars hear beside the walls."""
+    """Objects that sonars detect in addition to the walls."""
 
 
 class PlaneSpace(Space):
-    """``Space`` of the plane.
+    """``Space`` of the plane engine.
 
     Args:
-        footprint: of the robot, in its surroundings.
-        config: of the world.
+        footprint: footprint of the robot in its surroundings.
+        config: settings of the world.
     """
 
     def __init__(self, footprint: PlanOutline, config: WorldConfig) -> None:
@@ -151,15 +151,15 @@ class PlaneSpace(Space):
         profile = self._scene.place.profile
         uneven = profile is not None or bool(config.rough)
         self.terrain = Terrain(profile or LEVEL, config.rough) if uneven else None
-        """The ground; None: level."""
+        """The ground, or None if level."""
         self._tilt: TiltConfig = config.tilt
 
     def set_tilt(self, tilt: TiltConfig) -> None:
-        """From now on tilt the robot in another way."""
+        """Set the tilt of the robot from now on."""
         self._tilt = tilt
 
     def attitude(self, elapsed_ns: int, x: float, y: float, yaw: float) -> tuple[float, float]:
-        """Pitch and roll of the robot at a pose, rad."""
+        """Return pitch and roll of the robot at a pose (rad)."""
         if isinstance(self._tilt, SinusoidTilt):
             return rocking(self._tilt, elapsed_ns)
         if isinstance(self._tilt, SteadyTilt):
@@ -170,7 +170,7 @@ class PlaneSpace(Space):
 
 
 def plane(config: WorldConfig, footprint: PlanOutline, start: Pose2, seed: int | None) -> Engine:
-    """One robot of the plane."""
+    """Create the plane engine for one robot."""
     space = PlaneSpace(footprint, config)
     plant = TruckPlant(config.truck, config.battery, start, space.contact, space.attitude, seed)
     return Engine(plant, space, PlaneSweep(space.cast, space.terrain, config.lidar))

@@ -1,4 +1,4 @@
-"""What a robot's physics offers to its sensors and actuators, whichever engine computes it, and what engines share."""
+"""Engine-independent interface between a robot's physics and its sensors and actuators, and code the engines share."""
 
 from abc import ABC, abstractmethod
 from collections import deque
@@ -22,7 +22,7 @@ Xyz = tuple[float, float, float]
 
 
 class TruthState(NamedTuple):
-    """What is really the case; SI units and radians, map frame, geometric centre."""
+    """Ground truth at the geometric centre, in the map frame; SI units and radians."""
 
     time_ns: int
     x: float
@@ -30,50 +30,50 @@ class TruthState(NamedTuple):
     yaw: float
     """Yaw in (-pi, pi]."""
     v: float
-    """Along the direction of travel, negative backwards."""
+    """Speed along the direction of travel, negative backwards."""
     wz: float
     front: float
-    """Angle of the equivalent bicycle's front axle, left positive; 0 for a motion that no bicycle makes."""
+    """Front axle angle of the equivalent bicycle, left positive; 0 for motion impossible for a bicycle."""
     rear: float
     pitch: float
-    """Nose down positive (REP 103)."""
+    """Pitch, nose down positive (REP 103)."""
     roll: float
-    """Right side down positive."""
+    """Roll, right side down positive."""
     stuck: bool
-    """Ran into something and has not got 5 mm away since."""
+    """The robot ran into something and has not moved 5 mm away since."""
     clutch_slipping: bool
     charge: float
-    """Charge of the battery, 0..1."""
+    """State of charge of the battery, 0..1."""
     supply_v: float
     motor_current: float
-    """A, forwards positive."""
+    """Total motor current, forwards positive (A)."""
 
 
 class Caster(Protocol):
-    """Sight in the plane."""
+    """Ray caster in the plane."""
 
     def __call__(
         self, xs: Array, ys: Array, angles: Array, reach: float, times_ns: NDArray[np.int64] | None = None, /
     ) -> Array:
-        """Ranges along rays from (xs, ys) at angles up to a reach, in the map frame; inf = nothing.
+        """Return ranges along rays from (xs, ys) at ``angles`` in the map frame, up to ``reach``; inf without a hit.
 
-        What moves is met where it was at ``times_ns``, one a ray and rising; None = now.
+        Moving objects are hit where they were at ``times_ns``: one rising time per ray, or None for now.
         """
 
 
 class Plant(ABC):
-    """One robot, as its sensors and actuators see it, integrated lazily on a fixed grid of time.
+    """Physics of one robot as seen by its sensors and actuators, integrated lazily on a fixed time grid.
 
     Args:
         config: true parameters.
-        battery: the pack.
+        battery: battery model parameters.
         start: pose of the geometric centre.
-        attitude: pitch and roll there.
+        attitude: pitch and roll at the start.
     """
 
     STEP_NS: ClassVar[int]
     WHOLE_STEPS: ClassVar[bool]
-    """Whether nothing is integrated between two points of the grid; else a step ends early at the requested instant."""
+    """Whether to integrate whole grid steps only; otherwise a step ends early at the requested instant."""
 
     def __init__(
         self, config: SimTruckConfig, battery: BatteryModelConfig, start: Pose2, attitude: tuple[float, float]
@@ -83,13 +83,13 @@ class Plant(ABC):
         self._chassis = config.chassis()
         count = len(self._chassis.shafts)
         self.shafts = tuple(Shaft(config.motor) for _ in range(count))
-        """Driven ones."""
+        """Driven shafts."""
         self.currents = [0.0] * count
-        """Currents of their motors, A."""
+        """Motor current of each shaft (A)."""
         self.pulses: PulseSource | None = None
-        """Pulses of the controller that moves the steering servos."""
+        """Pulse output of the steering servo controller."""
         self.servo_supply = True
-        """The steering servos have their 5 V."""
+        """Whether the steering servos have their 5 V supply."""
         self._servos = tuple(map(Servo, config.servos))
         self._start_ns: int | None = None
         self._elapsed = 0
@@ -97,21 +97,21 @@ class Plant(ABC):
         self._twist: Twist2 = (0.0, 0.0, 0.0)
         self._attitude = attitude
         self._height = 0.0
-        """Height of the base, m."""
+        """Height of the base (m)."""
         self._stuck_at: Pose2 | None = None
         self._slipping = [False] * count
-        # 600_000_000: what the past of a robot's poses is kept for
+        # 600_000_000: length of the pose history, ns
         self._trail: deque[tuple[float, ...]] = deque(maxlen=600_000_000 // self.STEP_NS)
         self.joints: JointSource | None = None
-        """Joints of the lidar's mount; None: it is fixed."""
+        """Joints of the lidar mount, or None for a fixed mount."""
         self.together: Callable[[int], None] = lambda _: None
-        """Brings what else moves in the world to an instant (ns), before this robot is integrated to it."""
+        """Advances the rest of the world to an instant (ns) before this robot is integrated to it."""
         self.on_blocked: Callable[[Pose2, Twist2], None] = lambda _pose, _twist: None
-        """Gets a pose that something keeps the robot from, and the twist with which it went there."""
+        """Called with the blocked pose and the robot's twist when something stops the robot."""
 
     @property
     def pose(self) -> Pose2:
-        """Of the geometric centre in the map frame, at the newest instant; the heading counts turns."""
+        """Latest pose of the geometric centre in the map frame; the yaw is unwrapped."""
         return self._pose
 
     @property
@@ -127,25 +127,25 @@ class Plant(ABC):
     @property
     @abstractmethod
     def acceleration(self) -> Xyz:
-        """Of the body, forward, left and up in its level frame, as a sensor on it feels it, m/s^2; without gravity."""
+        """Acceleration of the body without gravity, as sensed on it: forward, left, up in its level frame (m/s^2)."""
 
     @property
     @abstractmethod
     def rates(self) -> Xyz:
-        """Angular velocity about forward, left and up of the level frame, rad/s."""
+        """Angular velocity about the forward, left and up axes of the level frame (rad/s)."""
 
     @property
     def current(self) -> float:
-        """Of all motors together, A."""
+        """Total current of all motors (A)."""
         return sum(self.currents)
 
     def advance(self, time_ns: int) -> None:
-        """Integrate up to an instant; the first call sets the start, earlier instants change nothing."""
+        """Integrate up to an instant; the first call sets the start, and earlier instants have no effect."""
         self.together(time_ns)
         self.integrate(time_ns)
 
     def integrate(self, time_ns: int) -> None:
-        """``advance`` of this robot alone."""
+        """Advance this robot alone."""
         if self._start_ns is None:
             self._start_ns = time_ns
             self._remember()
@@ -160,19 +160,19 @@ class Plant(ABC):
                 self._remember()
 
     def mount_torque(self, _joint: int, /) -> float:
-        """With which the lidar pushes its pitch (0) or roll (1) joint at the newest instant, Nm; 0 in the plane."""
+        """Return the latest load torque of the lidar on its pitch (0) or roll (1) joint (Nm); 0 in the plane."""
         return 0.0
 
     @abstractmethod
     def carry(self, pose: Pose2) -> None:
-        """Put the robot down elsewhere, at rest; sensors see no way between the two places."""
+        """Move the robot to another pose, at rest; sensors see a jump, not a path between the two places."""
 
     def slot(self, time_ns: int, period_ns: int) -> int:
-        """Number of the period since the start that an instant falls into: the index of its noise."""
+        """Return the index of the period since the start that contains an instant; it indexes the noise."""
         return max(0, time_ns - (self._start_ns or 0)) // period_ns
 
     def truth(self) -> TruthState:
-        """State at the newest instant."""
+        """Return the latest ground truth."""
         x, y, yaw = self._pose
         vx, vy, wz = self._twist
         front, rear = self._chassis.axle_angles(self._twist, self._steering_angles())
@@ -195,10 +195,10 @@ class Plant(ABC):
         )
 
     def poses(self, times_ns: NDArray[np.int64]) -> Array:
-        """Poses at instants of the last half second, (6, n): x, y, yaw, pitch, roll, and the base's height.
+        """Return poses at instants within the last half second, (6, n): x, y, yaw, pitch, roll, height of the base.
 
-        The height is 0 in the plane, whatever its ground. Instants not yet integrated are extrapolated at the present
-        velocity; none of them binds the future.
+        In the plane the height is 0 on any ground. Poses at instants not yet integrated are extrapolated at the current
+        velocity and do not affect the integration.
         """
         assert self._start_ns is not None
         seconds = (times_ns - self._start_ns) * 1e-9
@@ -220,7 +220,7 @@ class Plant(ABC):
         self._trail.append((self._elapsed * 1e-9, *self._pose, *self._attitude, self._height))
 
     def _turn_servos(self, dt: float) -> list[float]:
-        """Angles of the servos after dt, rad."""
+        """Advance the servos by ``dt`` and return their angles (rad)."""
         if self.pulses is not None and self._elapsed % 20_000_000 == 0:  # a servo frame, ns
             now = (self._start_ns or 0) + self._elapsed
             for servo, config in zip(self._servos, self.config.servos, strict=True):
@@ -234,7 +234,7 @@ class Plant(ABC):
             shaft.step(dt)
 
     def _draw(self, dt: float, pulls: Sequence[float]) -> None:
-        """The motors' currents at the pulls of their shafts (N at the ground), and the battery's charge."""
+        """Update the motor currents from the pull of each shaft (N at the ground), and the battery charge."""
         motor, watts = self.config.motor, 0.0
         for i, (shaft, pull) in enumerate(zip(self.shafts, pulls, strict=True)):
             current = self.currents[i] = motor_current(self.config, shaft, pull)
@@ -249,7 +249,7 @@ class Plant(ABC):
 
 
 def motor_current(config: SimTruckConfig, shaft: Shaft, pull: float) -> float:
-    """Of a motor whose wheels pull with ``pull``, N at the ground; A, forwards positive."""
+    """Return the current of a motor whose wheels pull with ``pull`` (N at the ground); A, forwards positive."""
     motor = config.motor
     if not shaft.powered:
         return 0.0

@@ -1,7 +1,7 @@
-"""What the robots of one world share: map, ground, things put into it, people, each other's outlines, and time.
+"""Surroundings shared by the robots of one world: map, ground, obstacles, people, the robots' outlines, and time.
 
-All bodies move on one grid of 5 ms: before a robot is integrated to an instant, everything is brought to the
-grid's last point before it. So at any instant the others are where they were at most 5 ms ago: 1 mm at 0.2 m/s.
+All bodies move on one time grid of 5 ms: before a robot is integrated to an instant, everything is advanced to the
+last grid point before it. The poses of the others are therefore at most 5 ms old: 1 mm at 0.2 m/s.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ from monstertruck_sim.world.raycast import cast_rays, clearance, grid_penetratio
 from monstertruck_sim.world.truck_plant import STEP_NS
 
 MOVING = 0.01
-"""A body slower than this stands, m/s."""
+"""Speed below which a body counts as standing (m/s)."""
 _WALK_NS = round(STEP_S * 1e9)
 
 
@@ -35,10 +35,10 @@ class Contact:
 
     time_ns: int
     mover: str
-    """Who moved into the other; a robot's name, or ``person N``."""
+    """The body that moved into the other: name of a robot, or ``person N``."""
     other: str
     speed: float
-    """Speed of the mover, m/s."""
+    """Speed of the mover (m/s)."""
     other_speed: float
 
     def __str__(self) -> str:
@@ -46,17 +46,17 @@ class Contact:
 
 
 class Neighbour(Protocol):
-    """A robot, as the others see it."""
+    """Interface of a robot to the other bodies."""
 
     name: str
 
     @property
     def plant(self) -> Plant:
-        """What moves it."""
+        """Physics of the robot."""
 
     @property
     def outline(self) -> Box:
-        """Footprint at its newest instant."""
+        """Latest footprint."""
 
     @property
     def pace(self) -> float:
@@ -74,18 +74,18 @@ class Surroundings:
 
     Args:
         place: map and ground.
-        people: who walks through it.
-        seed: of the people.
-        starts: where its robots begin; hills are level there, for all of them.
+        people: people who walk through the world.
+        seed: seed of the people.
+        starts: start poses of all robots; hills are level there.
 
     Raises:
-        InputError: a person's way is not free.
+        InputError: a person's path is not free.
     """
 
     def __init__(self, place: BuiltIn, people: Sequence[PersonConfig], seed: int, starts: Sequence[Pose2]) -> None:
         self.place, self.map, self.starts = place, place.map, tuple(starts)
         self.solid = place.map.cells != FREE
-        """Cells in which nobody may begin."""
+        """Cells in which robots and people may not start."""
         self._occupied = place.map.cells == OCCUPIED
         self._clear = clearance(self._occupied)
         self._obstacles: tuple[Obstacle, ...] = ()
@@ -102,7 +102,7 @@ class Surroundings:
         self._start_ns: int | None = None
         self._elapsed = 0
         self.contacts: list[Contact] = []
-        """All so far."""
+        """All contacts so far."""
         self.on_contact: Callable[[Contact], None] = lambda _: None
         self._touching: set[tuple[str, str]] = set()
         self.cast(np.zeros(1), np.zeros(1), np.zeros(1), 0.0)  # compiles outside of any deadline
@@ -118,10 +118,10 @@ class Surroundings:
         self._fixed = discs_and_segments(obstacles)
 
     def add_body(self, body: Neighbour) -> None:
-        """Let a robot in.
+        """Add a robot.
 
         Raises:
-            InputError: another one of its name is there, or it overlaps somebody.
+            InputError: its name is taken, or it overlaps a robot or a person.
         """
         outline = body.outline
         for other in self.bodies:
@@ -135,7 +135,7 @@ class Surroundings:
         self.bodies.append(body)
 
     def robots_beside(self, own: Plant) -> list[Plant]:
-        """What moves the other robots."""
+        """Return the physics of the other robots."""
         return [body.plant for body in self.bodies if body.plant is not own]
 
     def advance(self, time_ns: int) -> None:
@@ -180,7 +180,7 @@ class Surroundings:
             self._contact(name, other, speed, pace)
 
     def _met(self, box: Box, name: str) -> list[tuple[str, float, float]]:
-        """Name, speed and depth of everybody whom a footprint overlaps."""
+        """Return name, speed and penetration of every body that a footprint overlaps."""
         found = []
         size = hypot(box.length, box.width) / 2
         for body in self.bodies:
@@ -246,7 +246,7 @@ class Surroundings:
     # Sight
 
     def people_at(self, time_ns: int) -> list[tuple[float, float, float]]:
-        """Where everybody is at an instant of the last half second, and how wide: x, y, radius, m."""
+        """Return x, y and radius (m) of every person at an instant within the last half second."""
         elapsed = np.array([float(time_ns - (self._start_ns or 0))])
         found = [(person.places(elapsed)[:, 0].tolist(), person.radius) for person in self.people]
         return [(x, y, radius) for (x, y), radius in found]
@@ -260,7 +260,7 @@ class Surroundings:
         times_ns: NDArray[np.int64] | None = None,
         without: str = "",
     ) -> Array:
-        """Range of the first thing each ray meets, m; inf = nothing within ``reach``.
+        """Return the range of each ray's first hit (m); inf without a hit within ``reach``.
 
         Args:
             xs: (n,) origins in the map frame, m.

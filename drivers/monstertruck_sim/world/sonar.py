@@ -1,9 +1,9 @@
-"""What sonars hear: pure functions of the walls around them, for emulators and for studies without a daemon.
+"""Sonar model: pure functions of the surrounding walls, for emulators and for studies without a daemon.
 
-``beam`` is the range along the axis. ``cone`` samples the cone by rays and takes the nearest point from which sound
-comes back: a wall does so where its normal is within the critical angle of the direction to the sonar, an edge or a
-corner from everywhere. Sound that another sonar sent arrives in the same way, over a longer or shorter path, and as
-much later as it was sent: a sonar cannot tell whose sound it is (after Kuc and Siegel, "Physically Based Simulation
+``beam`` is the range along the axis. ``cone`` samples the cone by rays and takes the nearest point that returns sound:
+a wall returns it where its normal is within the critical angle of the direction to the sonar, an edge or a corner
+from everywhere. Sound from another sonar arrives in the same manner, over a longer or shorter path, shifted by the
+difference in send time: a sonar cannot tell the source of a sound (after Kuc and Siegel, "Physically Based Simulation
 Model for Acoustic Sensor Robot Navigation", 1987; Borenstein and Koren, "Error Eliminating Rapid Ultrasonic Firing",
 1995).
 """
@@ -24,7 +24,7 @@ from monstertruck_sim.world.plant import Caster, Plant
 from monstertruck_sim.world.sensors import turned
 
 SPEED_OF_SOUND: Final = 343.0
-"""m/s, in air of 20 degrees Celsius."""
+"""Speed of sound in air at 20 degrees Celsius (m/s)."""
 
 
 Solids = Callable[[float, float, float, float], Caster | None]
@@ -32,7 +32,7 @@ Solids = Callable[[float, float, float, float], Caster | None]
 
 
 class Ping(NamedTuple):
-    """A sonar that sends: place (m) and direction (rad) in the map frame, time (s)."""
+    """Ping of a sonar: place (m) and direction (rad) in the map frame, time (s)."""
 
     x: float
     y: float
@@ -41,14 +41,14 @@ class Ping(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """What the rays of one ping's cone meet; shapes (n,)."""
+    """Points hit by the rays of one ping's cone; shapes (n,)."""
 
     ping: Ping
     x: Array
-    """Coordinate of the points in the map frame, m."""
+    """x of the points in the map frame (m)."""
     y: Array
     ranges: Array
-    """Distances from the sonar, m; inf = nothing within ``audible``."""
+    """Distances from the sonar (m); inf without a hit within ``audible``."""
     normals: Array
     """Direction of the wall's normal, rad (either of both)."""
     scatters: NDArray[np.bool_]
@@ -62,12 +62,12 @@ def placed(sonar: SonarPlace, x: float, y: float, yaw: float, time: float = 0.0)
 
 
 def beam(cast: Caster, ping: Ping, model: SonarModelConfig) -> float:
-    """Range along the axis, m; inf = nothing within ``range_max``."""
+    """Return the range along the axis (m); inf without a hit within ``range_max``."""
     return float(cast(np.array([ping.x]), np.array([ping.y]), np.array([ping.yaw]), model.range_max)[0])
 
 
 def surface(cast: Caster, ping: Ping, model: SonarModelConfig) -> Surface:
-    """What is in the cone of one sonar, and how it reflects."""
+    """Return the reflecting points in the cone of one sonar."""
     count = 2 * ceil(model.field_of_view / 2 / 0.015) + 1  # angle between the rays of a cone, rad
     angles = ping.yaw + np.linspace(-model.field_of_view / 2, model.field_of_view / 2, count)
     ranges = cast(np.full(count, ping.x), np.full(count, ping.y), angles, model.audible)
@@ -104,7 +104,7 @@ def leaning(cast: Caster, yaw: float, pitch: float, roll: float, over: float) ->
 
 
 def nearer(one: Caster, other: Caster | None) -> Caster:
-    """What is met first of two."""
+    """Combine two casters: each ray returns the nearer hit."""
     if other is None:
         return one
 
@@ -116,7 +116,7 @@ def nearer(one: Caster, other: Caster | None) -> Caster:
 
 
 def cone(surfaces: Sequence[Surface], listener: Ping, model: SonarModelConfig) -> float:
-    """Nearest echo that ``listener`` takes for its own, m; inf = none within ``range_max``.
+    """Return the nearest echo that ``listener`` takes for its own (m); inf if none is within ``range_max``.
 
     Args:
         surfaces: of every sonar that sent anything since the last sound died away, that of ``listener`` among them.
@@ -127,7 +127,7 @@ def cone(surfaces: Sequence[Surface], listener: Ping, model: SonarModelConfig) -
 
 
 def heard(distance: float, model: SonarModelConfig, noise: np.random.Generator | None) -> float:
-    """A range as the sonar measures it, m: with noise, drop-outs and limits; inf = no echo.
+    """Return the measured range (m) with noise, dropouts and limits; inf without an echo.
 
     Args:
         distance: true one, m; inf = no echo.
@@ -174,7 +174,7 @@ def _normals(x: Array, y: Array, ranges: Array) -> tuple[Array, NDArray[np.bool_
 
 
 def _arrival(found: Surface, listener: Ping, model: SonarModelConfig) -> float:
-    """Range that ``listener`` reports for the sound of one ping; inf = it hears none."""
+    """Return the range that ``listener`` reports for the sound of one ping; inf if it hears none."""
     sent = found.ping
     own = sent == listener
     if not own and not model.cross_talk:
@@ -203,12 +203,12 @@ class SimulatedSonars:
     """``SonarSource``: every ping leaves from where the body is then, and is heard by all others until it dies away.
 
     Args:
-        plant: what carries them; they lean with it.
+        plant: the robot that carries the sonars; they lean with it.
         cast: ranges to the walls.
         config: true parameters.
-        seed: of the noise; None = none.
-        wall_height: over the ground, m.
-        solids: what they hear beside the walls; None = nothing.
+        seed: seed of the noise, or None for no noise.
+        wall_height: height of the walls above the ground, m.
+        solids: objects that sonars detect in addition to the walls, or None.
     """
 
     def __init__(
@@ -227,7 +227,7 @@ class SimulatedSonars:
         self._heard = 0
 
     def fire(self, name: str, time_ns: int) -> None:
-        """A sonar sends.
+        """Send a ping.
 
         Raises:
             InputError: the robot has no sonar of that name.
@@ -244,7 +244,7 @@ class SimulatedSonars:
         self._pings.append((name, ping, cast, found))
 
     def range(self, name: str) -> float:
-        """Distance that the newest ping of a sonar came to, m, once its sound is back; inf = no echo."""
+        """Return the distance of the latest ping of a sonar (m) once the echo is back; inf without an echo."""
         newest = next(((ping, cast) for fired, ping, cast, _ in reversed(self._pings) if fired == name), None)
         if newest is None:
             return inf

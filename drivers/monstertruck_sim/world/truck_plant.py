@@ -22,7 +22,7 @@ from monstertruck_sim.world.plant import PLANT_GRAVITY, Plant, Xyz
 STEP_NS = 5_000_000
 
 Contact = Callable[[float, float, float], float]
-"""How deep the footprint at (x, y, yaw) reaches into things, m; 0 = free."""
+"""Penetration of the footprint at (x, y, yaw) into its surroundings (m); 0 if free."""
 Tilt = Callable[[int, float, float, float], tuple[float, float]]
 """Pitch (nose down positive) and roll (right side down positive), rad, at (elapsed ns, x, y, yaw)."""
 
@@ -34,11 +34,11 @@ class TruckPlant(Plant):
 
     Args:
         config: true parameters.
-        battery: the pack.
+        battery: battery model parameters.
         start: pose of the geometric centre.
         contact: collision test.
         tilt: ground under the truck.
-        seed: of the slip noise; None = none.
+        seed: seed of the slip noise, or None for no noise.
     """
 
     STEP_NS: ClassVar[int] = STEP_NS
@@ -56,7 +56,7 @@ class TruckPlant(Plant):
         super().__init__(config, battery, start, tilt(0, *start))
         count = len(self.shafts)
         self._mass = config.mass / count
-        """Share of every driven shaft, kg."""
+        """Share of the mass per driven shaft (kg)."""
         self._weight = self._mass * PLANT_GRAVITY
         self._rolling = config.rolling_resistance * self._weight
         self._quiet = [0.0] * (2 + count)
@@ -72,16 +72,16 @@ class TruckPlant(Plant):
 
     @property
     def acceleration(self) -> Xyz:
-        """Of the body, forward, left and up in its level frame, as a sensor on it feels it, m/s^2; without gravity."""
+        """Acceleration of the body without gravity, as sensed on it: forward, left, up in its level frame (m/s^2)."""
         return *self._felt, 0.0
 
     @property
     def rates(self) -> Xyz:
-        """Angular velocity about forward, left and up of the level frame, rad/s; that the tilt turns is left out."""
+        """Angular velocity about the level frame's forward, left and up axes (rad/s), ignoring changes of the tilt."""
         return 0.0, 0.0, self._twist[2]
 
     def carry(self, pose: Pose2) -> None:
-        """Put the robot down elsewhere, at rest; sensors see no way between the two places."""
+        """Move the robot to another pose, at rest; sensors see a jump, not a path between the two places."""
         self._pose, self._twist, self._stuck_at = pose, (0.0, 0.0, 0.0), None
         self._wheel_speeds = [0.0] * len(self.shafts)
         self._attitude = self._tilt(self._elapsed, *pose)
@@ -161,13 +161,13 @@ class TruckPlant(Plant):
             self._twist = (0.0, 0.0, 0.0)
         else:
             self._pose, self._twist = pose, twist
-            # 0.005: way from where it was stuck on which it is free, m
+            # 0.005: distance from the place of contact at which the robot is free again, m
             if self._stuck_at and hypot(pose[0] - self._stuck_at[0], pose[1] - self._stuck_at[1]) > 0.005:
                 self._stuck_at = None
         self._attitude = self._tilt(self._elapsed, *self._pose)
 
     def _hold_wheels(self) -> None:
-        """The body stands against something: the motors go on and wind up until their clutches give."""
+        """Stop the wheels of a blocked body: its motors keep turning and wind up until their clutches slip."""
         for i, speed in enumerate(self._wheel_speeds):
             if speed:
                 self._pulls[i], self._slipping[i] = copysign(self.config.motor.clutch_force, speed), True
@@ -205,7 +205,7 @@ def _tyres(config: SimTruckConfig, chassis: Chassis) -> SingleTrack | None:
 
 
 class SkidEffects:
-    """What a skid-steer robot does besides what its model says: unequal wheels, a turn at each reversal, a slow slide.
+    """Skid-steer effects beyond the kinematic model: unequal wheels, a turn at each reversal, a slow slide.
 
     The skid-steer paper saw all three: its robot bent within a pass though its motors were commanded alike, turned a
     little whenever it reversed, and its circles wandered. Body parameters (turning centres, effective radii) are the
@@ -223,10 +223,10 @@ class SkidEffects:
         self._reversals = 0
         self._rate = 0.0
         self._left = 0.0
-        """Seconds for which it still turns."""
+        """Remaining time of the turn (s)."""
 
     def wheel_speeds(self, speeds: list[float]) -> list[float]:
-        """What of each wheel's speed reaches the ground, m/s."""
+        """Return the effective speed of each wheel over the ground (m/s)."""
         gains = self._config.wheel_gains
         return [speed * gain for speed, gain in zip(speeds, gains, strict=True)] if gains else speeds
 

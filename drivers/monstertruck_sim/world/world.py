@@ -1,4 +1,4 @@
-"""One robot in a simulated world, and the physics of its devices."""
+"""One simulated robot in its world, with its device models."""
 
 import logging
 from collections.abc import Sequence
@@ -46,15 +46,15 @@ log = logging.getLogger(__name__)
 class World:
     """One robot in its surroundings, with its sensors; it advances when a later instant is requested.
 
-    Everything is a function of configuration, seed, commands and their instants. The start of time is the first
-    instant anybody names.
+    The state is a function of configuration, seed, commands and command times. Time starts at the first instant
+    requested.
 
     Args:
         config: see ``WorldConfig``.
-        seed: of all noise.
-        scene: surroundings that it shares with other robots; None = its own, of ``config``.
-        name: of the robot.
-        lidar: whether it carries one: a robot of rigid bodies feels the weight.
+        seed: seed of all noise.
+        scene: surroundings shared with other robots, or None to build them from ``config``.
+        name: name of the robot.
+        lidar: whether the robot carries a lidar; its weight matters in the rigid-body engine.
 
     Raises:
         InputError: unknown map name, a bad map or profile file, or a start pose in a wall, a robot or a person.
@@ -102,66 +102,66 @@ class World:
         self.wheels: WheelSource = SimulatedRearWheels(self._plant, config.truck)
 
     def battery_volts(self, time_ns: int) -> float:
-        """Voltage behind the battery's divider."""
+        """Return the voltage behind the battery's divider."""
         return self.servos.analog_volts(self._battery_input, time_ns)
 
     @property
     def plant(self) -> Plant:
-        """What moves the robot."""
+        """Physics of the robot."""
         return self._plant
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:
-        """Obstacles in the world that are not on its map."""
+        """Obstacles in the world that are not on the map."""
         return self._space.obstacles
 
-    # As the others in the scene see it
+    # Interface to the other bodies in the scene
 
     @property
     def outline(self) -> Box:
-        """PlanOutline at its newest instant."""
+        """Latest footprint."""
         return self._footprint.box(self._plant.pose)
 
     @property
     def pace(self) -> float:
-        """Speed of its fastest point, m/s, at its newest instant."""
+        """Latest speed of the fastest point of the footprint (m/s)."""
         return self._footprint.pace(self._plant.twist)
 
     def integrate(self, time_ns: int) -> None:
-        """Move this robot alone on to an instant."""
+        """Integrate this robot alone up to an instant."""
         self._plant.integrate(time_ns)
 
     def outlines(self, times_ns: NDArray[np.int64]) -> list[Box]:
-        """Footprints at instants of the last half second."""
+        """Return the footprints at instants within the last half second."""
         return [self._footprint.box((x, y, yaw)) for x, y, yaw in self._plant.poses(times_ns)[:3].T.tolist()]
 
     def truth(self, time_ns: int) -> TruthState:
-        """What is really the case at ``time_ns`` (or at the newest instant requested, if that is later)."""
+        """Return the ground truth at ``time_ns``, or at the latest instant requested if that is later."""
         self._plant.advance(time_ns)
         return self._plant.truth()
 
     def horns(self) -> tuple[Horn, Horn]:
-        """Of the mount's pitch and roll servo."""
+        """Return the horns of the mount's pitch and roll servos."""
         return self._horns
 
     def carry_lidar(self, joints: JointSource) -> None:
-        """Put the lidar onto a mount with joints."""
+        """Put the lidar on a jointed mount."""
         self._lidar.joints = self._plant.joints = joints
 
     def mount_torque(self, joint: int) -> float:
-        """With which the lidar pushes its pitch (0) or roll (1) joint, Nm, at the newest instant."""
+        """Return the latest load torque of the lidar on its pitch (0) or roll (1) joint (Nm)."""
         return self._plant.mount_torque(joint)
 
     def is_free(self, pose: Pose2) -> bool:
-        """Whether the robot at ``pose``, x, y (m) and yaw (rad) in the map frame, would touch nothing."""
+        """Return whether ``pose`` is collision-free: x, y (m) and yaw (rad) in the map frame."""
         solid = self.scene.overlap(self.scene.solid, self._footprint.box(pose))
         return bool(solid + self._space.contact(*pose) <= 0)
 
     def carry(self, time_ns: int, pose: Pose2) -> None:
-        """Put the truck down at another ``pose``: x, y (m) and yaw (rad) in the map frame.
+        """Move the truck to another ``pose``: x, y (m) and yaw (rad) in the map frame.
 
         Raises:
-            InputError: it would touch what is not free there.
+            InputError: the pose is not collision-free.
         """
         if not self.is_free(pose):
             raise InputError(f"carry: the robot at {pose} touches what is not free")
@@ -169,59 +169,59 @@ class World:
         self._plant.carry(pose)
 
     def add(self, time_ns: int, obstacle: Obstacle) -> None:
-        """Put something into the world: seen by the lidar, stops the truck."""
+        """Add an obstacle that the lidar sees and that stops the truck."""
         self._plant.advance(time_ns)
         self._space.add(obstacle)
 
     def remove(self, time_ns: int, obstacle: Obstacle) -> None:
-        """Take it away again.
+        """Remove an obstacle.
 
         Raises:
-            InputError: it is not there.
+            InputError: the obstacle is not in the world.
         """
         self._plant.advance(time_ns)
         self._space.remove(obstacle)
 
     def set_charge(self, time_ns: int, charge: float) -> None:
-        """Exchange the battery for one charged to 0..1."""
+        """Replace the battery with one at state of charge ``charge`` (0..1)."""
         self._plant.advance(time_ns)
         self._plant.battery.set_charge(charge)
 
     def connect_battery(self, time_ns: int, *, connected: bool) -> None:
-        """Plug the battery in or pull its plug; what then has no supply is not the world's business."""
+        """Connect or disconnect the battery; the caller handles the devices that lose their supply."""
         self._plant.advance(time_ns)
         self._plant.battery.connected = connected
 
     def supply_servos(self, time_ns: int, *, on: bool) -> None:
-        """Switch the steering servos' own 5 V: without it they stay where they are."""
+        """Switch the 5 V supply of the steering servos; without it they hold their position."""
         self._plant.advance(time_ns)
         self._plant.servo_supply = on
 
     def powered(self, time_ns: int) -> tuple[bool, ...]:
-        """Which driven shafts have a motor whose power stage is on."""
+        """Return for each driven shaft whether its motor's power stage is on."""
         self._plant.advance(time_ns)
         return tuple(shaft.powered for shaft in self._plant.shafts)
 
     def block_shaft(self, time_ns: int, shaft: int = 0, *, on: bool) -> None:
-        """Hold a driven shaft, or let it go."""
+        """Block or release a driven shaft."""
         self._plant.advance(time_ns)
         self._plant.shafts[shaft].blocked = on
 
     def shaft_blocked(self, shaft: int = 0) -> bool:
-        """Whether a driven shaft is held."""
+        """Return whether a driven shaft is blocked."""
         return self._plant.shafts[shaft].blocked
 
     def set_tilt(self, time_ns: int, tilt: TiltConfig) -> None:
-        """From now on tilt the truck in another way."""
+        """Set the tilt of the truck from now on."""
         self._plant.advance(time_ns)
         self._space.set_tilt(tilt)
 
 
 def make_engine(config: WorldConfig, footprint: PlanOutline, start: Pose2, seed: int | None, *, lidar: bool) -> Engine:
-    """What computes one robot: ``engine`` of the configuration.
+    """Create the engine that the setting ``engine`` selects, for one robot.
 
     Raises:
-        NotInstalledError: its library is not there.
+        NotInstalledError: the engine's library is not installed.
     """
     if config.engine == "mujoco":
         try:
@@ -233,10 +233,10 @@ def make_engine(config: WorldConfig, footprint: PlanOutline, start: Pose2, seed:
 
 
 def make_view(config: WorldConfig, plant: Plant, cast: Caster, scene: Surroundings, seed: int) -> SimulatedView:
-    """What the camera sees, drawn in the plane or rendered.
+    """Create the camera view, drawn in the plane or rendered.
 
     Raises:
-        NotInstalledError: this computer cannot render, or tags need a library that is not there.
+        NotInstalledError: this computer cannot render, or the library for tags is not installed.
     """
     drawn = SimulatedView(
         plant,
@@ -256,15 +256,15 @@ def make_view(config: WorldConfig, plant: Plant, cast: Caster, scene: Surroundin
 
 
 def make_scene(config: WorldConfig, seed: int, others: Sequence[WorldConfig] = ()) -> Surroundings:
-    """Surroundings for the robots of one world.
+    """Create the surroundings for the robots of one world.
 
     Args:
-        config: the first robot's; map and people are its.
-        seed: of the people.
-        others: the further robots' worlds, for the places where they begin.
+        config: world of the first robot; defines the map and the people.
+        seed: seed of the people.
+        others: worlds of the other robots, for their start poses.
 
     Raises:
-        InputError: unknown map name, a bad map or profile file, or a person's way that is not free.
+        InputError: unknown map name, bad map or profile file, or a person's path is not free.
     """
     place = _find(config.map)
     return Surroundings(place, config.people, seed, [_start(each, place) for each in (config, *others)])
@@ -276,7 +276,7 @@ def _start(config: WorldConfig, place: BuiltIn) -> Pose2:
 
 
 def _find(name: str) -> BuiltIn:
-    """A built-in world, or the map file of that path with the ground profile in the same folder."""
+    """Return a built-in world, or load the map file at that path with the ground profile in the same folder."""
     if name in BUILT_IN:
         return BUILT_IN[name]()
     path = Path(name)

@@ -1,4 +1,4 @@
-"""Cameras under the ceiling of the world in three dimensions: what a test stand sees from above."""
+"""Ceiling cameras of a test stand in the three-dimensional world."""
 
 from monstertruck_sim.config import CeilingCamera
 from monstertruck_sim.world.board import BoardHolder
@@ -10,13 +10,13 @@ from monstertruck_sim.world3d.model import Group
 
 
 class CeilingView(RenderedView):
-    """``ViewSource`` of a camera that hangs in the world.
+    """``ViewSource`` of a fixed camera in the world.
 
     Args:
         world: of engine mujoco.
         config: place, lens and noise.
-        board: somebody holds it before the camera; None = nobody does.
-        seed: of noise and board.
+        board: board held in front of the camera, or None.
+        seed: seed of noise and board poses.
 
     Raises:
         NotInstalledError: this computer has no EGL.

@@ -1,7 +1,7 @@
-"""The robot as rigid bodies: MuJoCo's own grid of 2 ms; motors, servos and battery are those of every engine.
+"""Rigid-body robot on MuJoCo's time grid of 2 ms; all engines share the motor, servo and battery models.
 
-A command takes effect on the step that is integrated next: no step is taken before an instant beyond its end is asked
-for, so what is commanded up to then is in it.
+A command takes effect in the next integrated step: a step is integrated only when an instant at or beyond its end is
+requested, so it includes every command up to then.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,12 +34,12 @@ _UNSTABLE: Final = (
     mujoco.mjtWarning.mjWARN_BADQVEL,
     mujoco.mjtWarning.mjWARN_BADQACC,
 )
-"""Warnings after which MuJoCo begins again where its model does: elsewhere, without a word to anybody."""
+"""Warnings after which MuJoCo silently resets the state to the model's initial state."""
 
 Ground = Callable[[float, float], float]
-"""Height under a point of the map, m."""
+"""Return the ground height at a point of the map (m)."""
 Steering = Callable[[Sequence[float]], Sequence[float]]
-"""Servo angles to the angles of the steered wheels, in the order of their joints; rad."""
+"""Convert servo angles to the angles of the steered wheels, in the order of their joints (rad)."""
 
 
 class _Tyres(NamedTuple):
@@ -48,7 +48,7 @@ class _Tyres(NamedTuple):
     joints: tuple[tuple[int, int, int], ...]
     """Of each its place and its speed among those of all joints, and the speed of its wheel."""
     spring: float
-    """N/m."""
+    """Spring rate (N/m)."""
     share: float
     """Of the relaxation that a wheel rolls in one step, for each rad/s."""
 
@@ -98,30 +98,30 @@ class RigidPlant(Plant):
         self.data = mujoco.MjData(model)
         self._drive, self._steers, self.ground = drive, steering, ground
         self.before_steps: Callable[[], None] = lambda: None
-        """Brings what moves around the robot to where it is now."""
+        """Moves the bodies around the robot to their current poses."""
         count = len(self.shafts)
         self._first_shaft = model.nu - count
         self._wound = [0.0] * count
         """Angle to which each shaft has wound its wheels up, rad, mean of its wheels."""
         self._head = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in HEAD_JOINTS]
         self._head_shafts = np.zeros(len(self._head))
-        """Angles of the stabiliser's shafts at the newest step, rad."""
+        """Angles of the stabiliser's shafts at the latest step (rad)."""
         self._rolling = [model.jnt_qposadr[i] for i in range(model.njnt) if model.joint(i).name.endswith("_rollers")]
         """Of balls that stand for wheels with rollers: whose axis across the rollers' stays level."""
         self._tyres = _tyres(model, parts, config.wheel_radius)
         self._deflection = [0.0] * (0 if self._tyres is None else len(self._tyres.joints))
-        """Deflection of the tyres along and across, m."""
+        """Longitudinal and lateral deflection of the tyres (m)."""
         self._steered: list[float] = []
         """Servo angles that the steered wheels follow."""
         self._felt = self._turning = self._velocity = (0.0, 0.0, 0.0)
         self._on_blocks = 0.0, 0.0
-        """Pitch and roll that blocks under its wheels give it, rad."""
+        """Pitch and roll caused by blocks under the wheels (rad)."""
         self._solid = np.isin(model.geom_group, (Group.WALLS, Group.MOVING)).tolist()
         self._put(start)
 
     @property
     def acceleration(self) -> Xyz:
-        """Of the body, forward, left and up in its level frame, as a sensor on it feels it, m/s^2; without gravity."""
+        """Acceleration of the body without gravity, as sensed on it: forward, left, up in its level frame (m/s^2)."""
         return self._felt
 
     @property
@@ -131,11 +131,11 @@ class RigidPlant(Plant):
 
     @property
     def height(self) -> float:
-        """Of the base over the map's plane, m."""
+        """Height of the base above the plane of the map (m)."""
         return self._height
 
     def mount_torque(self, joint: int, /) -> float:
-        """With which the lidar pushes its pitch (0) or roll (1) joint at the newest instant, Nm."""
+        """Return the latest load torque of the lidar on its pitch (0) or roll (1) joint (Nm)."""
         return -float(self.data.actuator_force[self._head[joint]])
 
     def integrate(self, time_ns: int) -> None:
@@ -367,6 +367,6 @@ class RigidPlant(Plant):
             self._stuck_at = self._pose
         elif self._stuck_at is not None:
             x, y, _ = self._stuck_at
-            # 0.005: way from where it was stuck on which it is free, m
+            # 0.005: distance from the place of contact at which the robot is free again, m
             if hypot(self._pose[0] - x, self._pose[1] - y) > 0.005:
                 self._stuck_at = None
