@@ -1,4 +1,4 @@
-"""One description of a robot as rigid links and joints, from which its MJCF, its URDF and its static frames are made.
+"""Robot description of rigid links and joints, the common source of its MJCF, URDF and static frames.
 
 Frames: x forward, y left, z up. The base frame is the geometric centre on level ground, at rest under the robot's own
 weight: there every joint is at zero. Lengths m, masses kg, angles rad, SI units. Of the truck's masses, 7.25 kg in all
@@ -13,7 +13,7 @@ from xml.etree import ElementTree as ET
 from monstertruck_kinematics.elementary import KinematicsError, require_positive
 
 GRAVITY: Final = 9.81
-"""m/s^2."""
+"""Gravitational acceleration (m/s^2)."""
 
 Triple = tuple[float, float, float]
 JointKind = Literal["fixed", "revolute", "continuous", "prismatic"]
@@ -23,7 +23,7 @@ ZERO: Final[Triple] = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """What a link looks like, and collides with.
+    """Visual and collision shape of a link.
 
     ``box``: lengths along x, y, z. ``wheel``: radius and width of a cylinder about y. ``ball``: radius.
     """
@@ -34,24 +34,24 @@ class Shape:
     colour: str = "0.35 0.36 0.4 1"
     """Red, green, blue and opacity, 0..1."""
     yaw: float = 0.0
-    """About z, rad; of a cylinder."""
+    """Rotation of a cylinder about z (rad)."""
     touches: Literal["all", "ground", "walls"] = "all"
     slick: bool = False
-    """Without friction."""
+    """Whether the shape has no friction."""
     seen: bool = True
-    """In pictures and in files for viewers."""
+    """Whether the shape appears in pictures and in files for viewers."""
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A rigid part.
+    """Rigid part.
 
     Args:
-        name: of its frame.
-        mass: kg; 0 = a frame without a body.
-        centre: of mass, in its frame.
-        inertia: about the centre of mass, along the frame's axes.
-        shapes: outside.
+        name: name of its frame.
+        mass: mass (kg); 0 for a frame without a body.
+        centre: centre of mass, in its frame.
+        inertia: inertia about the centre of mass, along the frame's axes.
+        shapes: outer shapes.
     """
 
     name: str
@@ -63,21 +63,21 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class PartJoint:
-    """Connects a link to its parent; at zero the child's frame has the parent's orientation, turned by ``turn``.
+    """Joint between a link and its parent; at zero the child's frame has the parent's orientation turned by ``turn``.
 
     Args:
-        name: of the joint.
-        kind: of motion: ``prismatic`` slides along the axis, ``revolute`` turns about it between its limits.
-        parent: link.
-        child: link.
-        origin: of the child's frame in the parent's.
+        name: name of the joint.
+        kind: motion: ``prismatic`` slides along the axis, ``revolute`` turns about it between its limits.
+        parent: parent link.
+        child: child link.
+        origin: origin of the child's frame in the parent's frame.
         turn: roll, pitch and yaw of the child's frame.
         axis: unit vector.
-        limits: least and greatest position; None = none.
-        stiffness: of a spring, N/m or Nm/rad.
-        damping: N s/m or Nm s/rad.
-        load: with which the spring is pressed at zero, N or Nm, along the axis.
-        friction: dry, N or Nm.
+        limits: minimum and maximum position; None without limits.
+        stiffness: spring stiffness (N/m or Nm/rad).
+        damping: damping (N s/m or Nm s/rad).
+        load: spring preload at zero, along the axis (N or Nm).
+        friction: dry friction (N or Nm).
     """
 
     name: str
@@ -99,23 +99,23 @@ class Mechanics:
     """Masses, springs and friction of the truck.
 
     Args:
-        mass: of everything, kg.
-        wheel_mass: of one wheel, kg.
-        axle_mass: of one axle without its wheels, kg.
-        mass_height: of the centre of the mass that the springs carry, over the ground, m.
-        wheel_width: m.
-        droop: how far an axle sinks below its place at rest before its stop, m.
-        bump: how far it rises, m.
-        spring: of one axle, both its springs together, N/m; None: at the end of the droop they carry nothing.
-        damping: of one axle, share of the critical one of the body on both its axles.
-        axle_roll: greatest roll of an axle against the chassis, rad.
-        roll_spring: of one axle, Nm/rad: both its springs at a third of the track from the middle.
-        friction: between tyre and ground.
-        rolling_resistance: of the weight.
-        steering_limit: greatest angle of a wheel, rad.
-        tyre_stiffness: force of one rolling tyre by a small slip angle, N/rad, and by a small slip ratio, N (isotropic
+        mass: total mass (kg).
+        wheel_mass: mass of one wheel (kg).
+        axle_mass: mass of one axle without its wheels (kg).
+        mass_height: height of the sprung mass's centre above the ground (m).
+        wheel_width: width of a wheel (m).
+        droop: travel of an axle below its rest position before its stop (m).
+        bump: travel of an axle above its rest position (m).
+        spring: stiffness of one axle's two springs together (N/m); None: they carry nothing at the end of the droop.
+        damping: damping of one axle, as a fraction of the critical damping of the body on both axles.
+        axle_roll: maximum roll of an axle against the chassis (rad).
+        roll_spring: roll stiffness of one axle (Nm/rad): both its springs at a third of the track from the middle.
+        friction: friction coefficient between tyre and ground.
+        rolling_resistance: rolling resistance, as a fraction of the weight.
+        steering_limit: maximum steering angle of a wheel (rad).
+        tyre_stiffness: force of one rolling tyre per small slip angle (N/rad) and per small slip ratio (N) (isotropic
             brush); 0: rigid wheels.
-        relaxation: distance rolled in which a tyre's deflection gives way, m.
+        relaxation: relaxation length of a tyre's deflection (m).
     """
 
     mass: float = 7.25
@@ -146,22 +146,22 @@ class Mechanics:
 
     @property
     def sprung(self) -> float:
-        """Mass that the springs carry, kg."""
+        """Sprung mass (kg)."""
         return self.mass - 4.0 * self.wheel_mass - 2.0 * self.axle_mass
 
     @property
     def axle_load(self) -> float:
-        """Force on the springs of one axle at rest, N."""
+        """Force on the springs of one axle at rest (N)."""
         return self.sprung * GRAVITY / 2.0
 
     @property
     def tyre_spring(self) -> float:
-        """Of one tyre that does not roll, N/m."""
+        """Stiffness of one tyre that does not roll (N/m)."""
         return self.tyre_stiffness / self.relaxation
 
     @property
     def axle_spring(self) -> float:
-        """Stiffness of one axle's springs, N/m."""
+        """Stiffness of one axle's springs (N/m)."""
         return self.axle_load / self.droop if self.spring is None else self.spring
 
 
@@ -170,11 +170,11 @@ class Size:
     """Outer dimensions.
 
     Args:
-        wheelbase: m.
-        track: m.
-        wheel_radius: m.
-        length: of the footprint, m.
-        width: m.
+        wheelbase: wheelbase (m).
+        track: track (m).
+        wheel_radius: wheel radius (m).
+        length: length of the footprint (m).
+        width: width (m).
     """
 
     wheelbase: float = 0.32
@@ -186,13 +186,13 @@ class Size:
 
 @dataclass(frozen=True, slots=True)
 class LidarHead:
-    """What the stabiliser turns, and its servos: a pitch joint on the base, a roll joint on it, the lidar on that.
+    """Stabilised lidar with its servos: a pitch joint on the base, a roll joint on it, the lidar on the roll joint.
 
     Args:
-        place: of the point that both joints turn about, in the base frame, m.
-        lidar_mass: kg (the maker's data sheet: 160 g).
-        servo_mass: of one servo, kg (the maker's: 55 g).
-        offset: of the lidar's centre of mass above the joints, m.
+        place: position of the pivot of both joints in the base frame (m).
+        lidar_mass: mass of the lidar (kg) (data sheet: 160 g).
+        servo_mass: mass of one servo (kg) (data sheet: 55 g).
+        offset: height of the lidar's centre of mass above the joints (m).
     """
 
     place: Triple = (0.14, 0.0, 0.25)
@@ -202,7 +202,7 @@ class LidarHead:
 
     @property
     def mass(self) -> float:
-        """Kg."""
+        """Total mass (kg)."""
         return self.lidar_mass + 2.0 * self.servo_mass
 
 
@@ -211,7 +211,7 @@ HEAD_JOINTS: Final = ("lidar_pitch", "lidar_roll")
 
 @dataclass(frozen=True, slots=True)
 class SensorFrame:
-    """Where a sensor is fixed to the base: its name, place and roll, pitch, yaw."""
+    """Sensor mount on the base: name, position and roll, pitch, yaw."""
 
     name: str
     origin: Triple
@@ -223,12 +223,12 @@ class Description:
     """A tree of links.
 
     Args:
-        name: of the robot.
-        links: the first one is the base.
-        joints: one for every other link, parents before children.
+        name: name of the robot.
+        links: links; the first is the base.
+        joints: one joint for every other link, parents before children.
 
     Raises:
-        KinematicsError: a name that is used twice, or a joint whose links are not there.
+        KinematicsError: duplicate name, or a joint with missing links.
     """
 
     name: str
@@ -253,19 +253,19 @@ class Description:
 
     @property
     def mass(self) -> float:
-        """Of all links, kg."""
+        """Mass of all links (kg)."""
         return sum(link.mass for link in self.links)
 
     def link(self, name: str) -> Part:
-        """By its name."""
+        """Return a link by name."""
         return self._by_name[name]
 
     def children(self, parent: str) -> tuple[PartJoint, ...]:
-        """Joints that lead on from a link."""
+        """Return the joints to the children of a link."""
         return tuple(joint for joint in self.joints if joint.parent == parent)
 
     def frame(self, name: str) -> Triple:
-        """Place of a link's frame in the base frame with all joints at zero; for frames that are not turned."""
+        """Return the position of a link's frame in the base frame, all joints at zero; for unrotated frames."""
         by_child = {joint.child: joint for joint in self.joints}
         x, y, z = ZERO
         while name in by_child:
@@ -276,20 +276,20 @@ class Description:
 
 
 def box_inertia(mass: float, size: Triple) -> Triple:
-    """Principal moments of a solid box, kg m^2."""
+    """Return the principal moments of a solid box (kg m^2)."""
     x, y, z = (side * side for side in size)
     return mass * (y + z) / 12.0, mass * (x + z) / 12.0, mass * (x + y) / 12.0
 
 
 def wheel_inertia(mass: float, radius: float, width: float) -> Triple:
-    """Principal moments of a wheel about y: half solid disc, half thin ring, kg m^2."""
+    """Return the principal moments of a wheel about y: half solid disc, half thin ring (kg m^2)."""
     spin = 0.75 * mass * radius * radius
     across = 0.5 * spin + mass * width * width / 12.0
     return across, spin, across
 
 
 def wheel_shapes(radius: float, width: float) -> tuple[Shape, Shape]:
-    """A wheel's outline, which touches walls, of its hub; and a round tread, which touches the ground, of its tyre."""
+    """Return a wheel's outline on the hub, which touches walls, and a round tread on the tyre, which touches ground."""
     return (
         Shape("wheel", (radius, width), ZERO, "0.12 0.12 0.13 1", touches="walls"),
         Shape("ball", (radius,), touches="ground", seen=False),
@@ -302,13 +302,13 @@ def truck_description(
     sensors: tuple[SensorFrame, ...] = (),
     head: LidarHead | None = None,
 ) -> Description:
-    """The truck: a chassis on two solid axles, each with a vertical slide and a roll joint, and four steered wheels.
+    """Return the truck: a chassis on two solid axles, each with a vertical slide and a roll joint, four steered wheels.
 
     Args:
-        size: its dimensions; None = the truck's.
-        mechanics: masses and springs; None = the truck's.
+        size: dimensions; None for the truck dimensions.
+        mechanics: masses and springs; None for the truck values.
         sensors: frames on the chassis.
-        head: the lidar on its joints, a part of the mass on the springs; None = it is fixed.
+        head: lidar on its joints, part of the sprung mass; None for a fixed lidar.
     """
     size, parts = size or Size(), mechanics or Mechanics()
     radius = size.wheel_radius
@@ -419,9 +419,9 @@ def truck_description(
 
 
 def add_tyre(wheel: str, hub: str, parts: Mechanics, links: list[Part], joints: list[PartJoint]) -> str:
-    """The give of a tyre along and across between hub and rim, where tyres have one; the link that carries the wheel.
+    """Add a tyre's longitudinal and lateral compliance between hub and rim, if any; return the wheel's parent link.
 
-    The springs are the simulator's: they act on the deflection of what touches the ground, which rolling renews.
+    The simulator provides the springs: they act on the deflection of the contact patch, which rolling renews.
     """
     if parts.tyre_stiffness == 0.0:
         return hub
@@ -436,23 +436,23 @@ def add_tyre(wheel: str, hub: str, parts: Mechanics, links: list[Part], joints: 
 
 
 def turning_mass(parts: Mechanics) -> float:
-    """Of a wheel without its hub and what carries the tyre's give, kg."""
+    """Return the mass of a wheel without its hub and the link of the tyre compliance (kg)."""
     return parts.wheel_mass - HUB - (2.0 * _RIM if parts.tyre_stiffness else 0.0)
 
 
 _RIM: Final = 1e-3
-"""Mass of a link that only carries the give of a tyre, kg."""
+"""Mass of a link that only carries tyre compliance (kg)."""
 
 
 def add_sensors(sensors: tuple[SensorFrame, ...], links: list[Part], joints: list[PartJoint]) -> None:
-    """Frames on the base."""
+    """Add the sensor frames to the base."""
     for sensor in sensors:
         links.append(Part(sensor.name))
         joints.append(PartJoint(f"{sensor.name}_mount", "fixed", "base", sensor.name, sensor.origin, sensor.turn))
 
 
 def add_head(head: LidarHead, links: list[Part], joints: list[PartJoint]) -> None:
-    """The lidar and its joints on the base."""
+    """Add the lidar and its joints to the base."""
     servo = (0.032, 0.05, 0.04)
     lidar = (0.05, 0.05, 0.07)
     links += [
@@ -473,11 +473,11 @@ def add_head(head: LidarHead, links: list[Part], joints: list[PartJoint]) -> Non
 
 
 HUB: Final = 0.04
-"""Mass of a knuckle or hub, kg; counted to its wheel."""
+"""Mass of a knuckle or hub (kg); included in the wheel mass."""
 
 
 def urdf(description: Description) -> str:
-    """As a Unified Robot Description Format file, for viewers; springs have no element there."""
+    """Return the description in Unified Robot Description Format, for viewers; the format has no springs."""
     robot = ET.Element("robot", name=description.name)
     for link in description.links:
         element = ET.SubElement(robot, "link", name=link.name)

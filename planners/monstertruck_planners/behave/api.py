@@ -1,4 +1,4 @@
-"""What a behaviour is: a pure step from inputs to a requested motion, which its service runs at a fixed rate."""
+"""Interface of behaviours: a pure step from inputs to a requested motion, run by the service at a fixed rate."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,22 +15,22 @@ M = TypeVar("M", bound=Message)
 
 
 class BehaviourConfig(Schema):
-    """Settings that all behaviours have; each adds its ``kind``."""
+    """Settings shared by all behaviours; each adds its ``kind``."""
 
     kind: str
     rate: Annotated[float, Field(gt=0, le=50)] = 10.0
-    """Steps a second"""
+    """Steps per second"""
 
 
 class RequestedMotion(NamedTuple):
-    """A requested twist of base."""
+    """Requested twist of base."""
 
     vx: float = 0.0
-    """Forward, m/s."""
+    """Forward speed (m/s)."""
     wz: float = 0.0
-    """Yaw rate, rad/s, left positive."""
+    """Yaw rate (rad/s), left positive."""
     vy: float = 0.0
-    """To the left, m/s."""
+    """Lateral speed (m/s), left positive."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +38,12 @@ class BehaviourStep:
     """Result of one step.
 
     Attributes:
-        motion: the requested one; None = standstill.
-        state: for the next step.
-        phase: what it is doing.
-        outcome: DRIVING, or why it has ended; it is not stepped again then.
-        text: of the outcome; empty = the reason's own.
-        values: for ``plan/behaviour``.
+        motion: requested motion; None for standstill.
+        state: state for the next step.
+        phase: current phase.
+        outcome: DRIVING, or the reason why the behaviour ended; an ended behaviour is not stepped again.
+        text: message for the outcome; empty for the default message of the reason.
+        values: values for ``plan/behaviour``.
     """
 
     motion: RequestedMotion | None
@@ -55,48 +55,48 @@ class BehaviourStep:
 
 
 class BehaviourBody(NamedTuple):
-    """The robot that a behaviour moves."""
+    """Body of the robot that a behaviour moves."""
 
     chassis: Chassis
     max_angle: float
-    """Greatest angle of its axles, rad: that of the gate."""
+    """Maximum axle angle (rad): the gate's limit."""
 
 
 class Inputs:
-    """The newest message of every topic that a behaviour reads; all of them are fresh.
+    """Latest message of every topic that a behaviour reads; all are fresh.
 
     Args:
-        messages: by the topic's name.
+        messages: messages by topic name.
     """
 
     def __init__(self, messages: Mapping[str, Message]) -> None:
         self._messages = messages
 
     def of(self, topic: Topic[M]) -> M:
-        """The newest message of a topic."""
+        """Return the latest message of a topic."""
         message = self._messages[topic.name]
         assert isinstance(message, topic.model)
         return message
 
 
 class Behaviour(Protocol):
-    """Made from its settings; keeps nothing between steps but what they return.
+    """Behaviour constructed from its settings; the state returned by a step is all it keeps between steps.
 
-    A class with a class method ``fit(settings, body)`` is made by this instead, from a ``BehaviourBody`` as well, at
-    every start; a ``ValueError`` of it says why the body cannot do that, or what is wrong with the settings.
+    A class with a class method ``fit(settings, body)`` is constructed by it instead at every start, with a
+    ``BehaviourBody`` too; it raises a ``ValueError`` if the body cannot do that or the settings are wrong.
     """
 
     reads: ClassVar[tuple[Topic[Any], ...]]
-    """Topics without which it cannot run: when one has no fresh message, it is stopped with ``INPUT_STALE``."""
+    """Required topics: if one has no fresh message, the behaviour is stopped with ``INPUT_STALE``."""
 
     def begin(self) -> Any:
-        """State before the first step."""
+        """Return the state before the first step."""
 
     def step(self, inputs: Inputs, state: Any, t: float) -> BehaviourStep:
-        """One step.
+        """Run one step.
 
         Args:
-            inputs: newest messages.
-            state: of the step before.
-            t: s since the behaviour was started.
+            inputs: latest messages.
+            state: state returned by the previous step.
+            t: time since the start of the behaviour (s).
         """

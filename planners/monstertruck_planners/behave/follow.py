@@ -1,8 +1,8 @@
-"""Leader and follower: a robot drives along the path of another one, at a distance.
+"""Leader and follower: a robot drives along the path of another robot, at a distance.
 
-The leader is not involved: the follower receives the poses that the leader publishes, keeps its trail, and steers
-towards a point on the trail (pure pursuit, Coulter 1992) at the leader's speed plus a share of the gap's error. A
-leader is trusted as long as its poses arrive, by the follower's own clock.
+The leader is not involved. The follower receives the poses that the leader publishes, keeps its trail, and steers
+towards a point on the trail (pure pursuit, Coulter 1992). Its speed is the leader's speed plus a correction
+proportional to the gap error. The follower trusts a leader while poses arrive, by the follower's clock.
 """
 
 import itertools
@@ -28,25 +28,25 @@ Metres = Annotated[float, Field(gt=0, le=20)]
 
 
 class FollowConfig(BehaviourConfig):
-    """Whom to follow, and how."""
+    """Settings of following a leader."""
 
     kind: Literal["follow"] = "follow"
     leader: str
-    """One of the configuration's section `peers`"""
+    """Name of a robot in the configuration's section `peers`"""
     distance: Metres = 1.0
-    """Distance behind the leader along its path, from middle to middle, m"""
+    """Distance behind the leader along its path, centre to centre, m"""
     speed: Annotated[float, Field(gt=0, le=5)] = 0.2
-    """Greatest speed, m/s"""
+    """Maximum speed, m/s"""
     ahead: Metres = 0.4
-    """Distance of the point on the trail that it steers to, m"""
+    """Look-ahead distance to the target point on the trail, m"""
     silence: Annotated[float, Field(gt=0, le=5)] = 0.5
-    """Seconds without a pose of the leader after which it stops"""
+    """Time without a pose from the leader after which the follower stops, s"""
     lost: Metres = 5.0
-    """Distance from the leader at which it gives up, m"""
+    """Distance from the leader at which the follower gives up, m"""
 
 
 class Point(NamedTuple):
-    """Of the trail, m, in map."""
+    """Trail point in map (m)."""
 
     x: float
     y: float
@@ -54,17 +54,17 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LeaderTrail:
-    """State of a follower: where the leader was, from the point that is passed next."""
+    """State of a follower: past leader positions, starting at the next point to pass."""
 
     points: tuple[Point, ...] = ()
 
 
 class LeaderFollower:
-    """Follows another robot.
+    """Behaviour that follows another robot.
 
     Args:
         config: settings.
-        body: the robot's.
+        body: body of the robot.
 
     Raises:
         KinematicsError: the body cannot drive curves.
@@ -78,15 +78,15 @@ class LeaderFollower:
 
     @classmethod
     def fit(cls, config: FollowConfig, body: BehaviourBody) -> Self:
-        """The behaviour for a body. Raises as the class does."""
+        """Return the behaviour for a body; raises the same errors as the class."""
         return cls(config, body)
 
     def begin(self) -> LeaderTrail:
-        """Nothing is known of the leader's path."""
+        """Return an empty trail."""
         return LeaderTrail()
 
     def step(self, inputs: Inputs, state: LeaderTrail, t: float) -> BehaviourStep:
-        """One step."""
+        """Run one step."""
         config, me, peers = self._config, inputs.of(POSE).pose, inputs.of(PEERS)
         leader = next((peer for peer in peers.peers if peer.robot == config.leader), None)
         if leader is None:
@@ -101,7 +101,7 @@ class LeaderFollower:
             return BehaviourStep(None, state, "follow", Reason.PATH_LOST, text)
         state = extended(state, me, leader.pose)
         gap = length((Point(me.x, me.y), *state.points))
-        pace = along(leader, me) + 0.8 * (gap - config.distance)  # speed per error of the gap, 1/s
+        pace = along(leader, me) + 0.8 * (gap - config.distance)  # speed per gap error, 1/s
         pace = min(max(pace, 0.0), config.speed)
         values = {"gap": gap, "apart": apart, "silent": silent}
         if gap <= config.distance and pace < 0.01 * config.speed:
@@ -115,9 +115,9 @@ class LeaderFollower:
 
 
 def extended(trail: LeaderTrail, me: Pose2D, leader: Pose2D) -> LeaderTrail:
-    """The trail with the leader's newest place at its end, and without what the follower has passed."""
+    """Return the trail with the leader's latest position appended and passed points removed."""
     points, at = trail.points, Point(leader.x, leader.y)
-    # 0.5: a leader that moves further than this from one step to the next was put down elsewhere, m
+    # 0.5: a leader that moves further than this between two steps was put down elsewhere, m
     if not points or math.dist(points[-1], at) > 0.5:
         points = (at,)  # straight towards it
     elif len(points) > 1 and math.dist(points[-2], at) < TRAIL_SPACING:
@@ -137,19 +137,19 @@ def _passed(here: Point, first: Point, second: Point) -> bool:
 
 
 def length(points: tuple[Point, ...]) -> float:
-    """Length of the path through points, m."""
+    """Return the length of the path through points (m)."""
     return sum(math.dist(a, b) for a, b in itertools.pairwise(points))
 
 
 def along(leader: Peer, me: Pose2D) -> float:
-    """Speed with which the leader drives away from the follower, m/s; one that comes nearer has none."""
+    """Return the leader's speed if it drives away from the follower, otherwise 0 (m/s)."""
     vx, vy = to_world(leader.pose.yaw, leader.twist.vx, leader.twist.vy)
     away = vx * (leader.pose.x - me.x) + vy * (leader.pose.y - me.y)
     return math.hypot(vx, vy) if away > 0.0 else 0.0
 
 
 def curvature(me: Pose2D, points: tuple[Point, ...], ahead: float) -> float:
-    """Of the arc to the point of the trail at a distance, 1/m: 2 y / d^2; at most that of a quarter turn."""
+    """Return the curvature of the arc to the trail point ``ahead`` m away, 2 y / d^2 (1/m); at most 2 / ``ahead``."""
     here, left, target = Point(me.x, me.y), ahead, points[-1]
     for point in points:
         step = math.dist(here, point)

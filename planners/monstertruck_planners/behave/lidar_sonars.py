@@ -1,7 +1,8 @@
 """Sonars computed from a lidar: ranges along axes fixed to the robot, as ``sensor/sonar``, for a robot without sonars.
 
-The points of a scan, joined where neighbouring beams met one surface, are cut by each axis: a narrow beam that starts
-at the sonar's place. Behaviours that follow walls by sonars then drive a robot that has only a lidar.
+Scan points are joined where neighbouring beams hit the same surface. Each axis, a narrow beam from the sonar's
+position, is intersected with these surfaces. Behaviours that follow walls by sonars can then drive a robot that has
+only a lidar.
 """
 
 import math
@@ -24,7 +25,7 @@ from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan, SonarEch
 
 
 def places() -> dict[str, Mount]:
-    """Left, front left, front, front right and right, with the diagonal ones 0.05 m ahead of the others."""
+    """Return mounts for left, front left, front, front right and right; the diagonals 0.05 m ahead of the others."""
     return {
         "l": Mount(x=0.05, y=0.05, yaw=math.pi / 2),
         "fl": Mount(x=0.10, y=0.05, yaw=math.pi / 4),
@@ -35,14 +36,14 @@ def places() -> dict[str, Mount]:
 
 
 class LidarSonarsConfig(Schema):
-    """Sonars that are computed from the lidar's scans."""
+    """Settings of sonars computed from lidar scans."""
 
     sonars: dict[FrameId, Mount] = Field(default_factory=places, min_length=1)
-    """Place and axis of each, in the base frame, by name"""
+    """Position and axis of each sonar in the base frame, by name"""
     range_min: Annotated[float, Field(ge=0, lt=5)] = 0.02
-    """Least range that is stated, m"""
+    """Minimum reported range, m"""
     range_max: Annotated[float, Field(gt=0, le=30)] = 3.0
-    """Greatest range, m"""
+    """Maximum range, m"""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -52,12 +53,12 @@ class LidarSonarsConfig(Schema):
 
 
 def sonars_of(scan: LaserScan, mount: tuple[float, float, float], config: LidarSonarsConfig) -> tuple[SonarEcho, ...]:
-    """What the sonars measure; one whose axis runs where the lidar does not see or does not know has not answered.
+    """Return the sonar ranges; a sonar has not answered if its axis lies where the lidar cannot see or has no data.
 
     Args:
-        scan: of the lidar.
-        mount: its pose in base, m, m, rad.
-        config: the sonars.
+        scan: lidar scan.
+        mount: pose of the lidar in base (m, m, rad).
+        config: settings of the sonars.
     """
     bearings = scan.start_angle + scan.angle_increment * np.arange(len(scan.ranges))
     valid = (scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)
@@ -87,7 +88,7 @@ def sonars_of(scan: LaserScan, mount: tuple[float, float, float], config: LidarS
 
 
 def _cut(points: Array, joined: NDArray[np.bool_], place: Mount) -> tuple[float, int] | tuple[None, None]:
-    """Range at which the axis first cuts the surfaces, m, and the number of the beam before; None = it does not."""
+    """Return the range of the axis's first intersection (m) and the number of the beam before; None without one."""
     along, aside = points_relative(points, (place.x, place.y, place.yaw)).T
     crossing = joined & (aside[:-1] * aside[1:] <= 0.0) & (aside[:-1] != aside[1:])
     at = crossing.nonzero()[0]
@@ -101,7 +102,7 @@ def _cut(points: Array, joined: NDArray[np.bool_], place: Mount) -> tuple[float,
 
 
 def _beam_towards(scan: LaserScan, mount: tuple[float, float, float], place: Mount, reach: float) -> int | None:
-    """Number of the lidar's beam to the far end of a sonar's axis; None = the lidar does not look there."""
+    """Return the number of the lidar beam to the far end of a sonar axis; None if outside the lidar's field of view."""
     x, y = place.x + reach * math.cos(place.yaw) - mount[0], place.y + reach * math.sin(place.yaw) - mount[1]
     bearing = np.array([math.atan2(y, x) - mount[2]])
     beam = int(nearest_beams(bearing, scan.start_angle, scan.angle_increment)[0])
@@ -112,11 +113,11 @@ class LidarSonars:
     """Service that publishes ``sensor/sonar`` for every scan.
 
     Args:
-        config: the sonars.
-        mount: of the lidar in base, m, m, rad.
-        clock: time.
-        scans: ``sensor/scan``.
-        out: ``sensor/sonar``.
+        config: settings of the sonars.
+        mount: pose of the lidar in base (m, m, rad).
+        clock: clock.
+        scans: subscription to ``sensor/scan``.
+        out: publisher of ``sensor/sonar``.
     """
 
     name = ServiceName.LIDAR_SONARS.value

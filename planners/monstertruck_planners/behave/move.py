@@ -1,13 +1,13 @@
 """Basic motion control: a move (radius R, length D or angle phi = D/R) driven under a motion profile (lecture, 2013).
 
-Signs are those of REP 103: a radius above 0 has the centre on the left, an angle above 0 turns counter-clockwise, a
-length below 0 goes backwards. Radius and length are those of the point of the body abeam of the turning centre: of a
-car the middle of its rear axle.
+Signs follow REP 103: a radius above 0 has the centre on the left, an angle above 0 turns counter-clockwise, a length
+below 0 goes backwards. Radius and length refer to the point of the body abeam of the turning centre: on a car the
+middle of the rear axle.
 
-Before it sets off the robot creeps, so that its wheels are steered to the move. Then the profile says how far it should
-be, by a clock that stands while the robot is further behind than it drives in 0.3 s: because the gate slows it, or the
-motors do. ``ramp`` has no clock: its cubic ramps are computed from the present speed and acceleration, and the one to
-standstill covers the remaining distance.
+The robot first creeps so that its wheels steer to the move. The profile then gives the target distance by a clock. The
+clock stops while the robot lags by more than it drives in 0.3 s, because the gate or the motors slow it. ``ramp`` has
+no clock: its cubic ramps start from the current speed and acceleration, and the ramp to standstill covers the
+remaining distance.
 """
 
 import math
@@ -27,48 +27,48 @@ from monstertruck_schemas.state import Odometry
 from monstertruck_schemas.topics import GATE, ODOMETRY, Topic
 
 LAG: Final = 0.3
-"""Seconds of driving by which every robot is behind."""
+"""Lag that every robot has behind its profile (s)."""
 
 
 class Amounts(NamedTuple):
-    """What is different for metres and for the radians of a turn on the spot."""
+    """Limits of a move, in metres or, for a turn on the spot, in radians."""
 
     speed: float
     acceleration: float
     behind: float
-    """Distance that is never a lag."""
+    """Distance behind the profile that is never treated as a lag."""
     tolerance: float
-    """Tolerance at the end."""
+    """End tolerance."""
 
 
 class MoveConfig(BehaviourConfig):
-    """One basic move; ``monstertruckd move`` gives its settings with every run."""
+    """Settings of one basic move; ``monstertruckd move`` supplies them with every run."""
 
     kind: Literal["move"] = "move"
     rate: Annotated[float, Field(gt=0, le=50)] = 20.0
-    """Steps a second"""
+    """Steps per second"""
     radius: float | None = None
     """Radius of the arc, m, centre on the left positive; 0 = on the spot, null = straight"""
     length: float | None = None
-    """Distance, m, backwards negative; null = the angle says it"""
+    """Distance, m, backwards negative; null: given by the angle"""
     angle: float | None = None
-    """Turn, rad, counter-clockwise positive; null = the length says it"""
+    """Turn, rad, counter-clockwise positive; null: given by the length"""
     bearing: Annotated[float, Field(ge=-math.tau, le=math.tau)] = 0.0
     """Direction of travel in base, rad: 0 = ahead, 1.5708 = sideways to the left"""
     profile: Literal["trapezoid", "cubic", "ramp"] = "trapezoid"
-    """Constant acceleration; cubic ramps over time; or cubic ramps from the present speed"""
+    """Constant acceleration; cubic ramps over time; or cubic ramps from the current speed"""
     speed: Annotated[float, Field(gt=0, le=5)] = 0.15
-    """Greatest speed, m/s"""
+    """Maximum speed, m/s"""
     acceleration: Annotated[float, Field(gt=0, le=5)] = 0.3
-    """Greatest acceleration, m/s^2"""
+    """Maximum acceleration, m/s^2"""
     turn_rate: Annotated[float, Field(gt=0, le=5)] = 0.4
-    """Greatest yaw rate of a turn on the spot, rad/s"""
+    """Maximum yaw rate of a turn on the spot, rad/s"""
     turn_acceleration: Annotated[float, Field(gt=0, le=20)] = 0.8
-    """Greatest yaw acceleration of a turn on the spot, rad/s^2"""
+    """Maximum yaw acceleration of a turn on the spot, rad/s^2"""
     tolerance: Annotated[float, Field(gt=0, le=0.5)] = 0.005
-    """How exactly its end is reached, m"""
+    """End tolerance, m"""
     turn_tolerance: Annotated[float, Field(gt=0, le=0.5)] = 0.01
-    """How exactly the end of a turn on the spot is reached, rad"""
+    """End tolerance of a turn on the spot, rad"""
 
     @model_validator(mode="after")
     def _sane(self) -> Self:
@@ -77,10 +77,10 @@ class MoveConfig(BehaviourConfig):
         return self
 
     def move(self) -> BasicMove:
-        """The move that these settings say.
+        """Return the move defined by these settings.
 
         Raises:
-            ValueError: they say none, or more than one.
+            ValueError: the settings define no move, or more than one.
         """
         if (self.length is None) is (self.angle is None):
             raise ValueError("expected either a length or an angle")
@@ -106,7 +106,7 @@ class MoveConfig(BehaviourConfig):
 
     @property
     def amounts(self) -> Amounts:
-        """Of the move."""
+        """Limits of the move."""
         if self.radius == 0.0:
             return Amounts(self.turn_rate, self.turn_acceleration, 0.03, self.turn_tolerance)
         return Amounts(self.speed, self.acceleration, 0.01, self.tolerance)
@@ -120,38 +120,38 @@ class Progress:
     pose: Odometry | None = None
     covered: float = 0.0
     turned: float = 0.0
-    """Rad, counting turns."""
+    """Accumulated turn, not wrapped (rad)."""
     time: float = 0.0
-    """Time of the last step, s."""
+    """Time of the last step (s)."""
     steered: float | None = None
-    """Since when the wheels are steered to the move, s."""
+    """Time since which the wheels are steered to the move (s)."""
     clock: float = 0.0
-    """Time of the profile, s."""
+    """Profile time (s)."""
     target: float = 0.0
-    """How far the robot should be."""
+    """Target distance."""
     planned: float = 0.0
-    """How fast it should be."""
+    """Target speed."""
     ramp: CubicRamp | None = None
     ramp_clock: float = 0.0
     braking: bool = False
     best: float = 0.0
-    """Distance covered when there was progress last."""
+    """Distance covered at the last progress."""
     best_at: float = 0.0
-    """s."""
+    """Time of the last progress (s)."""
     stood: float = 0.0
-    """Seconds for which the clock stood."""
+    """Time for which the clock was stopped (s)."""
 
 
 class Move:
-    """A basic move of one body.
+    """Basic move of one body.
 
     Args:
-        config: the move.
-        body: the robot's.
+        config: settings of the move.
+        body: body of the robot.
 
     Raises:
-        KinematicsError: the body cannot move like that; the reason is named.
-        ValueError: the settings say no move.
+        KinematicsError: the body cannot do this move; the message gives the reason.
+        ValueError: the settings define no move.
     """
 
     reads: ClassVar[tuple[Topic[Any], ...]] = (ODOMETRY, GATE)
@@ -160,24 +160,24 @@ class Move:
         self._move, self._amounts = config.move(), config.amounts
         self._direction = self._move.direction
         self._twist = require_possible(self._move, body)
-        """Of base, at unit pace."""
+        """Twist of base at unit pace."""
         self._chassis = body.chassis
         self._distance = self._move.profile_distance
         self._turns = self._move.radius != 0.0 and body.chassis.freedom != "parallel"
-        """Whether the heading is held by turning."""
+        """Whether turning corrects the heading."""
         self._profile = _profile(config, self._distance)
 
     @classmethod
     def fit(cls, config: MoveConfig, body: BehaviourBody) -> Self:
-        """The move for a body. Raises as the class does."""
+        """Return the move for a body; raises the same errors as the class."""
         return cls(config, body)
 
     def begin(self) -> Progress:
-        """Nothing is covered yet."""
+        """Return the state before the first step."""
         return Progress()
 
     def step(self, inputs: Inputs, state: Progress, t: float) -> BehaviourStep:
-        """One step."""
+        """Run one step."""
         odometry, gate = inputs.of(ODOMETRY), inputs.of(GATE)
         dt = t - state.time
         state = replace(self._advanced(state, odometry), time=t)
@@ -185,11 +185,11 @@ class Move:
             steered = gate.twist is not None and self._steered(gate.twist)
             since = (t if state.steered is None else state.steered) if steered else None
             state = replace(state, steered=since)
-            # 0.3: seconds for which the gate has to command the move's direction: servos answer late
+            # 0.3: time for which the gate must command the move's direction, because servos respond late, s
             if since is None or t - since < 0.3:
                 if t > 4.0:  # seconds
                     return self._ended(state, Reason.NOT_OBEYED, "the wheels are not steered to the move")
-                # 0.02: speed while the wheels are steered, as a share of the move's: above what counts as standstill
+                # 0.02: speed while the wheels steer, as a fraction of the move's speed: above the standstill threshold
                 return self._going(state, math.copysign(0.02 * self._amounts.speed, self._distance))
             state = replace(
                 state, phase="drive", target=state.covered, best=state.covered, best_at=t, clock=self._begun(state)
@@ -203,7 +203,7 @@ class Move:
         if state.phase == "arrive" and abs(left) <= self._amounts.tolerance and stands:
             way = "" if self._move.radius == 0.0 else f"{state.covered:.3f} m, "
             return self._ended(state, Reason.BEHAVIOUR_DONE, f"{way}turned {state.turned:.3f} rad")
-        # 3.0: seconds without progress after which it gives up, and after which an end that is not reached is missed
+        # 3.0: time without progress after which the move is given up or its end is missed, s
         if waited > 3.0:
             unit = "rad" if self._move.radius == 0.0 else "m"
             reason = Reason.GOAL_MISSED if state.phase == "arrive" else Reason.STUCK
@@ -211,11 +211,11 @@ class Move:
         off = state.target - state.covered
         usual = LAG * abs(state.planned)
         beyond = off - min(max(off, -usual), usual)
-        # 2.0: speed per distance from where the robot should be, 1/s
+        # 2.0: correction speed per distance from the target, 1/s
         return self._going(state, state.planned + 2.0 * beyond)
 
     def _advanced(self, state: Progress, now: Odometry) -> Progress:
-        """With the motion since the last step."""
+        """Return the state with the motion since the last step added."""
         before = state.pose
         if before is None:
             return replace(state, pose=now)
@@ -237,13 +237,13 @@ class Move:
             return False
         vx, vy, wz = self._twist
         off = max(abs(commanded.vx / pace - vx), abs(commanded.vy / pace - vy))
-        steered = 0.03  # difference of two directions up to which they are the same, 1/m and rad
+        steered = 0.03  # tolerance between two equal directions, 1/m and rad
         return off <= steered and abs(commanded.wz / pace - wz) <= steered * (1.0 + abs(wz))
 
     # The profile
 
     def _begun(self, state: Progress) -> float:
-        """Time of the profile at which the creeping has covered what it has."""
+        """Return the profile time that corresponds to the distance covered by creeping."""
         if self._profile is None or self._profile.duration == 0.0:
             return 0.0
         times = np.linspace(0.0, self._profile.duration, 1000)
@@ -251,7 +251,7 @@ class Move:
         return float(times[min(int(np.searchsorted(covered, abs(state.covered))), len(times) - 1)])
 
     def _planned(self, state: Progress, pace: float, dt: float) -> Progress:
-        """How far and how fast the robot should be now."""
+        """Return the state with the current target distance and speed."""
         behind = (state.target - state.covered) * math.copysign(1.0, self._distance)
         lags = behind > self._amounts.behind + LAG * abs(state.planned)
         if state.phase == "arrive":
@@ -271,7 +271,7 @@ class Move:
         )
 
     def _ramped(self, state: Progress, pace: float, dt: float, *, lags: bool) -> Progress:
-        """The same by ramps from the present speed and acceleration; a robot that lags has another speed."""
+        """Return the same by ramps from the current speed and acceleration; a lagging robot uses its actual speed."""
         top, hardest = math.copysign(self._amounts.speed, self._distance), self._amounts.acceleration
         if lags:
             state = replace(state, target=state.covered, planned=pace, ramp=None, braking=False)
@@ -314,7 +314,7 @@ class Move:
 
 
 def _profile(config: MoveConfig, distance: float) -> MotionProfile | None:
-    """None for ramps."""
+    """Return the motion profile; None for ramps."""
     amounts = config.amounts
     if config.profile == "ramp":
         return None
@@ -324,16 +324,16 @@ def _profile(config: MoveConfig, distance: float) -> MotionProfile | None:
 
 
 def require_possible(move: BasicMove, body: BehaviourBody) -> Twist2:
-    """Twist of base at unit pace, of a move that a body can do.
+    """Return the twist of base at unit pace for a move that the body can do.
 
     Raises:
-        KinematicsError: the reason.
+        KinematicsError: the body cannot do the move; the message gives the reason.
     """
     chassis = body.chassis
     twist = chassis.possible(move.direction)
     angles, clipped = chassis.limited_steering(chassis.steering_for(twist, chassis.straight), body.max_angle)
     reached = chassis.reached(angles)
-    # 0.01: difference of an axle angle from the one requested that is none, rad
+    # 0.01: tolerance between a reached and a requested axle angle, rad
     if clipped or max((abs(a - b) for a, b in zip(angles, reached, strict=True)), default=0.0) > 0.01:
         vx, vy, wz = chassis.along(twist, *reached)
         if math.isinf(move.radius):

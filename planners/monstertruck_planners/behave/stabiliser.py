@@ -1,4 +1,4 @@
-"""Keeps the lidar level: the body's tilt becomes goals of the mount's two joints.
+"""Lidar stabiliser: converts the body's tilt into goals for the mount's two joints.
 
 **Convention.** All angles are REP 103: pitch about y, nose down positive; roll about x, right side down positive.
 The compass gives the body's tilt in a level frame as R = Ry(pitch) Rx(roll), heading left out. The mount's pitch
@@ -45,36 +45,36 @@ from monstertruck_schemas.topics import COMPASS, ODOMETRY, PLAN_STABILISER, Writ
 
 FILTERS: Final = 5
 JUDGED: Final = 2
-"""Readings over which a prediction is checked: about as far ahead as it is used."""
+"""Prediction length that is checked, in readings: about as far ahead as predictions are used."""
 LEAST_ERROR: Final = math.radians(0.1)
-"""Filters better than this are equally good, rad: the compass's resolution."""
+"""Error below which filters are equally good (rad): the compass resolution."""
 
 Limit = Annotated[float, Field(gt=0, lt=math.pi / 2)]
 
 
 class StabiliserConfig(Schema):
-    """How the lidar is kept level."""
+    """Settings of the lidar stabiliser."""
 
     kind: Literal["stabiliser"] = "stabiliser"
     rate: Annotated[float, Field(gt=0, le=100)] = 25.0
-    """Goals a second."""
+    """Goals per second."""
     pitch_limit: Limit = math.radians(30)
-    """Greatest joint angle to either side, rad."""
+    """Maximum joint angle to either side, rad."""
     roll_limit: Limit = math.radians(30)
     max_rate: Positive = 3.0
-    """Greatest change of a goal, rad/s."""
+    """Maximum rate of change of a goal, rad/s."""
     lead: Annotated[float, Field(ge=0, le=0.5)] = 0.036
-    """Seconds by which a joint is late on its goal: servo, bus and half a period of the goals."""
+    """Delay of a joint behind its goal, s: servo, bus and half a goal period."""
     memory: Annotated[float, Field(gt=0, lt=1)] = 0.4
-    """Share of the past that one reading leaves in the quickest filter; more is calmer and later."""
+    """Fraction of the past that one reading leaves in the fastest filter; more is smoother but later."""
     coast: Positive = 0.2
-    """Seconds over which tilt may be predicted beyond its newest reading."""
+    """Maximum prediction time beyond the latest tilt reading, s."""
     stale_after: Positive = COMPASS.fresh_for()
-    """Seconds without valid tilt after which the joints return to 0."""
+    """Time without valid tilt after which the joints return to 0, s."""
 
 
 class Joints(NamedTuple):
-    """Of the mount, rad, REP 103."""
+    """Joint angles of the mount (rad), REP 103."""
 
     pitch: float
     roll: float
@@ -85,18 +85,18 @@ SQUARE = Joints(0.0, 0.0)
 
 
 def level(tilt: Tilt) -> Joints:
-    """Joint angles that level the lidar, see the module."""
+    """Return the joint angles that level the lidar; see the module."""
     p, r = tilt.pitch, tilt.roll
     return Joints(pitch=-math.atan2(math.sin(p), math.cos(r) * math.cos(p)), roll=-math.asin(math.sin(r) * math.cos(p)))
 
 
 def goals(tilt: Tilt | None, before: Joints, dt: float, config: StabiliserConfig) -> Joints:
-    """Next goals: towards a level lidar, or to 0 without a tilt.
+    """Return the next goals: towards a level lidar, or to 0 without a tilt.
 
     Args:
-        tilt: of the body when the joints will have followed; None = unknown.
-        before: goals ``dt`` seconds earlier.
-        dt: s.
+        tilt: tilt of the body when the joints will have followed; None if unknown.
+        before: goals ``dt`` s earlier.
+        dt: time step (s).
         config: limits.
     """
     wanted = SQUARE if tilt is None else level(tilt)
@@ -112,7 +112,7 @@ def _towards(before: float, wanted: float, step: float) -> float:
 
 
 class TiltFilter:
-    """Follows valid tilt and predicts it, by the filters whose predictions have lately come true; see the module.
+    """Filter that tracks and predicts valid tilt, weighting filters by their recent predictions; see the module.
 
     Args:
         config: memory and times.
@@ -124,16 +124,16 @@ class TiltFilter:
         # 0.6: each next filter forgets this much of what the one before it forgets
         self._forget: Array = np.asarray((1 - config.memory) * 0.6 ** np.arange(FILTERS, dtype=np.float64))[:, None]
         self._past: deque[tuple[int, Array]] = deque(maxlen=JUDGED)
-        """Stamps and states after the newest readings: angle, rate, acceleration; shape (3, filters, 2 axes)."""
+        """Stamps and states after the latest readings: angle, rate, acceleration; shape (3, filters, 2 axes)."""
         self._errors = np.zeros((FILTERS, 2))
-        """Mean squares of what the filters predicted over that many readings, rad^2."""
+        """Mean squared prediction errors of the filters over that many readings (rad^2)."""
 
     def observe(self, attitude: Attitude, body: BodyAcceleration | None = None) -> None:
-        """Take a reading; invalid and older ones are passed over, after a gap it starts again.
+        """Process a reading; skip invalid and older readings, restart after a gap.
 
         Args:
             attitude: reading.
-            body: how the body has moved, if that is known.
+            body: acceleration of the body, if known.
         """
         if not attitude.tilt_valid or (self._stamp is not None and attitude.stamp <= self._stamp):
             return
@@ -155,7 +155,7 @@ class TiltFilter:
         self._past.append((attitude.stamp, state))
 
     def tilt(self, now: int) -> Tilt | None:
-        """Tilt ``lead`` seconds after ``now`` (ns); None when the newest valid reading is stale."""
+        """Return the tilt ``lead`` s after ``now`` (ns); None if the latest valid reading is stale."""
         if self._stamp is None:
             return None
         age = (now - self._stamp) / SECOND
@@ -174,7 +174,7 @@ def _ahead(state: Array, dt: float) -> Array:
 
 
 def _corrected(state: Array, measured: Array, dt: float, forget: Array) -> Array:
-    """State after a reading ``dt`` seconds later, of filters that forget a share of the past with each."""
+    """Return the state after a reading ``dt`` s later, for filters that forget a fraction of the past per reading."""
     off = measured - _ahead(state, dt)
     _, rate, acceleration = state
     return np.stack(
@@ -187,14 +187,14 @@ def _corrected(state: Array, measured: Array, dt: float, forget: Array) -> Array
 
 
 class StabiliserService:
-    """Publishes joint goals on an absolute schedule.
+    """Service that publishes joint goals on an absolute schedule.
 
     Args:
         config: limits, times.
-        clock: time; the compass's stamps are of the same clock.
-        compass: the body's tilt.
-        odometry: its speeds.
-        out: joint goals.
+        clock: clock, also used for the compass stamps.
+        compass: subscription to the body's tilt.
+        odometry: subscription to the body's speeds.
+        out: publisher of joint goals.
         name: service name.
     """
 
@@ -234,7 +234,7 @@ class StabiliserService:
 
 
 def build_stabiliser(config: StabiliserConfig, clock: Clock, bus: BusPort) -> StabiliserService:
-    """The service with its topics, for the catalog."""
+    """Build the service with its topics, for the catalog."""
     out = bus.publisher(PLAN_STABILISER, Writer.PLANNER)
     compass, odometry = bus.subscribe(COMPASS, latest()), bus.subscribe(ODOMETRY, fifo(KEPT_ODOMETRY))
     return StabiliserService(config, clock, compass, odometry, out)

@@ -1,4 +1,4 @@
-"""What explorers choose from: the frontiers of a map, a viewpoint for each, and the paths there. Loads numba."""
+"""Options of explorers: the frontiers of a map, a viewpoint for each, and the paths there. Loads numba."""
 
 import math
 from dataclasses import dataclass
@@ -31,45 +31,45 @@ from monstertruck_planners.route.heuristic import (
 )
 
 AROUND: Final = 3.0
-"""Distance of a viewpoint from its frontier at most, m."""
+"""Maximum distance of a viewpoint from its frontier (m)."""
 LEAST_NEW_AREA: Final = 0.06
-"""New area that makes a place worth going to, m^2."""
+"""Minimum new area of a viewpoint (m^2)."""
 BEHIND: Final = 4
-"""Coarse cells over which the direction of a path is measured."""
+"""Number of coarse cells used to measure the direction of a path."""
 SIDEWARD: Final = 0.4
-"""A frontier has to lie this far inside the angle of view, rad."""
+"""Margin of a frontier inside the angle of view (rad)."""
 ASIDE: Final = tuple(math.radians(angle) for angle in (0.0, 45.0, -45.0, 90.0, -90.0))
-"""Headings that are tried where the robot has no room to face a frontier, from its direction, rad."""
+"""Headings to try, relative to the direction of the frontier (rad), if the robot has no room to face it."""
 
 
 @dataclass(frozen=True)
 class Frontier:
-    """Cells at the edge of what is known."""
+    """Connected cells at the edge of the known area."""
 
     points: Array
-    """Shape (n, 2): their centres in map, m."""
+    """Cell centres in the map frame (m), shape (n, 2)."""
     middle: Point
-    """The one nearest to their mean, m."""
+    """Cell centre nearest to the mean (m)."""
     length: float
-    """About, m."""
+    """Approximate length (m)."""
 
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """Viewpoints of a frontier; they are valid as long as nothing changes around it."""
+    """Viewpoints of a frontier; valid until the map changes around it."""
 
     change: int
-    """The newest one of the map."""
+    """Number of the latest map change."""
     reached: int
-    """Coarse cells round it that could be reached."""
+    """Number of reachable coarse cells around the frontier."""
     places: Array = attribute(default_factory=lambda: np.empty((0, 2)))
-    """Shape (n, 2), m."""
+    """Positions (m), shape (n, 2)."""
     bearings: Array = attribute(default_factory=lambda: np.empty(0))
-    """Directions of the frontier from there, shape (n,), rad."""
+    """Directions of the frontier from the positions (rad), shape (n,)."""
     headings: Array = attribute(default_factory=lambda: np.empty(0))
-    """With these it is in view and the robot has room, shape (n,), rad."""
+    """Headings with the frontier in view and room for the robot (rad), shape (n,)."""
     gains: Array = attribute(default_factory=lambda: np.empty(0))
-    """New area that is seen with that heading, shape (n,), m^2."""
+    """New area seen with these headings (m^2), shape (n,)."""
 
 
 @dataclass(frozen=True)
@@ -79,54 +79,54 @@ class Option:
     frontier: Frontier
     pose: Pose2
     path_length: float
-    """Metres, dearer in narrow places."""
+    """Path length (m), with a penalty in narrow places."""
     gain: float
-    """New area that may be seen, m^2."""
+    """Expected new area (m^2)."""
     turn: float
-    """Angle between the robot's heading and the path's first part, rad, 0 to pi."""
+    """Angle between the heading of the robot and the first part of the path (rad), 0 to pi."""
 
     @property
     def target(self) -> Viewpoint:
-        """What is asked of the goal service."""
+        """Viewpoint for the goal service."""
         return Viewpoint(self.pose, self.frontier.middle, self.path_length, self.gain)
 
 
 class Explorer(Protocol):
-    """Chooses the next viewpoint; asked repeatedly while the robot drives."""
+    """Chooses the next viewpoint; called repeatedly while the robot drives."""
 
     def choose(
         self, view: "ExplorationView", pursued: Viewpoint | None, still: Option | None, seconds: float
     ) -> Viewpoint | None:
-        """The next viewpoint; ``pursued`` itself to go on.
+        """Return the next viewpoint; ``pursued`` itself to continue.
 
         Args:
-            view: the map, and its options.
-            pursued: where the robot is going.
-            still: the option which that is by now; None = its frontier is gone.
-            seconds: for how long it has been pursued.
+            view: map and options.
+            pursued: current viewpoint.
+            still: option that now corresponds to ``pursued``; None if its frontier is gone.
+            seconds: time since the robot set course for ``pursued`` (s).
         """
 
 
 @dataclass
 class Remembered:
-    """What is computed again only where the map differs."""
+    """Cached results, recomputed only where the map has changed."""
 
     route_map: RouteMap | None = None
     looks: dict[bytes, Viewpoints] = attribute(default_factory=dict)
-    """By a frontier's cells."""
+    """Viewpoints by the cells of a frontier."""
 
 
 @dataclass
 class ExplorationView:
-    """The map as an explorer sees it.
+    """Map as seen by an explorer.
 
     Args:
-        known: the map.
+        known: map with its frontiers.
         setup: robot, sensor and settings.
-        pose: of the base, in map.
-        banned: frontiers here are no options.
-        avoided: no place to look from is here.
-        memory: of the view before.
+        pose: pose of the base in the map frame.
+        banned: places whose frontiers are not options.
+        avoided: places without viewpoints.
+        memory: cache of the previous view.
     """
 
     known: FrontierMap
@@ -137,7 +137,7 @@ class ExplorationView:
     memory: Remembered
     options: list[Option] = attribute(init=False, default_factory=list)
     left_alone: int = attribute(init=False, default=0)
-    """Banned frontiers."""
+    """Number of banned frontiers."""
 
     def __post_init__(self) -> None:
         setup, known = self.setup, self.known
@@ -160,7 +160,7 @@ class ExplorationView:
     # Path lengths
 
     def path_length_to(self, place: Point) -> float | None:
-        """Metres from the robot to a place, dearer where it is narrow; None = no path is known."""
+        """Return the path length to a place (m), with a penalty in narrow places; None if no path is known."""
         if self._to_go is None:
             return None
         at = self._open_cell(self._cell_cost, self._cell, place)
@@ -168,11 +168,11 @@ class ExplorationView:
         return None if cost >= UNREACHED else cost * self._cell / UNIT
 
     def free(self, poses: Array) -> NDArray[np.bool_]:
-        """Whether the robot can stand at poses, shape (n, 3): (n,)."""
+        """Return whether the robot can stand at each pose; poses of shape (n, 3), result of shape (n,)."""
         return np.asarray(self._route_map.field.free(self.setup.footprint, poses, self.setup.margin), np.bool_)
 
     def path_lengths_between(self, options: list[Option]) -> Array:
-        """Metres from each option's place to each other's, shape (n, n); inf where no path is known."""
+        """Return the path lengths between all options (m), shape (n, n); inf if no path is known."""
         if self._rough is None:
             self._rough = joined_cells(self._cell_cost)
         cell = 2 * self._cell
@@ -196,9 +196,9 @@ class ExplorationView:
         return to_go
 
     def _open_cell(self, cell_cost: NDArray[np.int16], cell: float, place: Point) -> tuple[int, int] | None:
-        """The open cell nearest to a place, if there is one nearby."""
+        """Return the open cell nearest to a place, if there is one nearby."""
         row, column = cell_at(self._field, cell, *place)
-        reach = math.ceil(0.6 / cell)  # a path begins at an open cell this near to the robot, m
+        reach = math.ceil(0.6 / cell)  # maximum distance from the robot to the open cell that starts a path (m)
         top, left = max(row - reach, 0), max(column - reach, 0)
         rows, columns = np.nonzero(cell_cost[top : max(row + reach + 1, 0), left : max(column + reach + 1, 0)])
         if not len(rows):
@@ -213,14 +213,14 @@ class ExplorationView:
         seen: dict[bytes, Viewpoints] = {}
         reached = to_go.cost < UNREACHED
         for frontier in self._frontiers():
-            # 0.5: frontiers whose centre is this near to a banned place are skipped, m
+            # 0.5: frontiers with their centre within this distance of a banned place are skipped (m)
             if any(math.dist(frontier.middle, place) < 0.5 for place in self.banned):
                 self.left_alone += 1
                 continue
             key = (frontier.points + self.known.resolution / 4).round(2).tobytes()
             near = self._reached_near(reached, frontier)
             look = self.memory.looks.get(key)
-            # 1.0: a result is valid until something changes within this distance of such places, m
+            # 1.0: a result is valid until the map changes within this distance of such places (m)
             if (
                 look is None
                 or look.reached != len(near)
@@ -235,7 +235,7 @@ class ExplorationView:
         return options
 
     def _centres(self, coarse: NDArray[np.int64]) -> Array:
-        """Middles of coarse cells (row, column), shape (n, 2), m."""
+        """Return the centres of coarse cells (row, column) (m), shape (n, 2)."""
         return np.asarray((coarse[:, ::-1] + 0.5) * self._cell + (self._field.x, self._field.y), dtype=np.float64)
 
     def _frontiers(self) -> list[Frontier]:
@@ -251,12 +251,12 @@ class ExplorationView:
         if not len(of):
             return []
         centres = (np.column_stack((columns, rows)) + 0.5) * resolution + known.origin[:2]
-        # Between obstacles too close for the robot nothing is to be reached.
+        # Frontiers between obstacles too close together for the robot are unreachable.
         roomy = far_from_obstacles(known.cells, rows, columns, self._passable / resolution)
         result = []
         order = np.argsort(of, kind="stable")
         for group in np.split(order, np.flatnonzero(np.diff(of[order])) + 1):
-            for part in _divided(centres[group], 2.5):  # frontiers longer than this are divided, m
+            for part in _divided(centres[group], 2.5):  # maximum length of a frontier before it is divided (m)
                 members = group[part]
                 if len(members) < least or not roomy[members].any():
                     continue
@@ -270,7 +270,7 @@ class ExplorationView:
         return self.setup.footprint.half_width - self.known.resolution / 2
 
     def _reached_near(self, reached: NDArray[np.bool_], frontier: Frontier) -> NDArray[np.int64]:
-        """Coarse cells (row, column) that can be reached, in a square round a frontier, shape (n, 2)."""
+        """Return the reachable coarse cells (row, column) in a square around a frontier, shape (n, 2)."""
         row, column = cell_at(self._field, self._cell, *frontier.middle)
         reach = math.ceil(AROUND / self._cell)
         top, left = max(row - reach, 0), max(column - reach, 0)
@@ -279,9 +279,9 @@ class ExplorationView:
         return near
 
     def _look(self, frontier: Frontier, near: NDArray[np.int64]) -> Viewpoints:
-        """Places with room, from which enough of a frontier is in sight, and nearly as much new area as from the best.
+        """Find places with room, a view of enough of the frontier, and nearly as much new area as the best place.
 
-        Free space is checked first: the places that show most are often those at the edge of unknown ground, which
+        Free space is checked first: the places with the best view are often at the edge of unknown ground, which
         blocks.
         """
         config, resolution, corner = self.setup.config, self.known.resolution, self.known.origin[:2]
@@ -293,24 +293,24 @@ class ExplorationView:
         places, bearings, headings = self._with_room(places, frontier)
         if not len(places):
             return Viewpoints(change, reached)
-        some = _spread(len(places), 160)  # viewpoints compared for each frontier by how much of it is visible
+        some = _spread(len(places), 160)  # viewpoints per frontier compared by the visible share of it
         places, bearings, headings = places[some], bearings[some], headings[some]
-        sample = frontier.points[_spread(len(frontier.points), 12)]  # cells of a frontier whose visibility is tested
+        sample = frontier.points[_spread(len(frontier.points), 12)]  # frontier cells tested for visibility
         here, there = ((v - corner) / resolution for v in (places, sample))
-        # 0.5: margin on the sensor's range for visibility, m
+        # 0.5: margin on the sensor range for visibility (m)
         share = shares_seen(self.known.cells, here, there, (config.reach - 0.5) / resolution)
         if share.max(initial=0.0) == 0.0:
             return Viewpoints(change, reached)
-        good = np.flatnonzero(share >= min(0.6, float(share.max())))  # least share of a frontier that must be visible
-        good = good[_spread(len(good), 32)]  # the best of these that are compared by the new area seen
+        good = np.flatnonzero(share >= min(0.6, float(share.max())))  # minimum visible share of a frontier
+        good = good[_spread(len(good), 32)]  # number of these compared by new area
         gains = self.gains(np.column_stack((places[good], headings[good])))
-        # 0.6: places that show less than this share of what the best one shows are passed over
+        # 0.6: minimum new area relative to the best place
         worth = gains >= max(0.6 * float(gains.max()), LEAST_NEW_AREA)
         good = good[worth]
         return Viewpoints(change, reached, places[good], bearings[good], headings[good], gains[worth])
 
     def _with_room(self, places: Array, frontier: Frontier) -> tuple[Array, Array, Array]:
-        """Those of the places (n, 2) that the footprint has room at, directions of a frontier from there, headings."""
+        """Return the places (n, 2) with room for the footprint, the directions of the frontier there, and headings."""
         bearings = np.arctan2(*(frontier.middle - places).T[::-1])
         aside = [angle for angle in ASIDE if abs(angle) < self.setup.config.view / 2 - SIDEWARD or angle == 0.0]
         headings = bearings[:, None] + aside
@@ -321,7 +321,7 @@ class ExplorationView:
         return places[room], bearings[room], headings[room, first]
 
     def _option(self, frontier: Frontier, look: Viewpoints, to_go: CostToGo) -> Option | None:
-        """The nearest viewpoint of a frontier."""
+        """Return the nearest viewpoint of a frontier."""
         if not len(look.places):
             return None
         rows, columns = np.floor((look.places - (self._field.x, self._field.y)) / self._cell).astype(int).T[::-1]
@@ -330,7 +330,7 @@ class ExplorationView:
             if cost[i] >= UNREACHED:
                 break
             x, y = look.places[i].tolist()
-            # 0.25: metres round an avoided place without viewpoints
+            # 0.25: radius around an avoided place without viewpoints (m)
             if any(math.dist((x, y), place) <= 0.25 for place in self.avoided):
                 continue
             at = int(rows[i]), int(columns[i])
@@ -342,19 +342,19 @@ class ExplorationView:
         return None
 
     def gains(self, poses: Array) -> Array:
-        """New area seen from poses of the base, shape (n, 3): m^2, shape (n,)."""
+        """Return the new area seen from each base pose (m^2), shape (n,); poses of shape (n, 3)."""
         config, resolution = self.setup.config, self.known.resolution
         mx, my, turn = self.setup.lidar
         c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
         sensor = np.column_stack((poses[:, 0] + c * mx - s * my, poses[:, 1] + s * mx + c * my, poses[:, 2] + turn))
         sensor[:, :2] = (sensor[:, :2] - self.known.origin[:2]) / resolution
-        depth = getattr(config, "depth", 1.0)  # see ``new_area``, m
+        depth = getattr(config, "depth", 1.0)  # see ``new_area`` (m)
         cells = new_areas(self.known.cells, sensor, config.view, config.reach / resolution, depth / resolution, 96)
         area: Array = cells * resolution**2
         return area
 
     def _heading(self, to_go: CostToGo, at: tuple[int, int], bearing: float) -> float:
-        """That of the path to a coarse cell, if a frontier in that direction is in view then; else towards it."""
+        """Return the arrival heading at a coarse cell if it has a frontier at ``bearing`` in view, else ``bearing``."""
         before = cell_ahead(to_go.step, *at, float(BEHIND))
         if before == at:
             return bearing
@@ -363,7 +363,7 @@ class ExplorationView:
         return arriving if in_view else bearing
 
     def _turn(self, to_go: CostToGo, at: tuple[int, int]) -> float:
-        """Angle between the robot's heading and the beginning of the path to a coarse cell, rad."""
+        """Return the angle between the heading of the robot and the first part of the path to a cell (rad)."""
         trail = cells_to_goal(to_go.step, *at)
         if len(trail) < 2:
             return 0.0
@@ -373,12 +373,12 @@ class ExplorationView:
 
 
 def _spread(count: int, most: int) -> NDArray[np.intp]:
-    """At most so many numbers below ``count``, evenly."""
+    """Return at most ``most`` evenly spaced numbers below ``count``."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))
 
 
 def _divided(points: Array, longest: float) -> list[NDArray[np.intp]]:
-    """Numbers of the points, shape (n, 2), in parts no longer than that, m: halved across their longer direction."""
+    """Split points (n, 2) into parts no longer than ``longest`` (m) by halving; return their indices."""
     waiting, parts = [np.arange(len(points))], []
     while waiting:
         part = waiting.pop()
@@ -395,9 +395,9 @@ def _divided(points: Array, longest: float) -> list[NDArray[np.intp]]:
 
 
 def make_explorer(config: ExplorerConfig) -> Explorer:
-    """Explorer of a configuration.
+    """Create the explorer of a configuration.
 
     Raises:
-        InputError: settings without a kind of explorer, or what it needs is not installed.
+        InputError: settings without a kind of explorer, or a missing dependency.
     """
     return cast("Explorer", EXPLORERS.implementation(config)(config))

@@ -1,4 +1,4 @@
-"""Exploration by ``kind``: which frontier is visited next."""
+"""Explorers by ``kind``, which choose the next frontier."""
 
 from typing import Annotated, Final
 
@@ -37,7 +37,7 @@ EXPLORERS: Final = Catalog(
     ),
     base=ExplorerConfig,
 )
-"""An explorer is made from its settings; it is an ``Explorer``."""
+"""Catalog of explorers; each implements ``Explorer`` and is created from its settings."""
 
 AnyExplorer = Annotated[ExplorerConfig, EXPLORERS.section("information")]
-"""The configuration's section `explorer`."""
+"""Section `explorer` of the configuration."""

@@ -1,4 +1,4 @@
-"""Inputs and outputs of the exploring step; light, as the daemon's loop imports them."""
+"""Inputs and outputs of the exploring step; lightweight, as the daemon's loop imports them."""
 
 from dataclasses import dataclass
 
@@ -9,98 +9,98 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Grid
 
 Point = tuple[float, float]
-"""x, y, m."""
+"""x, y (m)."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraView:
-    """What the camera is good for where tags are looked for."""
+    """Camera data for the search for tags."""
 
     mount: Pose2 = (0.18, 0.0, 0.0)
-    """In base."""
+    """Camera pose in base."""
     view: float = 0.95
-    """Angle of view that is counted on, rad."""
+    """Usable angle of view (rad)."""
     reach: float = 1.4
-    """Greatest distance, m."""
+    """Maximum distance of a wall (m)."""
     nearest: float = 0.25
-    """Distance of the nearest wall, m."""
+    """Minimum distance of a wall (m)."""
     oblique: float = 0.75
-    """Greatest angle from a wall's normal, rad."""
+    """Maximum angle from the normal of a wall (rad)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExploreSetup:
-    """What exploring is made for; comes first, and again after every restart."""
+    """Settings and robot data of the exploring step; sent first, and again after every restart."""
 
     config: AnyExplorer
     footprint: Footprint
     radius: float
-    """Least turning radius, m."""
+    """Minimum turning radius (m)."""
     margin: float = 0.04
-    """Kept to obstacles by the routes, m."""
+    """Clearance of routes from obstacles (m)."""
     lidar: Pose2 = (0.0, 0.0, 0.0)
-    """In base."""
+    """Lidar pose in base."""
     camera: CameraView = CameraView()
 
 
 @dataclass(frozen=True, slots=True)
 class ExploreTask:
-    """What is newer than at the task before, and whether a decision is requested."""
+    """Data newer than the previous task, and whether a decision is requested."""
 
     pose: Pose2
-    """Of the base, in map."""
+    """Pose of the base in the map frame."""
     whole: Grid | None = None
-    """A whole map, which replaces the last one."""
+    """Whole map, which replaces the previous one."""
     tiles: tuple[Grid, ...] = ()
-    """Tiles that are newer than the whole map."""
+    """Tiles newer than the whole map."""
     setup: ExploreSetup | None = None
     choose: bool = False
-    """Say where to look next."""
+    """Choose the next viewpoint."""
     current: "Viewpoint | None" = None
-    """Where the robot is going."""
+    """Viewpoint the robot is driving to."""
     pursued: float = 0.0
-    """Time for which it has been pursued, s."""
+    """Time since the robot set course for ``current`` (s)."""
     banned: tuple[Point, ...] = ()
-    """Frontiers here are skipped."""
+    """Places whose frontiers are skipped."""
     avoided: tuple[Point, ...] = ()
-    """No viewpoints here: these places could not be reached."""
+    """Unreachable places, where no viewpoints are placed."""
     home: Pose2 | None = None
-    """The path there is wanted."""
+    """Home pose, if the path to it is requested."""
     find: bool = False
-    """Walls are looked at, too, once no frontier is left."""
+    """Whether walls are viewed once no frontier is left."""
 
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
-    """A place to look from, and what for."""
+    """Viewpoint and its frontier."""
 
     pose: Pose2
-    """Of the base, in map."""
+    """Pose of the base in the map frame."""
     frontier: Point
-    """Centre of the frontier or wall that is viewed."""
+    """Centre of the viewed frontier or wall."""
     path_length: float = 0.0
-    """Length of the path to a viewpoint, m."""
+    """Path length to the viewpoint (m)."""
     gain: float = 0.0
-    """New area that may be seen there, m^2."""
+    """Expected new area (m^2)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExploreAnswer:
-    """What is known, and the decision."""
+    """Decision and state of the map."""
 
     target: Viewpoint | None = None
-    """None = nothing is left that can be reached, or none was requested."""
+    """Chosen viewpoint; None if no reachable one is left or none was requested."""
     kept: bool = False
-    """Whether it is the pursued one."""
+    """Whether ``target`` is the current viewpoint."""
     frontiers: int = 0
-    """Frontiers that can be reached."""
+    """Number of reachable frontiers."""
     banned: int = 0
-    """Others that are skipped for now."""
+    """Number of other frontiers that are skipped for now."""
     known: float = 0.0
-    """Area of the free ground in the map, m^2."""
+    """Area of free ground in the map (m^2)."""
     home: float | None = None
-    """Metres of the path home; None = not requested, or none is known."""
+    """Length of the path home (m); None if not requested or if no path is known."""
     failure: Reason | None = None
-    """Why there is no decision; None = there is one."""
+    """Why there is no decision, or None."""
     text: str = ""
-    """The same in words."""
+    """Description of the failure."""

@@ -1,7 +1,7 @@
-"""One exploration: a pure state machine. Equal observations give equal decisions.
+"""Pure state machine of one exploration: equal observations give equal decisions.
 
-It asks for the next viewpoint, again while the robot drives, sends goals, keeps a blacklist of places that cannot be
-reached, drives home, and has the map saved. Every decision is reported with its reason.
+It requests the next viewpoint, also while the robot drives, sends goals, keeps a blacklist of unreachable places,
+drives home, and has the map saved. Every decision is reported with its reason.
 """
 
 import math
@@ -18,50 +18,50 @@ from monstertruck_schemas.plan import ExplorationPhase
 from monstertruck_schemas.reasons import Reason
 
 MAPPING_TIME: Final = 1.5
-"""Seconds after a goal until the map contains what is seen there."""
+"""Time after a goal until the map contains the view from there (s)."""
 CONFIRM: Final = 2
-"""Evaluations in a row without a frontier after which the exploration ends."""
+"""Number of consecutive evaluations without a frontier that end the exploration."""
 RETURNS: Final = 6
-"""Attempts to drive home."""
+"""Maximum number of attempts to drive home."""
 NEAR_START: Final = 1.0
-"""Distance from a blocked start, as at a wall, within which the robot counts as back, m."""
+"""Maximum distance of a robot that is back at a blocked start, for example at a wall (m)."""
 AGAIN: Final = 2.0
-"""Seconds from a refused goal to the next one; while driving home twice as many after each failure."""
+"""Delay from a refused goal to the next (s); doubled after each failure while driving home."""
 STANDS: Final = 5.0
-"""Seconds that a lost robot waits before it drives a little."""
+"""Waiting time of a lost robot before it drives a short distance (s)."""
 STUCK: Final = 3
-"""Goals in a row that fail at one place after which the robot drives back out of it."""
+"""Number of consecutive failed goals at one place until the robot drives back out of it."""
 LEFT: Final = 0.3
-"""Distance from there from which on the robot has left that place, m."""
+"""Minimum distance of a robot that has left that place (m)."""
 TRAIL: Final = 0.5
-"""Distance between the poses kept for driving back, m."""
+"""Distance between the poses kept for driving back (m)."""
 REMEMBERED: Final = 8
-"""Poses kept for driving back."""
+"""Number of poses kept for driving back."""
 PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
-"""Outcomes of a goal that do not depend on its place."""
+"""Goal outcomes that do not depend on the place."""
 BROKEN: Final = frozenset({Reason.WORKER_DIED, Reason.WORKER_TIMEOUT})
-"""Refusals of any goal, by a planner that does not start; of a goal that was planned they may be its place's."""
+"""Refusals by a planner that does not start, for any goal; after planning, the place may be the cause."""
 HOPELESS: Final = frozenset({Reason.DISARMED, Reason.ESTOPPED, Reason.BUSY})
-"""Outcomes of a goal that would be the same at any other place."""
+"""Goal outcomes that would be the same at any other place."""
 
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """A place that could not be reached, or from which nothing new was seen."""
+    """Place that could not be reached or showed nothing new."""
 
     place: Point
     count: int
     until: float
-    """On the blacklist until then, s; +inf: to the end of the exploration."""
+    """End of the blacklisting (s); +inf: until the exploration ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class Attempts:
-    """The blacklist of an exploration.
+    """Blacklist of an exploration.
 
     Args:
-        period: seconds on the blacklist after a failed attempt.
-        most: failed attempts after which a place stays on it.
+        period: time on the blacklist after a failed attempt (s).
+        most: number of failed attempts until a place stays on the blacklist.
     """
 
     period: float
@@ -69,8 +69,8 @@ class Attempts:
     places: tuple[Attempt, ...] = ()
 
     def failed(self, place: Point, now: float, *, ignore_first: bool = False) -> "Attempts":
-        """With one more failed attempt at a place; ``ignore_first``: the first has no effect yet."""
-        # 0.5: places this near to each other count as one, m
+        """Return the list with one more failed attempt at a place; ``ignore_first``: the first has no effect."""
+        # 0.5: places within this distance of each other are one place (m)
         before = next((attempt for attempt in self.places if math.dist(attempt.place, place) < 0.5), None)
         count = 1 if before is None else before.count + 1
         until = math.inf if count >= self.most else now if ignore_first and count == 1 else now + self.period
@@ -78,11 +78,11 @@ class Attempts:
         return replace(self, places=(*others, Attempt(place, count, until)))
 
     def banned(self, now: float) -> tuple[Point, ...]:
-        """Places on the blacklist at ``now``, s."""
+        """Return the places on the blacklist at ``now`` (s)."""
         return tuple(attempt.place for attempt in self.places if now < attempt.until)
 
     def released(self, now: float) -> "Attempts | None":
-        """With all temporary entries expired; None = there are none. For a robot that has no other place to go."""
+        """Return the list with all temporary entries expired, or None without any; used when no other place is left."""
         if not any(now < attempt.until < math.inf for attempt in self.places):
             return None
         return replace(
@@ -92,7 +92,7 @@ class Attempts:
 
 @dataclass(frozen=True, slots=True)
 class Choose:
-    """Ask for the next viewpoint."""
+    """Request the next viewpoint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,17 +104,17 @@ class Go:
 
 @dataclass(frozen=True, slots=True)
 class Cancel:
-    """Give up the goal that is pursued."""
+    """Cancel the current goal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Save:
-    """Have the map saved."""
+    """Request saving the map."""
 
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """An event."""
+    """Event to report."""
 
     reason: Reason
     severity: Severity
@@ -126,46 +126,46 @@ Action = Choose | Go | Cancel | Save | Notice
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """What is known at one instant."""
+    """Observations at one instant."""
 
     now: float
-    """Seconds."""
+    """Time (s)."""
     pose: Pose2 | None
-    """Of the base, in map; None = not known, or not to be trusted."""
+    """Pose of the base in the map frame; None if unknown or unreliable."""
     believed: Pose2 | None = None
-    """The pose even if it is not to be trusted."""
+    """Pose of the base, even if unreliable."""
     ended: Reason | None = None
-    """How the newest goal ended; None = it is pursued, or there was none."""
+    """Outcome of the latest goal; None while it is active, or without a goal."""
     ended_text: str = ""
     refused: bool = False
-    """It was not taken, and did not end."""
+    """Whether the goal was refused, so ``ended`` is a refusal."""
     displaced: str = ""
-    """Who took the goal over."""
+    """Source whose goal replaced it."""
     paused: bool = False
-    """The goal that was sent is paused."""
+    """Whether the goal is paused."""
     answer: ExploreAnswer | None = None
-    """To the last question, once."""
+    """Answer to the last request, passed once."""
     charge: float | None = None
-    """Charge of the battery, 0 to 1; None = not measured."""
+    """Battery charge, 0 to 1; None if not measured."""
     low: bool = False
-    """The battery's voltage is low."""
+    """Whether the battery voltage is low."""
     estopped: bool = False
-    """The emergency stop is latched."""
+    """Whether the emergency stop is latched."""
     critical: bool = False
-    """Whether the charge is too low to drive: the gate stops, and an unsaved map may be lost."""
+    """Whether the charge is too low to drive: the gate stops the robot, and an unsaved map may be lost."""
     saved: str | None = None
-    """Where the map was saved after that was requested; empty = nowhere."""
+    """Path of the map saved after the request; empty if it was not saved, None if pending."""
     save_failure: str = ""
-    """Why it was saved nowhere."""
+    """Why the map was not saved."""
     failed: str = ""
-    """Which service failed for good and why, where the robot cannot drive to goals without it."""
+    """Permanently failed services that goals need, and why they failed."""
     found: int = 0
-    """Points of interest that are known."""
+    """Number of known points of interest."""
 
 
 @dataclass(frozen=True, slots=True)
 class Exploration:
-    """One exploration and how far it has come."""
+    """An exploration and its progress."""
 
     number: int
     source: str
@@ -173,70 +173,70 @@ class Exploration:
     returns: bool
     """Whether the robot drives home at the end."""
     budget: float
-    """Seconds."""
+    """Maximum duration (s)."""
     begun: float
     now: float
     attempts: Attempts
-    """At frontiers."""
+    """Failed attempts at frontiers."""
     unreached: Attempts
-    """At places to look from."""
+    """Failed attempts at viewpoints."""
     find: int | None = None
-    """Number of points of interest at which it ends; None = not limited."""
+    """Number of points of interest that ends the exploration; None for no limit."""
     found: int = 0
-    """Points of interest that are known."""
+    """Number of known points of interest."""
     phase: ExplorationPhase = ExplorationPhase.LOOKING
     since: float = 0.0
-    """Begin of the phase, s."""
+    """Start of the phase (s)."""
     outcome: Reason = Reason.DRIVING
     text: str = ""
     final: Reason = Reason.DRIVING
-    """The outcome after driving home."""
+    """Outcome after driving home."""
     final_text: str = ""
     target: Viewpoint | None = None
     pursued: float = 0.0
-    """Since when, s."""
+    """Start of driving to ``target`` (s)."""
     asked: float = -math.inf
-    """When a decision was requested last, s."""
+    """Time of the last request for a decision (s)."""
     waiting: bool = False
-    """Whether an answer is awaited."""
+    """Whether an answer is pending."""
     not_before: float = 0.0
-    """Time before which no decision and no goal for driving home is requested, s."""
+    """Earliest time of the next request for a decision or of a goal for driving home (s)."""
     nothing: int = 0
-    """Answers in a row without a viewpoint."""
+    """Number of consecutive answers without a viewpoint."""
     newest: ExploreAnswer = field(default_factory=ExploreAnswer)
     travelled: float = 0.0
-    """Metres, by poses 3 cm apart."""
+    """Distance travelled (m), summed over poses 3 cm apart."""
     counted: Pose2 | None = None
-    """The last of these."""
+    """Last pose included in ``travelled``."""
     before: Pose2 | None = None
     trail: tuple[Pose2, ...] = ()
-    """Where it came from, the newest last."""
+    """Recent poses, latest last."""
     near_home: tuple[Pose2, ...] = ()
-    """Where it passed first within ``NEAR_START`` of its start, 0.25 m apart."""
+    """First poses within ``NEAR_START`` of the start, 0.25 m apart."""
     stuck: int = 0
-    """Goals in a row that failed where the robot stands."""
+    """Number of consecutive failed goals at the place of the robot."""
     stuck_at: Pose2 | None = None
-    """Where the robot stands then."""
+    """Pose of the robot at these failures."""
     blameless: tuple[Attempts, Attempts] | None = None
-    """At frontiers and at places to look from, before these goals."""
+    """Values of ``attempts`` and ``unreached`` before these failures."""
     backing: bool = False
-    """The goal is one it came from."""
+    """Whether the robot is driving back to an earlier pose."""
     charge: float | None = None
-    """At the start."""
+    """Battery charge at the start."""
     goals: int = 0
     failures: int = 0
     home_goals: int = 0
     blocked: int = 0
-    """Of them: at which the robot cannot stand."""
+    """Number of blocked home goals, where the robot cannot stand."""
     looks: int = 0
-    """Short drives since the robot was lost."""
+    """Number of short drives since the robot lost its pose."""
     came_from: Pose2 | None = None
-    """Where the newest of these began, and whether the robot has to drive back there."""
+    """Start pose of the latest short drive; ``goes_back``: whether the robot must drive back there."""
     goes_back: bool = False
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the exploration has not ended."""
         return self.phase is not ExplorationPhase.IDLE
 
 
@@ -247,7 +247,7 @@ def begin(
     number: int, source: str, pose: Pose2, now: float, config: ExplorerConfig, *, home: bool, budget: float,
     find: int | None = None,
 ) -> Step:  # fmt: skip
-    """Take on an exploration."""
+    """Start an exploration."""
     none = Attempts(config.blacklist, config.attempts)
     run = Exploration(number, source, pose, home, budget, now, now, none, none, find, since=now)
     text = f"{config.kind}, for {budget:g} s at most{', then home' if home else ''}, asked for by {source}"
@@ -255,13 +255,13 @@ def begin(
 
 
 def stop(run: Exploration, source: str, now: float) -> Step:
-    """End it where the robot is."""
+    """End the exploration at the current place."""
     run = replace(run, now=now)
     return _end(run, Reason.CANCELLED, f"stopped by {source}", Cancel(), Save())
 
 
 def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
-    """One step with new observations."""
+    """Advance the state machine with new observations."""
     run = _moved(replace(run, now=seen.now, found=seen.found), seen)
     if seen.answer is not None:
         run = replace(run, newest=_merged(run.newest, seen.answer), waiting=False)
@@ -288,7 +288,7 @@ def tick(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
 
 
 def _stopped(seen: Observed) -> tuple[Reason, str] | None:
-    """Why it ends where the robot stands."""
+    """Return why the exploration ends at the current place, or None."""
     if seen.estopped:
         return Reason.ESTOPPED, Reason.ESTOPPED.text
     if seen.critical:
@@ -300,7 +300,7 @@ def _moved(run: Exploration, seen: Observed) -> Exploration:
     counted, distance = run.counted, 0.0
     if counted is None or seen.pose is None:
         counted = seen.pose
-    # 0.03: motion that counts, m: the pose of a standing robot moves by some millimetres with every scan
+    # 0.03: minimum motion (m): the pose of a standing robot moves by some millimetres with every scan
     elif (moved := math.dist(counted[:2], seen.pose[:2])) >= 0.03:
         counted, distance = seen.pose, moved
     charge = seen.charge if run.charge is None else run.charge
@@ -314,23 +314,23 @@ def _moved(run: Exploration, seen: Observed) -> Exploration:
 
 
 def _near_home(run: Exploration, pose: Pose2 | None) -> tuple[Pose2, ...]:
-    """Where a robot that set out has been: what it could not see behind itself at its start, it passed over there."""
+    """Return the first poses after the start; there the robot passed over ground it could not see behind itself."""
     places = run.near_home
-    if pose is None or len(places) == 3 or math.dist(pose[:2], run.home[:2]) > NEAR_START:  # how many of them
+    if pose is None or len(places) == 3 or math.dist(pose[:2], run.home[:2]) > NEAR_START:  # number of poses kept
         return places
     apart = min(math.dist(pose[:2], place[:2]) for place in (run.home, *places))
-    return (*places, pose) if apart >= 0.25 else places  # distance between the places beside the start that are kept, m
+    return (*places, pose) if apart >= 0.25 else places  # minimum distance between the poses (m)
 
 
 def _merged(before: ExploreAnswer, answer: ExploreAnswer) -> ExploreAnswer:
-    """The newest answer; the path home is kept from before if none is found now, everything if there is none."""
+    """Return the new answer, with the previous path home if it has none; the previous answer after a failure."""
     if answer.failure is not None:
         return before
     return answer if answer.home is not None else replace(answer, home=before.home)
 
 
 def _enough(run: Exploration, seen: Observed, config: ExplorerConfig) -> tuple[Reason, str] | None:
-    """Why the exploring ends now."""
+    """Return why the exploring ends now, or None."""
     if run.find is not None and seen.found >= run.find:
         return Reason.POINTS_FOUND, f"{seen.found} points of interest"
     if run.now - run.begun > run.budget:
@@ -347,9 +347,9 @@ def _enough(run: Exploration, seen: Observed, config: ExplorerConfig) -> tuple[R
 
 
 def charge_per_metre(run: Exploration, charge: float, config: ExplorerConfig) -> float:
-    """Share of the charge that a metre takes: as measured, once enough was used; until then as configured."""
+    """Return the fraction of the charge used per metre: measured after sufficient use, before that as configured."""
     used = (run.charge or 0.0) - charge
-    # 0.05: share of the charge used from which on the use per metre counts as measured
+    # 0.05: minimum fraction of the charge used for a measured use per metre
     measured = used >= 0.05 and run.travelled > 0.0
     return used / run.travelled if measured else 1.0 / config.full_range
 
@@ -363,7 +363,7 @@ def _looking(run: Exploration, seen: Observed) -> Step:
     if answer.target is not None:
         return _go(run, answer.target)
     if answer.known == 0.0:
-        if run.now - run.since > 30.0:  # seconds to wait for a first map
+        if run.now - run.since > 30.0:  # timeout (s) for a first map
             return _finish(run, answer.failure or Reason.NO_MAP, answer.text or "no map to explore")
         return replace(run, not_before=run.now + 1.0), ()
     if run.nothing + 1 < CONFIRM:
@@ -420,7 +420,7 @@ def _driving(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
 
 
 def _counted(run: Exploration, seen: Observed, *, reached: bool) -> Exploration:
-    """With the goal that ended counted, if it failed where others did before."""
+    """Count the ended goal if it failed at the place of the previous failures."""
     if reached:
         return replace(run, stuck=0)
     assert seen.pose is not None
@@ -431,9 +431,9 @@ def _counted(run: Exploration, seen: Observed, *, reached: bool) -> Exploration:
 
 
 def _back(run: Exploration) -> Step | None:
-    """Drive back to where it came from, as no place can be reached from here; None = nowhere is left to drive back to.
+    """Drive back along the trail, as no place is reachable from here; return None if there is no earlier pose.
 
-    The places are not to blame: they are as before.
+    The failed places are not the cause, so the blacklist is restored.
     """
     assert run.before is not None
     assert run.blameless is not None
@@ -480,8 +480,8 @@ def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
         return run, ()
     if run.goes_back and run.came_from is not None:
         return replace(run, target=Viewpoint(run.came_from, run.came_from[:2])), (Go(run.came_from),)
-    # poses in base to which a lost robot drives in turn, and back, to see more; not backward, where no scan has seen
-    # the ground
+    # poses in base that a lost robot visits in turn, driving back each time, to see more; never behind it, as no scan
+    # has seen the ground there
     around = ((0.6, 0.0, 0.0), (0.6, 0.25, 0.8), (0.6, -0.25, -0.8))
     x, y, yaw = placed(np.array((around[run.looks % len(around)],)), seen.believed)[0].tolist()
     pose = x, y, math.remainder(yaw, math.tau)
@@ -491,7 +491,7 @@ def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
 
 
 def _finish(run: Exploration, outcome: Reason, text: str) -> Step:
-    """No more viewpoints: drive home, or end."""
+    """Stop choosing viewpoints: drive home, or end."""
     run = replace(run, final=outcome, final_text=text, target=None)
     if not run.returns:
         return _end(run, outcome, text, Cancel(), Save())
@@ -501,7 +501,7 @@ def _finish(run: Exploration, outcome: Reason, text: str) -> Step:
 
 
 def _returning(run: Exploration, seen: Observed) -> Step:
-    """A goal is under way if one was sent and has not ended."""
+    """Handle the phase RETURNING; a goal is active if one was sent and has not ended."""
     if run.target is not None:
         if seen.ended is None:
             return run, ()
@@ -530,7 +530,7 @@ def _back_home(run: Exploration, pose: Pose2) -> Step:
 
 
 def _saving(run: Exploration, seen: Observed) -> Step:
-    if seen.saved is None and run.now - run.since < 30.0:  # seconds to wait for the map to be saved
+    if seen.saved is None and run.now - run.since < 30.0:  # timeout (s) for saving the map
         return run, ()
     kept = f"map in {seen.saved}" if seen.saved else f"map not saved{seen.save_failure and ': '}{seen.save_failure}"
     severity = Severity.INFO if run.final.exit_code == 0 else Severity.WARNING

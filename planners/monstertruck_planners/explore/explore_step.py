@@ -1,4 +1,4 @@
-"""The exploring step: changes of the map in, frontiers and the next place to look from out. For workers."""
+"""Exploring step: computes frontiers and the next viewpoint from map changes. For workers."""
 
 import math
 
@@ -23,7 +23,7 @@ from monstertruck_schemas.state import Grid
 
 
 class ExploringStep:
-    """Answers tasks one by one; equal tasks give equal answers."""
+    """Answers tasks in sequence; equal tasks give equal answers."""
 
     def __init__(self) -> None:
         self._setup: ExploreSetup | None = None
@@ -33,10 +33,10 @@ class ExploringStep:
         self._looks = WallLooks(CameraView())
 
     def step(self, task: ExploreTask) -> ExploreAnswer:
-        """Do one task.
+        """Carry out one task.
 
         Raises:
-            InputError: no setup came first, or a map that does not fit those before.
+            InputError: the first task had no setup, or the map does not match the previous ones.
         """
         if task.setup is not None:
             self._setup, self._explorer = task.setup, make_explorer(task.setup.config)
@@ -76,16 +76,16 @@ class ExploringStep:
 
     @staticmethod
     def _still(view: ExplorationView, current: Viewpoint | None) -> Option | None:
-        """The option that the pursued target is by now; None if little new would be seen there."""
+        """Return the option that now corresponds to the current viewpoint; None if it would show little new area."""
         if current is None or float(view.gains(np.array([current.pose]))[0]) < max(LEAST_NEW_AREA, current.gain / 4):
             return None
-        # 1.0: a frontier this near to the one that is pursued is what became of it, m
+        # 1.0: a frontier within this distance (m) of the current one is its successor
         near = [option for option in view.options if math.dist(option.frontier.middle, current.frontier) < 1.0]
         return min(near, key=lambda option: math.dist(option.frontier.middle, current.frontier), default=None)
 
 
 class ExploringWorker(ExploringStep):
-    """The step as a worker's: its code is compiled when it is built."""
+    """Exploring step in a worker; compiles its code on construction."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -93,7 +93,7 @@ class ExploringWorker(ExploringStep):
 
 
 def warm_up() -> None:
-    """Compile everything before the first decision is due."""
+    """Compile all code before the first decision is due."""
     cells = np.full((160, 160), -1, np.int8)
     cells[20:120, 20:120] = 0
     cells[20:120, [20, 119]] = cells[[20, 119], 20:120] = 100

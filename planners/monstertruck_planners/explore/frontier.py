@@ -1,8 +1,8 @@
-"""Frontiers of a map that grows: kept cell by cell, so that a changed tile costs only its own surroundings.
+"""Frontiers of a growing map, kept per cell, so that a changed tile costs only its own surroundings.
 
 A frontier cell is a free cell next to an unknown one (B. Yamauchi, "A frontier-based approach for autonomous
-exploration", 1997); only around what differs from before is looked again (compare M. Keidar, G. A. Kaminka, "Efficient
-frontier detection for robot exploration", 2014).
+exploration", 1997). Only the surroundings of changed cells are searched again (compare M. Keidar, G. A. Kaminka,
+"Efficient frontier detection for robot exploration", 2014).
 """
 
 from typing import Final
@@ -19,14 +19,14 @@ Cells = NDArray[np.int8]
 
 UNKNOWN_CELL: Final = -1
 BLOCK: Final = 64
-"""The area grows by whole blocks of this many cells."""
+"""Block side (cells); the area grows by whole blocks."""
 
 
 class FrontierMap:
-    """Occupancy and frontiers of a growing area; cells are counted from the origin of map.
+    """Occupancy and frontiers of a growing area; cell indices start at the map origin.
 
     Args:
-        grid: the first message: its resolution is that of all others.
+        grid: first message; all others must have its resolution.
     """
 
     def __init__(self, grid: Grid) -> None:
@@ -34,27 +34,27 @@ class FrontierMap:
         self.corner = np.zeros(2, np.int64)
         """Column and row of the first cell."""
         self.cells: Cells = np.full((0, 0), UNKNOWN_CELL, np.int8)
-        """Shape (rows, columns): -1 unknown, 0 free to 100 occupied."""
+        """Occupancy, shape (rows, columns): -1 unknown, 0 free to 100 occupied."""
         self.frontier: NDArray[np.bool_] = np.zeros((0, 0), np.bool_)
         self.free = 0
-        """Free cells."""
+        """Number of free cells."""
         self.changes = 0
-        """How often something was put in."""
+        """Number of insertions."""
         self.changed: NDArray[np.int64] = np.zeros((0, 0), np.int64)
-        """The change in which a cell of each block became known, free or occupied last."""
+        """Latest insertion that changed a cell of each block to unknown, free or occupied."""
         self.put(grid, whole=True)
 
     @property
     def origin(self) -> tuple[float, float, float]:
-        """Pose of the outer corner of the first cell, m, rad."""
+        """Pose of the outer corner of the first cell (m, m, rad)."""
         x, y = (self.corner * self.resolution).tolist()
         return x, y, 0.0
 
     def put(self, grid: Grid, *, whole: bool) -> int:
-        """Take a tile, or a whole map that replaces the last one; returns the number of cells checked again.
+        """Insert a tile, or a whole map that replaces the last one; return the number of cells checked again.
 
         Raises:
-            InputError: another resolution, or cells that do not lie on those before.
+            InputError: different resolution, or cells not aligned with the previous ones.
         """
         if grid.resolution != self.resolution or grid.origin.yaw != 0.0:
             text = f"map of cells of {grid.resolution} m, turned by {grid.origin.yaw} rad"
@@ -75,7 +75,7 @@ class FrontierMap:
         return self._replace(new, (row, column))
 
     def _replace(self, new: Cells, corner: tuple[int, int]) -> int:
-        """Write a box, block by block where it differs."""
+        """Write the differing blocks of a box."""
         looked = 0
         for top in range(0, new.shape[0], BLOCK):
             for left in range(0, new.shape[1], BLOCK):
@@ -112,7 +112,7 @@ class FrontierMap:
         size = np.array(self.cells.shape[::-1])
         low, high = low - 1, high + 1
         end = self.corner + size
-        spare = 2  # cells by which the area grows beyond what is needed
+        spare = 2  # extra blocks when the area grows
         if size.all():
             if (low >= self.corner).all() and (high <= end).all():
                 return
@@ -133,7 +133,7 @@ class FrontierMap:
         self.corner, self.cells, self.frontier, self.changed = corner, cells, frontier, changed
 
     def changed_within(self, middle: tuple[float, float], reach: float) -> int:
-        """The newest change of any block within a square round a place, m: ``reach`` to each side."""
+        """Return the latest change of any block in a square around a place, ``reach`` (m) to each side."""
         cells = BLOCK * self.resolution
         low, high = (np.floor((np.array(middle) + d - self.origin[:2]) / cells).astype(int) for d in (-reach, reach))
         part = self.changed[max(low[1], 0) : max(high[1] + 1, 0), max(low[0], 0) : max(high[0] + 1, 0)]
@@ -141,7 +141,7 @@ class FrontierMap:
 
 
 def _standing(cells: Cells) -> Cells:
-    """Unknown, free or occupied: -1, 0, 1."""
+    """Return the state of each cell: -1 unknown, 0 free, 1 occupied."""
     return (cells >= OCCUPIED).astype(np.int8) - (cells < 0)
 
 

@@ -1,4 +1,4 @@
-"""What can be seen from a place in a map that is partly unknown. Loads numba."""
+"""Visibility in a partly unknown map. Loads numba."""
 
 from math import cos, floor, sin
 
@@ -12,7 +12,7 @@ from monstertruck_planners.collision import OCCUPIED
 
 @njit(cache=True)
 def sees(cells: NDArray[np.int8], x: float, y: float, to_x: float, to_y: float) -> bool:
-    """Whether no obstacle lies on the line between two places, in cells; unknown cells count as free."""
+    """Whether the line between two places (cells) is free of obstacles; unknown cells are treated as free."""
     dx, dy = to_x - x, to_y - y
     steps = int(max(abs(dx), abs(dy)) * 1.5) + 1
     rows, columns = cells.shape
@@ -29,7 +29,7 @@ def sees(cells: NDArray[np.int8], x: float, y: float, to_x: float, to_y: float) 
 def far_from_obstacles(
     cells: NDArray[np.int8], rows: NDArray[np.int64], columns: NDArray[np.int64], least: float
 ) -> NDArray[np.bool_]:
-    """Whether the middle of each of some cells, shape (n,), is so far from those of all obstacles, in cells."""
+    """Whether the centre of each cell is at least ``least`` (cells) from all obstacle centres, shape (n,)."""
     result = np.ones(len(rows), np.bool_)
     around = int(least)
     for k in range(len(rows)):
@@ -45,17 +45,17 @@ def far_from_obstacles(
 def new_area(
     cells: NDArray[np.int8], x: float, y: float, heading: float, view: float, reach: float, depth: float, beams: int
 ) -> float:
-    """Unknown area that a scan would show, cells: as far as known obstacles let it, ``depth`` into unknown ground.
+    """Unknown area that a scan would show (cells): up to known obstacles, and ``depth`` into unknown ground.
 
     Args:
-        cells: the map.
-        x: of the sensor, cells.
-        y: the same.
-        heading: of the sensor, rad.
-        view: angle of view, rad.
-        reach: range, cells.
-        depth: cells.
-        beams: how many are followed.
+        cells: map.
+        x: x of the sensor (cells).
+        y: y of the sensor (cells).
+        heading: heading of the sensor (rad).
+        view: angle of view (rad).
+        reach: range (cells).
+        depth: maximum depth into unknown ground (cells).
+        beams: number of simulated beams.
     """
     rows, columns = cells.shape
     width = view / beams
@@ -82,7 +82,7 @@ def new_area(
 def new_areas(
     cells: NDArray[np.int8], places: Array, view: float, reach: float, depth: float, beams: int
 ) -> Array:  # fmt: skip
-    """``new_area`` at each of the places (x, y, heading), shape (n, 3), in cells and rad; shape (n,)."""
+    """``new_area`` at each place (x, y, heading; cells and rad), shape (n, 3); result of shape (n,)."""
     result = np.empty(len(places))
     for i in range(len(places)):
         result[i] = new_area(cells, places[i, 0], places[i, 1], places[i, 2], view, reach, depth, beams)
@@ -91,7 +91,7 @@ def new_areas(
 
 @njit(cache=True)
 def shares_seen(cells: NDArray[np.int8], places: Array, points: Array, reach: float) -> Array:
-    """Share of the points (m, 2) that is seen from each of the places (n, 2) within a range, all in cells."""
+    """Fraction of the points (m, 2) visible from each place (n, 2) within ``reach``, all in cells."""
     result = np.empty(len(places))
     for i in range(len(places)):
         count = 0
@@ -107,7 +107,7 @@ def shares_seen(cells: NDArray[np.int8], places: Array, points: Array, reach: fl
 
 @njit(cache=True)
 def joined_cells(cost: NDArray[np.int16]) -> NDArray[np.int16]:
-    """Costs of cells twice as large each way: open where any of the four is, as dear as the cheapest."""
+    """Costs of cells of twice the side length: open if any of the four is open, with the lowest of their costs."""
     rows, columns = (cost.shape[0] + 1) // 2, (cost.shape[1] + 1) // 2
     result = np.zeros((rows, columns), np.int16)
     for row in range(cost.shape[0]):
@@ -121,14 +121,14 @@ def joined_cells(cost: NDArray[np.int16]) -> NDArray[np.int16]:
 
 @njit(cache=True)
 def short_tour(distance: Array, first: Array) -> NDArray[np.int64]:
-    """Order in which to visit n places: short, from a start to anywhere.
+    """Order of visiting n places on a short tour from the start, with a free end.
 
-    The best of the nearest-next tours, improved by reversing and moving parts while that shortens it (2-opt, Or-opt;
+    The nearest-neighbour tour, improved by reversing and moving parts while that shortens it (2-opt, Or-opt;
     G. A. Croes 1958, I. Or 1976).
 
     Args:
-        distance: shape (n, n), symmetric.
-        first: shape (n,), from the start to each.
+        distance: distances between places, shape (n, n), symmetric.
+        first: distances from the start, shape (n,).
     """
     n = len(first)
     order = np.empty(n, np.int64)
@@ -150,7 +150,7 @@ def short_tour(distance: Array, first: Array) -> NDArray[np.int64]:
 
 @njit(cache=True)
 def _reversed_parts(distance: Array, first: Array, order: NDArray[np.int64]) -> bool:
-    """Reverse every part of a tour whose reversal shortens it; returns whether one did."""
+    """Reverse every part of a tour if that shortens the tour; return whether a part was reversed."""
     n, improved = len(order), False
     for i in range(n):
         for j in range(i + 1, n):
@@ -168,7 +168,7 @@ def _reversed_parts(distance: Array, first: Array, order: NDArray[np.int64]) -> 
 
 @njit(cache=True)
 def _moved_parts(distance: Array, first: Array, order: NDArray[np.int64]) -> bool:
-    """Move every part of up to three places to where the tour is shorter; returns whether one was moved."""
+    """Move parts of up to three places if that shortens the tour; return whether a part was moved."""
     n, improved = len(order), False
     trial, least = order.copy(), tour_length(distance, first, order)
     for length in range(1, min(4, n)):
@@ -188,7 +188,7 @@ def _moved_parts(distance: Array, first: Array, order: NDArray[np.int64]) -> boo
 
 @njit(cache=True)
 def tour_length(distance: Array, first: Array, order: NDArray[np.int64]) -> float:
-    """Length of a tour, see ``short_tour``."""
+    """Length of a tour; see ``short_tour``."""
     total = first[order[0]]
     for k in range(1, len(order)):
         total += distance[order[k - 1], order[k]]

@@ -1,7 +1,7 @@
-"""Where to look for tags on walls: faces of walls that the camera has not had before it, near enough and not obliquely.
+"""Search for tags on walls: wall faces that the camera has not yet viewed from near enough and not too obliquely.
 
-A layer over exploration: once no frontier is left, the robot is sent past the walls until as much was found as was
-requested, or every wall was viewed.
+A layer over exploration: once no frontier is left, the robot drives past the walls until the requested number of tags
+is found, or every wall has been viewed.
 """
 
 import math
@@ -20,28 +20,28 @@ from monstertruck_planners.explore.frontier import FrontierMap
 from monstertruck_planners.explore.kernels import shares_seen
 
 FACE: Final = 0.2
-"""Faces of walls are counted by squares of this side, m, and eight directions."""
+"""Side of the squares (m) that, with eight directions, distinguish wall faces."""
 NEAR_BANNED: Final = 0.3
-"""A face this near to a banned place is skipped, m."""
+"""Faces within this distance of a banned place are skipped (m)."""
 
 
 @dataclass(frozen=True)
 class Faces:
-    """Where a wall meets free ground."""
+    """Wall faces next to free ground."""
 
     points: Array
-    """(n, 2): before the wall, m."""
+    """Points in front of the wall (m), shape (n, 2)."""
     normals: Array
-    """(n, 2): unit vectors away from it."""
+    """Unit vectors away from the wall, shape (n, 2)."""
     keys: NDArray[np.int64]
-    """(n,): square and direction."""
+    """Square and direction, shape (n,)."""
 
 
 class WallLooks:
-    """What the camera has viewed.
+    """Wall faces that the camera has viewed.
 
     Args:
-        camera: of the robot.
+        camera: camera of the robot.
     """
 
     def __init__(self, camera: CameraView) -> None:
@@ -49,13 +49,13 @@ class WallLooks:
         self._looked: set[int] = set()
 
     def take(self, known: FrontierMap, pose: Pose2) -> None:
-        """The robot is here: what is before its camera was viewed."""
+        """Mark the faces in front of the camera at this pose as viewed."""
         faces = faces_of(known)
         if len(faces.keys):
             self._looked.update(faces.keys[self._sees(known, faces, pose)].tolist())
 
     def choose(self, view: ExplorationView, current: Viewpoint | None) -> Viewpoint | None:
-        """A viewpoint of a wall; the pursued one until its wall was viewed."""
+        """Return a viewpoint of a wall; the current one until its wall has been viewed."""
         faces = faces_of(view.known)
         open_ = ~np.isin(faces.keys, np.fromiter(self._looked, np.int64, len(self._looked)))
         for place in view.banned:
@@ -66,8 +66,8 @@ class WallLooks:
         if current is not None and np.hypot(*(faces.points[left] - current.frontier).T).min() < FACE / 2:
             return current
         best, least = None, math.inf
-        worth = 1.5  # metres that a look costs besides its path
-        # 60: faces for which a place is looked for, spread over all
+        worth = 1.5  # cost of a look besides its path (m)
+        # 60: maximum number of evenly sampled faces to search a viewpoint for
         for i in left[np.unique(np.linspace(0, len(left) - 1, 60).astype(np.intp))]:
             pose = self._place(view, faces.points[i], faces.normals[i])
             length = None if pose is None else view.path_length_to(pose[:2])
@@ -80,12 +80,12 @@ class WallLooks:
         return best
 
     def _place(self, view: ExplorationView, point: Array, normal: Array) -> Pose2 | None:
-        """Where the robot can stand with the face before its camera."""
+        """Return a free pose of the robot with the face in front of its camera."""
         mx, my, turn = self._camera.mount
-        for aside in (0.0, 0.5, -0.5):  # angles off the normal of a face from which it is viewed, rad
+        for aside in (0.0, 0.5, -0.5):  # viewing angles from the face normal (rad)
             c, s = math.cos(aside), math.sin(aside)
             ahead = np.array((c * normal[0] - s * normal[1], s * normal[0] + c * normal[1]))
-            for away in (0.8, 1.0, 0.65):  # distances from which a face is viewed, m; the first that is free is used
+            for away in (0.8, 1.0, 0.65):  # viewing distances (m); the first free one is used
                 yaw = math.atan2(-ahead[1], -ahead[0]) - turn
                 c0, s0 = math.cos(yaw), math.sin(yaw)
                 x, y = (point + away * ahead - (c0 * mx - s0 * my, s0 * mx + c0 * my)).tolist()
@@ -97,7 +97,7 @@ class WallLooks:
         return None
 
     def _sees(self, known: FrontierMap, faces: Faces, pose: Pose2) -> NDArray[np.bool_]:
-        """Which faces are before the camera of a robot at a pose."""
+        """Return which faces the camera sees with the robot at a pose."""
         camera, (mx, my, turn) = self._camera, self._camera.mount
         c, s = math.cos(pose[2]), math.sin(pose[2])
         eye = np.array((pose[0] + c * mx - s * my, pose[1] + s * mx + c * my))
@@ -118,7 +118,7 @@ class WallLooks:
 
 
 def faces_of(known: FrontierMap) -> Faces:
-    """Faces of walls next to free ground: one for each square of ``FACE`` and direction."""
+    """Return the wall faces next to free ground: one for each square of ``FACE`` and direction."""
     solid = known.cells >= OCCUPIED
     padded = np.pad(solid, 1).astype(np.int8)
     rows, columns = known.cells.shape

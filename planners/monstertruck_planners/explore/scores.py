@@ -1,4 +1,4 @@
-"""Explorers that score every frontier by itself."""
+"""Explorers that score each frontier separately."""
 
 import math
 
@@ -8,7 +8,7 @@ from monstertruck_planners.explore.exchange import Viewpoint
 
 
 class Nearest:
-    """The nearest frontier, until it is gone.
+    """Chooses the nearest frontier, and keeps it until it is gone.
 
     Args:
         config: settings.
@@ -28,10 +28,10 @@ class Nearest:
 
 
 class Information:
-    """The most new area per second of driving.
+    """Chooses the frontier with the most new area per second of driving.
 
-    A goal that is pursued is kept unless another one is much better: its new area becomes smaller as it comes into
-    sight, and a robot that turns to whatever is best at each instant leaves a bit of everything behind.
+    The current goal is kept unless another is much better: its new area shrinks as it comes into sight, and a robot
+    that always turns to the best frontier leaves small unexplored remnants everywhere.
 
     Args:
         config: settings.
@@ -58,7 +58,7 @@ class Information:
 
 
 class Author:
-    """The thesis author's scores; a goal is pursued until it is reached or his patience ends.
+    """Scores of the thesis author; a goal is kept until it is reached or the time ``patience`` has passed.
 
     Source: see ``AuthorConfig``.
 

@@ -1,4 +1,4 @@
-"""Exploration as a service: observations to the state machine, its decisions to the goal service."""
+"""Exploration service: passes observations to the state machine and its decisions to the goal service."""
 
 import asyncio
 import math
@@ -36,15 +36,15 @@ from monstertruck_schemas.topics import BATTERY, POSE, SLAM
 SOURCE: Final = ServiceName.EXPLORER.value
 """Source of the goals."""
 CHANGES: Final = ("number", "phase", "outcome", "goals", "failures")
-"""Fields of the report whose change is reported at once."""
+"""Report fields whose change triggers an immediate report."""
 LOW: Final = frozenset({BatteryLevel.LOW, BatteryLevel.CRITICAL})
 TILES: Final = 4096
-"""Tiles kept since the newest whole map."""
+"""Maximum number of tiles kept since the latest whole map."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExplorerInputs:
-    """Topics read."""
+    """Input topics."""
 
     gate: Subscription[GateState]
     pose: Subscription[Odometry]
@@ -59,18 +59,18 @@ class ExplorerInputs:
 
 
 class ExplorerService:
-    """Explores when asked to.
+    """Explores on request.
 
     Args:
-        setup: how, and the robot.
-        clock: time.
-        actor: where decisions are made; started with the first exploration.
-        goals: what drives.
-        save: has the map saved; returns whether it can be; None = there is none.
+        setup: explorer settings and robot data.
+        clock: time source.
+        actor: runs the exploring step; started with the first exploration.
+        goals: goal service that drives the robot.
+        save: requests saving the map; returns whether it can be saved. None if there is no map to save.
         max_age: see ``GateConfig.max_request_age``.
-        inputs: topics read.
-        state: ``plan/explore``.
-        events: where decisions are reported.
+        inputs: input topics.
+        state: publisher of ``plan/explore``.
+        events: sink for decisions.
     """
 
     name = SOURCE
@@ -109,11 +109,11 @@ class ExplorerService:
         self._seq = 0
         self._goal: int | None = None
         self._others = 0
-        """The newest goal when the exploration was started."""
+        """Number of the latest goal when the exploration was started."""
         self._refused: tuple[Reason, str] | None = None
         self._placed = 0
         self._saves: int | None = None
-        """Since when the map is being saved, ns."""
+        """Time of the request to save the map (ns)."""
         self._cannot_save = False
 
     async def run(self, ready: Ready) -> None:
@@ -134,14 +134,14 @@ class ExplorerService:
 
     @property
     def running(self) -> bool:
-        """Whether an exploration runs."""
+        """Whether an exploration is running."""
         return self._run is not None and self._run.running
 
     def accept(self, request: ExploreRequest) -> Pose2:
-        """Where an exploration would begin.
+        """Return the start pose of an exploration.
 
         Raises:
-            RequestRefusedError: the pose is not known, or the robot keeps no points of interest to be found.
+            RequestRefusedError: the pose is unknown, or points of interest are requested and the robot keeps none.
         """
         if request.find is not None and self._in.points is None:
             raise RequestRefusedError(Reason.NOT_SUPPORTED, "this robot keeps no points of interest: section `points`")
@@ -152,9 +152,9 @@ class ExplorerService:
         return pose
 
     def begin(self, accepted: Pose2, request: ExploreRequest, number: int) -> None:
-        """Explore from a pose on."""
+        """Start exploring from a pose."""
         self._fresh, self._goal, self._refused, self._saves = True, None, None, None
-        self._deciding = None  # of the exploration before: its answer is not one to this
+        self._deciding = None  # discard a pending answer to the previous exploration
         goal, config = self._in.goal.latest, self._config
         self._others = 0 if goal is None else goal.number
         self._do(
@@ -180,7 +180,7 @@ class ExplorerService:
         self.tasks.register(rpc, "explore", ExploreRequest)
 
     def state(self, now: int) -> ExplorationState:
-        """The report on the newest exploration."""
+        """Return the report on the latest exploration."""
         return state_of(self._run, self._config.kind, now)
 
     # Observations
@@ -210,7 +210,7 @@ class ExplorerService:
                 self._tiles.append(tile)
 
     def _saved(self) -> tuple[str | None, str]:
-        """Where the map was saved since that was requested, empty = nowhere; and why not."""
+        """Return where the map was saved since the request (empty if saving failed), and the reason of a failure."""
         saved, failure = None, ""
         for event in self._in.events.drain():
             if self._saves is None or event.received < self._saves:
@@ -250,7 +250,7 @@ class ExplorerService:
         )
 
     def _failed(self) -> str:
-        """Which service failed for good and why: that of the goals, or any for which the gate lets nobody drive."""
+        """Permanently failed services with details: the goal service, and any that make the gate block driving."""
         table, gate = self._in.health.latest, self._in.gate.latest
         blocked = gate is not None and Reason.SERVICE_FAILED in gate.reasons
         failed = () if table is None else [row for row in table.services if row.state is ServiceState.FAILED]
@@ -258,12 +258,12 @@ class ExplorerService:
         return "; ".join(names)
 
     def _found(self) -> int:
-        """Tags that are known."""
+        """Number of known tags."""
         message = None if self._in.points is None else self._in.points.latest
         return 0 if message is None else sum(point.kind is PointKind.TAG for point in message.points)
 
     def _goal_end(self) -> tuple[Reason | None, str, str]:
-        """How the goal that was sent ended, in words, and whose goal took its place."""
+        """Return outcome and text of the explorer's goal, and the source of the goal that replaced it."""
         goal = self._in.goal.latest
         newer = goal is not None and (self._goal is None or goal.number > self._goal)
         if goal is not None and goal.source != SOURCE and goal.number > self._others and newer:
@@ -275,18 +275,18 @@ class ExplorerService:
         return goal.outcome, goal.text, ""
 
     def _believed(self, now: int) -> Pose2 | None:
-        """Of the base in map, whatever it is worth."""
+        """Return the fresh pose of the base in the map frame, even if it is unreliable."""
         pose = self._in.pose.latest
         return None if pose is None or now - pose.received > POSE.fresh_for() * SECOND else pose_of(pose)
 
     def _pose(self, now: int) -> Pose2 | None:
-        """Of the base in map, while it is known."""
+        """Return the pose of the base in the map frame while localised, else None."""
         pose, slam = self._believed(now), self._in.slam.latest
         if pose is None:
             return None
         if slam is None or slam.standing not in NO_PLACE or now - slam.received > SLAM.fresh_for() * SECOND:
             self._placed = now
-        # 1.0: seconds without a place in the map after which it counts as lost
+        # 1.0: seconds without localisation until the robot is lost
         return pose if now - self._placed <= 1.0 * SECOND else None
 
     # Decisions
@@ -333,7 +333,7 @@ class ExplorerService:
         self._deciding = self._tasks.create_task(self._ask(task))
 
     async def _ask(self, task: ExploreTask) -> ExploreAnswer:
-        """The worker's answer; of one that failed and starts again: that it did."""
+        """Return the worker's answer; if the worker failed and restarts, an answer with the failure."""
         assert self._actor is not None
         try:
             answer: ExploreAnswer = await self._actor.step(task)
@@ -342,7 +342,7 @@ class ExplorerService:
             self._events(error.reason, Severity.ERROR, SOURCE, text)
             kept = task.current is not None
             return ExploreAnswer(task.current, kept=kept, failure=error.reason, text=text.partition("\n")[0])
-        if answer.kept:  # what comes back from a worker is a copy
+        if answer.kept:  # the worker returns a copy of the target
             return replace(answer, target=task.current)
         return answer
 
@@ -361,18 +361,18 @@ class ExplorerService:
             self._refused = error.refusal, str(error)
 
     def _cancel(self) -> None:
-        """What was sent, if it is still pursued."""
+        """Cancel the explorer's goal if it is still active."""
         goal = self._in.goal.latest
         if goal is None or self._goal != goal.number or goal.phase is GoalPhase.IDLE:
             self._goal = None
             return
         self._goal = None
-        with suppress(RequestRefusedError):  # it has ended, or is somebody else's, since that was published
+        with suppress(RequestRefusedError):  # since that report it has ended, or another source has replaced it
             self._goals.tasks.take(GoalControl(**self._header(), order=GoalOrder.CANCEL, own=True))
 
 
 def state_of(run: Exploration | None, kind: str, now: int) -> ExplorationState:
-    """The report on an exploration, its sequence number still 0."""
+    """Return the report on an exploration, with sequence number 0."""
     if run is None:
         return ExplorationState(stamp=now, received=now, seq=0, frame="map", kind=kind)
     target = None if run.target is None else run.target.pose

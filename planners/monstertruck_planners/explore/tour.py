@@ -1,4 +1,4 @@
-"""The explorer that weighs the path to a frontier against its new area, and the short tour over the others after it."""
+"""Explorer that weighs the path to a frontier against its new area and a short tour over the other frontiers."""
 
 import math
 
@@ -12,12 +12,12 @@ from monstertruck_planners.explore.kernels import short_tour, tour_length
 
 
 class Tour:
-    """The first place of the best tour.
+    """Chooses the first place of the best tour.
 
-    Of a tour that begins with a frontier the cost is the way there, less ``worth`` times the square root of the new
-    area that is seen from there (about its size in metres), plus ``rest`` times the length of the short tour over the
-    others after it. A tour that only is short begins with whatever shadow of a corner is near, and comes late to the
-    large areas: most of those shadows vanish by themselves, or are too small to matter.
+    The cost of a tour is the path length to its first frontier, minus ``worth`` times the square root of the new area
+    seen there (about its size in metres), plus ``rest`` times the length of a short tour over the other frontiers. A
+    tour optimised only for length starts at any nearby shadow of a corner and reaches the large areas late. Most such
+    shadows vanish by themselves or are too small to matter.
 
     Args:
         config: settings.
@@ -37,7 +37,7 @@ class Tour:
         chosen = options[0]
         if self._config.rest > 0.0 and len(options) > 2:
             first = np.array([self._first(option, option is still) for option in options])
-            distance = np.minimum(view.path_lengths_between(options), 1e4)  # stands for a path that is not known, m
+            distance = np.minimum(view.path_lengths_between(options), 1e4)  # substitute for an unknown path (m)
             chosen = options[best_beginning(first, distance, self._config.rest)]
         return pursued if chosen is still else chosen.target
 
@@ -48,15 +48,15 @@ class Tour:
 
 
 def best_beginning(first: Array, distance: Array, rest: float) -> int:
-    """The place with which the best tour begins.
+    """Return the index of the first place of the best tour.
 
     Args:
         first: cost of each of the n > 2 places as the first one, ascending, shape (n,).
-        distance: between them, shape (n, n).
-        rest: weight of the tour over the others.
+        distance: distances between the places, shape (n, n).
+        rest: weight of the tour over the other places.
     """
     costs = []
-    for k in range(min(len(first), 6)):  # frontiers that are compared as the first one
+    for k in range(min(len(first), 6)):  # number of frontiers compared as the first
         others = np.delete(np.arange(len(first)), k)
         between, begin = distance[np.ix_(others, others)], distance[k, others]
         costs.append(first[k] + rest * tour_length(between, begin, short_tour(between, begin)))

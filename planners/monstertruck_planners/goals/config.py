@@ -1,4 +1,4 @@
-"""Settings of driving to goals: route planner, map, deformation, recovery behaviours; light, no planner is loaded."""
+"""Settings of driving to goals: route planner, map, deformation, recovery behaviours. Loads no planner."""
 
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -18,117 +18,117 @@ DRIVEN: dict[Literal["2ws", "counter", "4ws"], tuple[Steering, ...]] = {
     "counter": ("counter",),
     "4ws": ("counter", "crab"),
 }
-"""Ways of steering in the routes of each kind of vehicle."""
+"""Steering modes in the routes of each kind of vehicle."""
 
 
 class EscapeConfig(Schema):
-    """Backing out, as by car_maneuver_recovery: away from the sides of the footprint that are not free."""
+    """Backing out, as in car_maneuver_recovery: away from the blocked sides of the footprint."""
 
     room: Positive = 0.15
-    """A side is free if there is no obstacle within this distance of it, m."""
+    """Minimum distance of obstacles from a free side (m)."""
     distance: Positive = 0.5
-    """Driven at most, m."""
+    """Maximum distance travelled (m)."""
     angle: Annotated[float, Field(gt=0, lt=1)] = 0.362
-    """Of the axles, away from a blocked side, rad; less where the servos reach less."""
+    """Axle angle away from a blocked side (rad), limited by the servos."""
     crab: bool = True
-    """Both axles alike, where the vehicle can; else they turn the truck."""
+    """Same angle on both axles if the vehicle can; otherwise the axles turn the truck."""
     margin: NotNegative = 0.03
-    """Kept to obstacles on the way, m; those that are nearer already may not come nearer."""
+    """Clearance from obstacles along the path (m); obstacles already within it may not come closer."""
 
 
 class WindowConfig(Schema):
-    """Obstacles around the robot by which routes are deformed."""
+    """Obstacle window around the robot for deforming routes."""
 
     size: Annotated[float, Field(gt=0, le=20)] = 4.0
-    """Side, m; the robot is in the middle"""
+    """Side length (m), centred on the robot"""
     resolution: Annotated[float, Field(ge=0.01, le=0.2)] = 0.04
-    """Edge of a cell, m"""
+    """Cell size (m)"""
     mark: Positive = 3.0
-    """Returns up to this distance mark obstacles, m"""
+    """Maximum distance of returns that mark obstacles (m)"""
     clear: Positive = 4.0
-    """Beams clear cells up to this distance, m"""
+    """Maximum distance of cells cleared by beams (m)"""
     thickness: NotNegative = 0.12
-    """Depth of obstacles where the cells behind them have never been seen, m"""
+    """Depth of obstacles if the cells behind them have never been seen (m)"""
 
 
 class LocalConfig(Schema):
-    """When routes are deformed, and what is made of it."""
+    """Conditions and limits of deforming routes."""
 
     window: WindowConfig = WindowConfig()
-    """Where obstacles are kept"""
+    """Window of remembered obstacles"""
     clearance: NotNegative = 0.02
-    """A route with an obstacle nearer than this is deformed, m; the gate's side clearance."""
+    """Clearance below which a route is deformed (m); the side clearance of the gate."""
     rejoin_clearance: NotNegative = 0.03
-    """Clearance needed to return to the route, m."""
+    """Clearance required to return to the route (m)."""
     rejoin_distance: Positive = 0.06
-    """Distance from the route within which the truck may return to it, m, counting 0.3 m per radian."""
+    """Maximum distance from the route for returning to it (m), with 0.3 m per radian of heading error."""
     blocked_timeout: Positive = 2.0
-    """Seconds without a way round something after which the route counts as blocked."""
+    """Time without a path round an obstacle until the route is blocked (s)."""
     detour: Positive = 45.0
-    """Seconds of deformation that do not bring the truck on along its route, after which the same holds."""
+    """Time of deformation without progress along the route until the route is blocked (s)."""
     latency: Positive = 0.05
-    """Seconds a deformation takes on the virtual clock"""
+    """Latency of a deformation on the virtual clock (s)"""
     deadline: Positive = 5.0
-    """Seconds after which a silent worker is killed"""
+    """Timeout of a silent worker (s), which is then killed"""
 
 
 class PlannerConfig(Schema):
-    """How goals are reached."""
+    """Driving to goals."""
 
     route: AnyRoutePlanner = HybridConfig(margin=0.04, unknown="blocked", reverse_cost=2.0)
-    """Route planner; its margin has to exceed the gate's side clearance; backward the lidar sees nothing"""
+    """Route planner; its margin must exceed the side clearance of the gate; the lidar sees nothing behind"""
     steering: Literal["2ws", "counter", "4ws"] = "4ws"
-    """Front axle alone, both opposite, or both in every way"""
+    """Steering: front axle only, both axles opposite, or both axles opposite and parallel"""
     angle: Annotated[float, Field(gt=0, lt=1)] = 0.33
-    """Greatest axle angle of routes, rad: circles of 0.47 m; the tracker has more. Less where the servos reach
-    less"""
+    """Maximum axle angle of routes (rad), limited by the servos; the default gives circles of 0.47 m. The tracker may
+    use more"""
     map: Path | None = None
-    """map_server YAML file to plan on where there is no slam"""
+    """map_server YAML file for planning without slam"""
     local_planner: AnyLocalPlanner | None = None
-    """What leads the truck round things that stand on its route; null = the route is planned again"""
+    """Local planner around obstacles on the route; null: replan the route"""
     local: LocalConfig = LocalConfig()
     rate: Annotated[float, Field(ge=1, le=20)] = 10.0
     """Decisions per second."""
     position_tolerance: Positive = 0.2
-    """The goal is reached if the truck stops within this distance, m."""
+    """Maximum distance from the goal at a stop (m)."""
     yaw_tolerance: Positive = 0.2
-    """The goal is reached if the heading differs by no more than this, rad."""
+    """Maximum heading error at the goal (rad)."""
     waypoint_radius: Positive = 0.3
-    """A waypoint has been passed if the truck was this near, m."""
+    """Radius of a waypoint (m); the truck passes it by coming within this radius."""
     aim: Annotated[float, Field(gt=0, le=1)] = 0.4
-    """Share of these beyond which it corrects its place first."""
+    """Fraction of the tolerances beyond which the truck first corrects its pose."""
     corrections: Annotated[int, Field(ge=0)] = 1
-    """How often it does so."""
+    """Number of such corrections."""
     timeout: Positive = 600.0
-    """Seconds for a goal; those in which the truck is not armed or the goal is paused do not count."""
+    """Time limit of a goal (s), without the time unarmed or paused."""
     unarmed_timeout: Positive = 300.0
-    """Seconds a goal waits for the truck to be armed, or for a fresh pose."""
+    """Timeout of waiting for the truck to be armed, or for a fresh pose (s)."""
     stuck: Positive = 4.0
-    """Seconds without progress after which the recovery behaviours begin."""
+    """Time without progress until the recovery behaviours begin (s)."""
     progress: Positive = 0.03
-    """Metres along the path that are progress."""
+    """Minimum progress along the path (m)."""
     look_ahead: Positive = 1.5
-    """Distance ahead that is compared with the newest scan, m."""
+    """Distance ahead that is checked against the latest scan (m)."""
     blocked_scans: Annotated[int, Field(ge=1)] = 3
-    """Consecutive scans that have to show the path blocked."""
+    """Number of consecutive scans that must show the path blocked."""
     recovery: Annotated[tuple[Recovery, ...], Field(strict=False)] = ("clear", "back_out", "wait", "replan")
     """Recovery behaviours, tried in turn before the goal is given up"""
     wait: Positive = 5.0
-    """Seconds of the behaviour "wait"."""
+    """Duration of the behaviour "wait" (s)."""
     recovered: Positive = 0.5
-    """Metres nearer to the goal along the route than ever before, after which the recovery behaviours start again"""
+    """Reduction of the minimum remaining route length that restarts the recovery behaviours (m)"""
     routes: Annotated[int, Field(ge=1)] = 30
-    """Routes for one goal at most."""
+    """Maximum number of routes for one goal."""
     max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1
-    """A scan tilted more than this says nothing about the way, rad: it looks over obstacles, or onto the ground"""
+    """Maximum tilt of a used scan (rad); beyond, it passes over obstacles or hits the ground"""
     scan_tolerance: NotNegative = 0.08
-    """Returns this near to an obstacle of the map are taken for it, m; up to twice as much where the pose is uncertain:
-    two standard deviations of its position are added"""
+    """Maximum distance of a return from the map obstacle that explains it (m); two standard deviations of the position
+    are added, up to twice this value in total"""
     escape: EscapeConfig = EscapeConfig()
     latency: Positive = 0.5
-    """Seconds a route takes on the virtual clock"""
+    """Latency of a route on the virtual clock (s)"""
     deadline: Positive = 30.0
-    """Seconds after which a silent worker is killed"""
+    """Timeout of a silent worker (s), which is then killed"""
 
     @model_validator(mode="after")
     def _in_time(self) -> Self:

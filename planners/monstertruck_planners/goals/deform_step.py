@@ -1,7 +1,7 @@
-"""The local planner's step, for workers: a scan into the obstacle window; out whether the route is free, or a path.
+"""Local planning step, for workers: adds a scan to the obstacle window; returns whether the route is free, or a path.
 
-While the route is free it is driven as it was planned: the local planner is used only from the moment an obstacle is on
-it until the truck is back on it.
+A free route is driven as planned. The local planner is used only from the moment an obstacle is on the route until the
+truck is back on the route.
 """
 
 import logging
@@ -35,9 +35,9 @@ log = logging.getLogger(__name__)
 
 
 class Window:
-    """Obstacles around the truck, in a grid whose axes are those of the frame.
+    """Obstacles around the truck in a grid aligned with the frame.
 
-    Cells never seen are free unless they lie just behind an obstacle; cells out of sight keep their last state.
+    Unseen cells are free unless they lie just behind an obstacle; cells out of sight keep their last state.
 
     Args:
         config: size and resolution.
@@ -57,13 +57,13 @@ class Window:
         """Add a scan.
 
         Args:
-            sensor: x, y of the lidar, m.
-            base: x, y of the truck, the new middle of the window, m.
-            ends: shape (n, 2): where each beam ended, m.
-            hit: shape (n,): whether it hit something there.
+            sensor: x, y of the lidar (m).
+            base: x, y of the truck, the new centre of the window (m).
+            ends: end of each beam (m), shape (n, 2).
+            hit: whether each beam hit an obstacle at its end, shape (n,).
 
         Raises:
-            InputError: shapes that do not fit.
+            InputError: shapes that do not match.
         """
         if ends.ndim != 2 or ends.shape[1] != 2 or hit.shape != (len(ends),):
             raise InputError(f"scan of {ends.shape} ends, {hit.shape} hits: expected (n, 2) and (n,)")
@@ -85,35 +85,35 @@ class Window:
         if self._mark == 1:
             self._marks[:] = 0
         odds, marks = self._odds.reshape(-1), self._marks.reshape(-1)
-        # (2, -2, 1): steps of a hit and of a pass, and the limit: one scan changes any cell to either
+        # (2, -2, 1): steps of a hit and of a pass, and the limit: a single scan can set a cell to either state
         trace(odds, marks, count, cells, np.zeros(2, np.int64), self._mark, (2, -2, 1), np.count_nonzero(near))
 
     @property
     def cells(self) -> NDArray[np.bool_]:
-        """Where something was seen, shape (rows, columns), row 0 at the lowest y."""
+        """Occupied cells, shape (rows, columns), row 0 at the lowest y."""
         return np.asarray(self._odds > 0)
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """Which cells were seen, of the same shape."""
+        """Seen cells, same shape as ``cells``."""
         return np.asarray(self._odds != 0)
 
     @property
     def obstacles(self) -> Array:
-        """Middles of the cells where something was seen, shape (n, 2), m."""
+        """Centres of the occupied cells (m), shape (n, 2)."""
         return np.asarray((np.argwhere(self.cells)[:, ::-1] + 0.5) * self.config.resolution + self.corner)
 
     @property
     def corner(self) -> tuple[float, float]:
-        """Of cell (0, 0), m."""
+        """Outer corner of cell (0, 0) (m)."""
         column, row = self._corner or (0, 0)
         return column * self.config.resolution, row * self.config.resolution
 
     def field(self, known: DistanceField | None = None) -> DistanceField:
-        """Distances in the window.
+        """Return the distance field of the window.
 
         Args:
-            known: obstacles of the map, added to those seen; outside the map nothing is added.
+            known: map obstacles, added to the seen ones; outside the map nothing is added.
         """
         x, y = self.corner
         res = self.config.resolution
@@ -139,7 +139,7 @@ class Window:
 
 
 def _moved(cells: NDArray[np.int16], rows: int, columns: int) -> NDArray[np.int16]:
-    """Cells of a window moved up by rows and right by columns."""
+    """Return the cells of a window moved up by ``rows`` and right by ``columns``."""
     count = len(cells)
     fresh = np.zeros_like(cells)
     if abs(columns) < count and abs(rows) < count:
@@ -150,7 +150,7 @@ def _moved(cells: NDArray[np.int16], rows: int, columns: int) -> NDArray[np.int1
 
 
 class DeformStep:
-    """Answers scan by scan; equal scans give equal answers."""
+    """Answers each scan; equal scans give equal answers."""
 
     def __init__(self) -> None:
         self._setup: Setup | None = None
@@ -158,13 +158,13 @@ class DeformStep:
         self._number = 0
         """Number of the route; 0 before the first one."""
         self._rest: PosePath | None = None
-        """The route from where its deformation began; None while it is free."""
+        """Rest of the route from the start of its deformation; None while the route is free."""
 
     def step(self, task: DeformTask) -> DeformAnswer:
-        """Take in a scan, and say what becomes of the route.
+        """Process a scan and return the result for the route.
 
         Raises:
-            InputError: no setup came first, or no deformer is configured.
+            InputError: the first task had no setup, or no deformer is configured.
         """
         if task.setup is not None:
             self._set_up(task.setup)
@@ -209,9 +209,9 @@ class DeformStep:
         self._rest, self._state = None, LocalPlannerState()
 
     def _observe(self, setup: Setup, task: DeformTask) -> tuple[Array, NDArray[np.bool_]]:
-        """Put a scan into the window; obstacles in base, and which of them the map explains.
+        """Add a scan to the window; return the obstacles in base, and which of them the map explains.
 
-        Obstacles are its points, and where the lidar does not see or look those that it saw before.
+        The obstacles are the scan points and, outside the view of the lidar and at blind beams, earlier ones.
         """
         pose, points = task.pose, scan_points_at(task.scan, setup.lidar, task.stamp, task.twist)
         (sensor,) = placed(np.array([setup.lidar]), pose)
@@ -228,9 +228,9 @@ class DeformStep:
         return points, np.asarray(self._walls.lookup(ends) <= tolerance)
 
     def _advance(self, here: Array) -> None:
-        """Find the truck's place on the route: near the last one, not beyond a cusp that it has not reached."""
+        """Find the truck's place on the route, near the last place and not beyond a cusp it has not reached."""
         guide, travelled, at = self._guide, self._travelled, self._place
-        # 0.5: metres of route behind the truck that still count as near
+        # 0.5: length of route behind the truck to search (m)
         reach = np.array([-0.5, self._window.config.size / 2])
         first, last = np.searchsorted(travelled, travelled[at] + reach).tolist()
         cusps = np.flatnonzero(np.diff(guide.directions[first : at + 2]))
@@ -240,10 +240,10 @@ class DeformStep:
         self._place = first + nearest_pose(PosePath(guide.poses[first : last + 1], directions), here)
 
     def _free(self, setup: Setup, here: Array, pose: Pose2, points: Array, mapped: NDArray[np.bool_]) -> bool:
-        """Whether the truck can drive the route as it is: always looked at; to go back to it more is asked.
+        """Whether the truck can drive the route as planned; returning to the route has stricter conditions.
 
-        The route keeps its distance to the map's obstacles; where these seem nearer the pose is off, and only what the
-        truck would touch counts.
+        The route keeps its clearance from map obstacles. If they appear nearer, the pose is inaccurate, so only contact
+        with them blocks the route.
         """
         local, guide, at = setup.config.local, self._guide, self._place
         deformed = self._rest is not None
@@ -260,7 +260,7 @@ class DeformStep:
 
     def _answer(self, result: LocalPlan) -> DeformAnswer:
         number, path = self._number, result.path
-        shortest = 0.02  # a deformed path shorter than this is none, m
+        shortest = 0.02  # minimum length of a deformed path (m)
         if path is not None and path.length < shortest and self._place == len(self._guide.poses) - 1:
             return DeformAnswer(number, "kept", result.reason, place=self._place, complete=True)
         if path is None or path.length < shortest:
@@ -273,7 +273,7 @@ class DeformStep:
 
 
 def _walls_of(place: Path) -> DistanceField | None:
-    """Distances to the obstacles of a map; None if it cannot be read: then no obstacle counts as a known wall."""
+    """Return the distances to map obstacles; None for an unreadable map: then no obstacle is a known wall."""
     try:
         world = load_map(place)
     except InputError as error:
@@ -283,7 +283,7 @@ def _walls_of(place: Path) -> DistanceField | None:
 
 
 def blind_beams(scan: LaserScan) -> NDArray[np.intp]:
-    """Beams that say neither how far it is free nor that nothing is in range, nor do their neighbours.
+    """Return the beams that, like both neighbours, report neither a range nor that no obstacle is in range.
 
     Single beams fail on edges and dark surfaces.
     """
@@ -292,12 +292,12 @@ def blind_beams(scan: LaserScan) -> NDArray[np.intp]:
 
 
 def _beams(points: Array, scan: LaserScan) -> NDArray[np.intp]:
-    """Beam towards each point, shape (n, 2), in the lidar's frame."""
+    """Return the beam towards each point, shape (n, 2), in the lidar frame."""
     return nearest_beams(np.arctan2(points[:, 1], points[:, 0]), scan.start_angle, scan.angle_increment)
 
 
 class DeformingWorker(DeformStep):
-    """The step as a worker's: its code is compiled when it is built."""
+    """Deforming step in a worker; compiles its code on construction."""
 
     def __init__(self) -> None:
         super().__init__()

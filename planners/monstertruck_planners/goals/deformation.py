@@ -1,4 +1,4 @@
-"""The deformation of the route: every scan goes to the deforming step, its answers to the goal service."""
+"""Route deformation: passes every scan to the deforming step and its answers to the goal service."""
 
 from collections.abc import Callable
 from typing import Final
@@ -27,20 +27,20 @@ from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY
 
 DEFORM_RETRY: Final = 10.0
-"""Seconds after which a deforming step that did not start is started again."""
+"""Delay until a deforming step that did not start is started again (s)."""
 
 
 class RouteDeformation:
-    """Keeps the route that is driven and what the deforming step said of it last.
+    """Keeps the current route and the last answer of the deforming step.
 
     Args:
-        setup: how, and the truck.
-        clock: time.
-        actor: where it is deformed.
-        scan: every one is taken in.
-        pose: of the truck, in the frame of the routes.
-        grid: the map; None = the configured one.
-        events: where events go.
+        setup: settings and truck data.
+        clock: time source.
+        actor: runs the deforming step.
+        scan: mailbox of all scans.
+        pose: pose of the truck in the frame of the routes.
+        grid: map; None for the configured map.
+        events: event sink.
     """
 
     name = ServiceName.GOALS.value
@@ -65,16 +65,16 @@ class RouteDeformation:
         self._sent_route = 0
         self._answer: DeformAnswer | None = None
         self._since = 0
-        """When what stands on the route began to block it, ns."""
+        """Time when an obstacle began to block the route (ns)."""
         self._furthest = 0.0
         self._onward = 0
-        """When the truck last came on along the route, ns."""
+        """Time of the last progress along the route (ns)."""
 
     async def run(self, report: Callable[[Finding, DeformAnswer], None]) -> None:
-        """Pass every scan on until cancelled; while one is worked on, newer ones replace each other.
+        """Pass every scan on until cancelled; while one is processed, newer ones replace each other.
 
         Args:
-            report: is given the finding before and the answer.
+            report: called with the previous finding and the answer.
         """
         async with self._actor as actor:
             await self._started(actor)
@@ -95,7 +95,7 @@ class RouteDeformation:
                     report(was, answer)
 
     async def _started(self, actor: Actor) -> None:
-        """Start what deforms; meanwhile routes are driven as they were planned, and planned again where blocked."""
+        """Start the deforming step; until then routes are driven as planned, and replanned if blocked."""
         while True:
             try:
                 await actor.start()
@@ -106,13 +106,13 @@ class RouteDeformation:
                 return
 
     def begin(self, route: RouteAnswer) -> None:
-        """Another route is driven from now on."""
+        """Start driving a new route."""
         self._number += 1
         self._route, self._answer = route, None
         self._furthest, self._onward = 0.0, self._clock.now()
 
     def end(self) -> None:
-        """No route is driven."""
+        """Stop driving the route."""
         self._route = self._answer = None
 
     @property
@@ -121,33 +121,33 @@ class RouteDeformation:
 
     @property
     def deformed(self) -> bool:
-        """Whether something else than the route is driven."""
+        """Whether the driven path differs from the route."""
         return self._finding not in ("idle", "free")
 
     @property
     def active(self) -> bool:
-        """Whether it decides what is driven of the present route."""
+        """Whether the deformation decides which path is driven along the current route."""
         return self._answer is not None
 
     @property
     def complete(self) -> bool:
-        """Whether what is driven leads to the route's end."""
+        """Whether the driven path leads to the end of the route."""
         return self._answer is None or self._answer.complete
 
     @property
     def held_up(self) -> bool:
-        """Whether there is no way round for now."""
+        """Whether there is currently no path round the obstacle."""
         return self._finding == "blocked"
 
     def blocked(self, now: int) -> bool:
-        """Whether the route leads nowhere: no way round for some time, or a detour without end."""
+        """Whether the route is blocked: no path round the obstacle for some time, or a detour that takes too long."""
         return (self.held_up and now - self._since > self._local.blocked_timeout * SECOND) or (
             self.deformed and now - self._onward > self._local.detour * SECOND
         )
 
     @property
     def left(self) -> float:
-        """Metres of the route ahead; 0 without one."""
+        """Remaining length of the route (m); 0 without a route."""
         if self._answer is None:
             return 0.0
         travelled = self._path.travelled
@@ -155,7 +155,7 @@ class RouteDeformation:
 
     @property
     def rest(self) -> PosePath:
-        """The route from the truck on."""
+        """Remaining route from the truck."""
         assert self._answer is not None
         count = len(self._path.poses)
         return self._path.part(min(self._answer.place, count - 2), count)
@@ -196,13 +196,13 @@ class RouteDeformation:
         if answer.finding == "blocked" and not self.held_up:
             self._since = now
         along = float(self._path.travelled[answer.place])
-        if answer.finding == "free" or along > self._furthest + 0.05:  # metres along the route that are progress
+        if answer.finding == "free" or along > self._furthest + 0.05:  # minimum progress along the route (m)
             self._furthest, self._onward = max(along, self._furthest), now
         self._answer = answer
 
 
 def event_of(was: Finding, answer: DeformAnswer) -> tuple[Reason, Severity, str] | None:
-    """Reason, severity and text of the event of a changed finding; None if it is the same."""
+    """Return reason, severity and text of the event for a changed finding; None if unchanged."""
     text = answer.text or answer.reason.text
     match answer.finding:
         case "blocked" if was != "blocked":

@@ -1,9 +1,9 @@
-"""Backing out of a tight place, as by car_maneuver_recovery (G. Kouros), with its errors corrected.
+"""Backing out of a tight place, as in car_maneuver_recovery (G. Kouros), with its errors corrected.
 
-The rule is its own: of the footprint's four sides those are found that are not free. With both ends blocked there is no
-path out; else the truck drives forward if it can, backward otherwise, steering away from the side that is blocked.
-Three things differ. Speeds follow from the axle angles by the truck's kinematics, where the package's forward speed had
-sqrt(1 / (1 + tan b)) for cos b. A side is the whole side, not three points of it. And the path is checked as a whole.
+The rule is unchanged: find the blocked sides of the footprint. With both ends blocked there is no path out. Otherwise
+the truck drives forward if it can, else backward, steering away from the blocked side. There are three differences.
+Speeds follow from the axle angles by the truck kinematics; the package used sqrt(1 / (1 + tan b)) instead of cos b in
+the forward speed. A side is the whole side, not three points of it. The path is checked as a whole.
 """
 
 from dataclasses import dataclass, replace
@@ -17,12 +17,12 @@ from monstertruck_planners.goals.config import EscapeConfig
 from monstertruck_schemas.plan import Steering
 
 ESCAPE_POSE_STEP = 0.02
-"""Metres between two poses of the path."""
+"""Spacing of the poses of the path (m)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sides:
-    """Which sides of the footprint have something within reach."""
+    """Blocked sides of the footprint."""
 
     front: bool
     rear: bool
@@ -31,23 +31,23 @@ class Sides:
 
     @property
     def any(self) -> bool:
-        """Whether one of them has."""
+        """Whether any side is blocked."""
         return self.front or self.rear or self.left or self.right
 
 
 @dataclass(frozen=True)
 class Escape:
-    """An escape motion."""
+    """Escape motion."""
 
     poses: Array
-    """Shape (n, 3): of the base, in the frame of the truck at its start."""
+    """Poses of the base in the frame of the truck at the start, shape (n, 3)."""
     direction: int
     """+1 or -1."""
     steering: Steering
 
 
 def blocked_sides(footprint: Footprint, points: Array, room: float) -> Sides:
-    """Sides with a point nearer than ``room``, m; points have shape (n, 2) and are in the base frame."""
+    """Return the sides with a point nearer than ``room`` (m); points (n, 2) in the base frame."""
     x, y = points[:, 0] - footprint.offset, points[:, 1]
     length, width = footprint.half_length, footprint.half_width
     within, along = np.abs(y) <= width, np.abs(x) <= length
@@ -63,16 +63,16 @@ def escape(
     config: EscapeConfig, geometry: FourWheelSteering, footprint: Footprint, points: Array, *, crab: bool, rear: bool,
     unseen: Array | None = None,
 ) -> Escape | None:  # fmt: skip
-    """The escape motion, or None if both ends are blocked or it is too short.
+    """Return the escape motion, or None if both ends are blocked or the motion is too short.
 
     Args:
         config: distances and angle.
-        geometry: the truck's.
-        footprint: its outline.
-        points: shape (n, 2), obstacles in the base frame, m.
-        crab: the vehicle can set both axles alike.
-        rear: the rear axle steers.
-        unseen: shape (n, 2), ground in the base frame onto which it must not back, m.
+        geometry: steering geometry of the truck.
+        footprint: footprint of the truck.
+        points: obstacles in the base frame (m), shape (n, 2).
+        crab: whether the vehicle can set both axles to the same angle.
+        rear: whether the rear axle steers.
+        unseen: unseen ground in the base frame (m), shape (n, 2); the truck must not back onto it.
     """
     sides = blocked_sides(footprint, points, config.room)
     ahead, behind = not sides.front, not sides.rear
@@ -104,7 +104,7 @@ def _motion(
 
 
 def _before(motion: Escape, contact: int | None) -> Escape | None:
-    """A motion up to the pose before a contact; None if that is too short."""
+    """Return a motion up to the pose before a contact; None if that is too short."""
     poses = motion.poses[:contact]
-    # 0.04: least length of an escape motion, m
+    # 0.04: minimum length of an escape motion (m)
     return replace(motion, poses=poses) if (len(poses) - 1) * ESCAPE_POSE_STEP >= 0.04 else None

@@ -1,4 +1,4 @@
-"""Inputs and outputs of the planning step and the deforming step; light, as the daemon's loop imports them."""
+"""Inputs and outputs of the planning and deforming steps; lightweight, as the daemon's loop imports them."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -16,12 +16,12 @@ from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Ground, Odometry
 
 Place = tuple[float, float, float | None]
-"""x, y (m), and yaw (rad) if it matters."""
+"""x, y (m), and yaw (rad), or None for any yaw."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What planning and deforming are made for; comes first, and again after every restart."""
+    """Settings and robot data for planning and deforming; sent first, and again after every restart."""
 
     config: PlannerConfig
     geometry: FourWheelSteering
@@ -29,21 +29,21 @@ class Setup:
     lidar: Pose2 = (0.0, 0.0, 0.0)
     """Pose of the lidar in base."""
     cusp_clearance: float = 0.0
-    """Clearance that the gate demands at a cusp, m."""
+    """Clearance required by the gate at a cusp (m)."""
     seen_for: float | None = None
-    """Age up to which seen ground counts as seen by the gate, s; None = it lets the robot reverse anywhere."""
+    """Maximum age of seen ground in the gate (s); None if the gate lets the robot reverse anywhere."""
     timed: bool = False
-    """Whether the route planner works for its time or for its effort: only the latter is reproducible."""
+    """Whether the time budget limits the route planner, or else its effort budget; only the latter is reproducible."""
 
 
 @dataclass(frozen=True, slots=True)
 class SeenScan:
-    """A scan taken on the way, in the map's frame."""
+    """Scan taken while driving, in the map frame."""
 
     points: Array
-    """Shape (n, 2): its returns, m."""
+    """Returns of the scan (m), shape (n, 2)."""
     sensor: Array
-    """Shape (2,): where it was taken, m."""
+    """Position of the sensor (m), shape (2,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,125 +53,125 @@ class SeenGround:
     grid: Grid
     """See ``topics.SEEN``."""
     pose: Pose2
-    """Of the grid's frame in the map's frame."""
+    """Pose of the grid frame in the map frame."""
     field: tuple[float, float]
-    """Least and greatest bearing that the lidar measures, rad."""
+    """Minimum and maximum bearing of the lidar (rad)."""
     reach: float
-    """Its range, m."""
+    """Range of the lidar (m)."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanTask:
-    """One thing to plan."""
+    """Planning request."""
 
     what: Literal["route", "escape"]
     pose: Pose2
-    """Of the base, in the map's frame."""
+    """Pose of the base in the map frame."""
     goal: Pose2
-    """Of the base."""
+    """Goal pose of the base."""
     points: Array
-    """Shape (n, 2): returns of the newest scan in the map's frame, m."""
+    """Returns of the latest scan in the map frame (m), shape (n, 2)."""
     setup: Setup | None = None
     grid: Grid | None = None
-    """A newer map than before."""
+    """Map, if newer than in the previous task."""
     ground: Ground | None = None
-    """Newer tilt and roughness of the ground than before."""
+    """Tilt and roughness of the ground, if newer than in the previous task."""
     clear: bool = False
-    """Forget obstacles of older scans, but for those near the truck, and the route so far."""
+    """Discard obstacles of older scans, except those near the truck, and the current route."""
     afresh: bool = False
-    """Forget the route so far."""
+    """Discard the current route."""
     via: tuple[Place, ...] = ()
-    """Places of the base to be passed before the goal."""
+    """Waypoints of the base before the goal."""
     deviation: float = 0.0
-    """Standard deviation of the position, m."""
+    """Standard deviation of the position (m)."""
     seen: tuple[SeenScan, ...] = ()
-    """Scans taken since the task before, oldest first."""
+    """Scans since the previous task, oldest first."""
     ground_seen: SeenGround | None = None
-    """None = not known: routes may reverse anywhere."""
+    """Seen ground; None if unknown: routes may reverse anywhere."""
 
 
 @dataclass(frozen=True, slots=True)
 class RouteAnswer:
-    """A path to drive, or the reason why there is none."""
+    """Path to drive, or the reason why there is none."""
 
     reason: Reason
     text: str = ""
     path: PosePath | None = None
     """Path of the base, or None."""
     length: float = 0.0
-    """Metres."""
+    """Length of the path (m)."""
     cost: float = 0.0
-    """Metres, with all prices."""
+    """Cost of the path including all penalties (m)."""
     kept: bool = False
-    """Whether it is the rest of the previous route."""
+    """Whether the path is the rest of the previous route."""
     drivable: bool = True
-    """Whether the truck can drive it; else its poses only show where to go."""
+    """Whether the truck can drive the path; otherwise its poses are only a guide."""
     complete: bool = True
-    """Whether it leads to the goal; else it is the beginning of a route too long for one path."""
+    """Whether the path leads to the goal; otherwise it is the first part of a route too long for one path."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeformTask:
-    """One scan, with what is newer than at the scan before."""
+    """A scan, and data newer than the previous scan."""
 
     scan: LaserScan
     pose: Pose2
-    """Of the base, in the map's frame."""
+    """Pose of the base in the map frame."""
     setup: Setup | None = None
     grid: Grid | None = None
     route: PosePath | None = None
-    """Route of the base to deform."""
+    """Base route to deform."""
     number: int = 0
-    """Number of this route."""
+    """Number of the route."""
     drivable: bool = True
-    """Whether the truck can drive it; else a local path along it is always driven."""
+    """Whether the truck can drive the route; otherwise it always drives a local path along it."""
     deviation: float = 0.0
-    """Standard deviation of the position, m."""
+    """Standard deviation of the position (m)."""
     stamp: int = 0
-    """Of the pose, ns."""
+    """Time stamp of the pose (ns)."""
     twist: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Vx, vy, wz of the base since the scan, m/s and rad/s."""
+    """Vx, vy (m/s), wz (rad/s) of the base since the scan."""
 
 
 Finding = Literal["idle", "free", "kept", "new", "blocked"]
-"""No route yet; the route is free; the deformed path is kept; here is a new one; there is none."""
+"""No route yet; route free; deformed path kept; new deformed path; no path found."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeformAnswer:
-    """What becomes of the route."""
+    """Result of deforming the route."""
 
     number: int
-    """The route's."""
+    """Number of the route."""
     finding: Finding
     reason: Reason = Reason.OK
-    """Of a new path PATH_PARTIAL if only its beginning is free; of none why."""
+    """PATH_PARTIAL if only the beginning of a new path is free; without a path, the cause."""
     text: str = ""
     place: int = 0
-    """Index of the route's pose that the truck has come to."""
+    """Index of the route pose that the truck has reached."""
     complete: bool = False
-    """The path leads to the route's end."""
+    """Whether the path leads to the end of the route."""
     path: PosePath | None = None
-    """The new path, of the base."""
+    """New path of the base."""
 
 
 def level(scan: LaserScan, config: PlannerConfig) -> bool:
-    """Whether the plane of a scan was level enough to show obstacles; true where its tilt is not known."""
+    """Whether the plane of a scan was level enough to show obstacles; true if its tilt is unknown."""
     return scan.tilt is None or scan.tilt <= config.max_tilt
 
 
 def placeless(slam: SlamHealth | None) -> str:
-    """Why the pose in map means nothing, by the newest state of the mapping; empty if it does, or there is none."""
+    """Return why the pose in map is invalid, from the latest slam health; empty if it is valid or without slam."""
     if slam is None or slam.standing not in PLACELESS:
         return ""
     return f"its place on the saved map is not known ({slam.standing})"
 
 
 def require_place(slam: SlamHealth | None) -> None:
-    """Whether the pose in map means something, by the newest state of the mapping; None = there is none.
+    """Require a valid pose in map, from the latest slam health (None without slam).
 
     Raises:
-        RequestRefusedError: it does not: the robot has not found its place on its saved map.
+        RequestRefusedError: the robot has not found its place on its saved map.
     """
     if why := placeless(slam):
         hint = "`monstertruckd drive` it a metre or two there, by which it finds itself"
@@ -179,15 +179,15 @@ def require_place(slam: SlamHealth | None) -> None:
 
 
 def explained_within(config: PlannerConfig, deviation: float) -> float:
-    """Distance from the map's obstacles at which returns are taken for those, m, at a deviation of the position."""
+    """Maximum distance of a return from a map obstacle that explains it (m), for a position deviation (m)."""
     return config.scan_tolerance + min(2.0 * deviation, config.scan_tolerance)
 
 
 def pose_of(odometry: Odometry) -> Pose2:
-    """x, y (m), yaw (rad)."""
+    """Return the pose: x, y (m), yaw (rad)."""
     return odometry.pose.x, odometry.pose.y, odometry.pose.yaw
 
 
 def twist_of(odometry: Odometry) -> tuple[float, float, float]:
-    """Vx, vy (m/s), wz (rad/s)."""
+    """Return the twist: vx, vy (m/s), wz (rad/s)."""
     return odometry.twist.vx, odometry.twist.vy, odometry.twist.wz

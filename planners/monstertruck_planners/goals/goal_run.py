@@ -1,7 +1,7 @@
-"""The pursuit of one goal: a pure state machine. Equal observations give equal decisions.
+"""Pure state machine that drives to one goal: equal observations give equal decisions.
 
-It plans, has the route followed, plans again when something stands on it or the truck left it, and tries the recovery
-behaviours in turn when that does not help. Every decision is reported with its reason.
+It plans a route and has it followed, replans when the route is blocked or the truck has left it, and tries the recovery
+behaviours in turn if replanning does not help. Every decision is reported with its reason.
 """
 
 import math
@@ -28,48 +28,48 @@ REFUSED: Final = frozenset(
         Reason.UNSEEN_STOP,
     }
 )
-"""Why a goal is refused if its first route fails; later on these may be passing trouble."""
+"""Reasons that refuse a goal if its first route fails; later they may be temporary."""
 
 ENDED: Final = frozenset({Reason.GOAL_REACHED, Reason.GOAL_MISSED})
-"""What the tracker says at the end of a path."""
+"""Tracker outcomes at the end of a path."""
 
 LEFT: Final = frozenset({Reason.PATH_LOST, Reason.CUSP_MISSED, Reason.UNSEEN_STOP})
-"""What it says where it leaves a path, to be planned again from there."""
+"""Tracker outcomes when the truck leaves a path; the goal run replans from there."""
 
 
 MISSES: Final = 5
-"""Routes that may end short of the goal's tolerance."""
+"""Maximum number of routes that end outside the goal tolerance."""
 
 BLOCKS: Final = 2
-"""Times a route may be blocked again before the truck has got on."""
+"""Maximum number of blocked routes without progress of the truck."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Ask for a route or a way out."""
+    """Request a route or an escape path."""
 
     what: Literal["route", "escape"] = "route"
     clear: bool = False
-    """Forget older obstacles and the route so far."""
+    """Discard older obstacles and the current route."""
     afresh: bool = False
-    """Forget only the route so far."""
+    """Discard only the current route."""
 
 
 @dataclass(frozen=True, slots=True)
 class Follow:
-    """Have this driven."""
+    """Drive this path."""
 
     answer: RouteAnswer
 
 
 @dataclass(frozen=True, slots=True)
 class Halt:
-    """Come to rest."""
+    """Stop the truck."""
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """An event."""
+    """Event to report."""
 
     reason: Reason
     severity: Severity
@@ -81,79 +81,79 @@ Action = Plan | Follow | Halt | Report
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """What is known at one instant."""
+    """Observations at one instant."""
 
     now: float
-    """Seconds."""
+    """Time (s)."""
     armed: bool
-    """The gate lets the truck move."""
+    """Whether the gate lets the truck move."""
     at_rest: bool
     pose: Pose2 | None
-    """Of the base, in the goal's frame."""
+    """Pose of the base in the frame of the goal."""
     answer: RouteAnswer | None = None
-    """The newest plan, once."""
+    """New answer of the planner, passed once."""
     outcome: Reason | None = None
-    """What the tracker says of the present path; None before it says something."""
+    """Tracker outcome on the current path; None until there is one."""
     along: float = 0.0
-    """Metres driven on it."""
+    """Distance travelled on the current path (m)."""
     left: float = math.inf
-    """Metres of the route ahead."""
+    """Remaining length of the route (m)."""
     blocked: bool = False
-    """The newest scan shows something on the way ahead."""
+    """Whether the latest scan shows an obstacle on the path ahead."""
     unseen: bool = False
-    """The gate stops the truck before ground that no sensor has seen."""
+    """Whether the gate stops the truck before ground that no sensor has seen."""
     estopped: bool = False
-    """The emergency stop is latched."""
+    """Whether the emergency stop is latched."""
     placeless: str = ""
-    """Why the pose means nothing."""
+    """Why the pose is invalid; empty if it is valid."""
     held: str = ""
-    """What keeps the truck from being armed, in words."""
+    """Description of the reason why the truck is not armed."""
 
 
 @dataclass(frozen=True, slots=True)
 class GoalRun:
-    """One goal and how far it has come."""
+    """A goal and its progress."""
 
     number: int
     goal: Pose2
     source: str
     now: float
     via: tuple[Place, ...] = ()
-    """Still to be passed."""
+    """Waypoints still to pass."""
     phase: GoalPhase = GoalPhase.PLANNING
     outcome: Reason = Reason.DRIVING
     text: str = ""
     planned: Literal["route", "escape"] = "route"
-    """What is being planned."""
+    """Kind of path being planned."""
     since: float = 0.0
-    """Begin of the phase, s."""
+    """Start of the phase (s)."""
     elapsed: float = 0.0
     unarmed: float = 0.0
-    """Seconds it has waited for the truck to be armed."""
+    """Time waited for the truck to be armed (s)."""
     best: float = 0.0
-    """Metres of the present path driven when progress was last observed."""
+    """Distance travelled on the current path at the last observed progress (m)."""
     moved: float = 0.0
-    """When progress was last seen, s."""
+    """Time of the last observed progress (s)."""
     blocked_scans: int = 0
-    """Scans in a row that showed the way blocked."""
+    """Number of consecutive scans that showed the path blocked."""
     blocks: int = 0
     nearest: float = math.inf
-    """Least remaining length of any route so far, m."""
+    """Minimum remaining length of all routes so far (m)."""
     recovery_distance: float = math.inf
-    """That length when the last recovery behaviour began, m."""
+    """Value of ``nearest`` when the last recovery behaviour began (m)."""
     partial: bool = False
-    """The present route ends before the goal: it is too long for one path."""
+    """Whether the current route ends before the goal, as the whole route is too long for one path."""
     misses: int = 0
     error: float = math.inf
-    """Least that it was off before a correction, as the greater share of its tolerances."""
+    """Minimum goal error before a correction, as the larger fraction of the two tolerances."""
     next_recovery: int = 0
-    """Index of the recovery behaviour to be tried next."""
+    """Index of the next recovery behaviour."""
     routes: int = 0
     recoveries: int = 0
 
     @property
     def active(self) -> bool:
-        """Whether it is still pursued."""
+        """Whether the goal is still active."""
         return self.phase is not GoalPhase.IDLE
 
 
@@ -161,7 +161,7 @@ Step = tuple[GoalRun, tuple[Action, ...]]
 
 
 def begin(number: int, goal: Pose2, source: str, now: float, via: tuple[Place, ...] = ()) -> Step:
-    """Take on a goal."""
+    """Start a goal."""
     run = GoalRun(number, goal, source, now, via, since=now, moved=now)
     x, y, yaw = goal
     through = f" by way of {len(via)} waypoints" if via else ""
@@ -170,7 +170,7 @@ def begin(number: int, goal: Pose2, source: str, now: float, via: tuple[Place, .
 
 
 def order(run: GoalRun, what: GoalOrder, source: str, now: float) -> Step:
-    """Pause, resume or cancel; what does not fit is passed over."""
+    """Pause, resume or cancel; ignore an order that does not fit the phase."""
     by = f"goal {run.number}, by {source}"
     if what is GoalOrder.CANCEL and run.active:
         return _end(run, Reason.CANCELLED, f"cancelled by {source}", Severity.INFO)
@@ -184,13 +184,13 @@ def order(run: GoalRun, what: GoalOrder, source: str, now: float) -> Step:
 
 
 def displaced(run: GoalRun, text: str) -> Step:
-    """Another source's path is followed: end without touching it."""
+    """End the goal without stopping the truck, because it follows the path of another source."""
     ended, actions = _end(run, Reason.CANCELLED, text, Severity.WARNING)
     return ended, tuple(action for action in actions if not isinstance(action, Halt))
 
 
 def tick(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
-    """One step with new observations."""
+    """Advance the state machine with new observations."""
     passed, phase, run = observed.now - run.now, run.phase, replace(run, now=observed.now)
     if phase is GoalPhase.IDLE:
         return run, ()
@@ -232,7 +232,7 @@ def _planned(run: GoalRun, observed: Observations, answer: RouteAnswer, config: 
         if run.routes == 0 and answer.reason in REFUSED:
             return _end(run, answer.reason, answer.text)
         return _recover(run, answer.reason, answer.text, config)
-    # 0.01: a route shorter than this is none, m: the truck stands at the goal
+    # 0.01: with a shorter route (m) the truck is already at the goal
     if answer.length < 0.01 and not run.via and observed.pose is not None:
         return _arrived(replace(run, routes=run.routes + 1), observed, config)
     kind = "the rest of the route before" if answer.kept else "a new route"
@@ -244,7 +244,7 @@ def _planned(run: GoalRun, observed: Observations, answer: RouteAnswer, config: 
 
 
 def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
-    """Driving, or backing out."""
+    """Handle the phases DRIVING and BACKING_OUT."""
     if not observed.armed:
         return run, ()
     backing = run.phase is GoalPhase.BACKING_OUT
@@ -279,10 +279,10 @@ def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
 
 
 def _progressed(run: GoalRun, left: float, config: PlannerConfig) -> GoalRun:
-    """What starts again as the truck makes progress.
+    """Reset counters as the truck makes progress.
 
-    The recovery behaviours do so only nearer to the goal than when the last one began: driving to and fro between two
-    routes that are both blocked is no progress.
+    The recovery behaviours restart only when the truck is nearer to the goal than when the last one began: driving back
+    and forth between two blocked routes is not progress.
     """
     run = replace(run, nearest=min(run.nearest, left))
     if run.best > config.recovered:
@@ -295,7 +295,7 @@ def _at_waypoint(run: GoalRun, pose: Pose2 | None, config: PlannerConfig) -> boo
 
 
 def _arrived(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
-    """The end of the route: is it the goal?"""
+    """Check the goal tolerance at the end of the route: end the goal, or correct the pose."""
     assert observed.pose is not None
     away, turned = apart(observed.pose, run.goal)
     off = f"{away:.3f} m and {turned:.3f} rad away"
@@ -359,11 +359,11 @@ def _end(run: GoalRun, reason: Reason, text: str, severity: Severity = Severity.
 
 
 def _error(pose: Pose2, goal: Pose2, config: PlannerConfig) -> float:
-    """How far a pose is off a goal, as the greater share of its tolerances."""
+    """Return the error of a pose at a goal, as the larger fraction of the two tolerances."""
     away, turned = apart(pose, goal)
     return max(away / config.position_tolerance, turned / config.yaw_tolerance)
 
 
 def apart(a: Pose2, b: Pose2) -> tuple[float, float]:
-    """Distance, m, and angle, rad, between two poses."""
+    """Return the distance (m) and the angle (rad) between two poses."""
     return math.dist(a[:2], b[:2]), abs(math.remainder(a[2] - b[2], math.tau))

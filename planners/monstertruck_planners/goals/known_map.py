@@ -1,4 +1,4 @@
-"""Publishes the map over which a robot without mapping plans, so that operators see it."""
+"""Publishes the planning map of a robot without mapping, so that operators see it."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from monstertruck_runtime.map_files import WorldMap
 
 Offload = Callable[[Callable[[], "WorldMap"]], Awaitable["WorldMap"]]
-"""Runs a function that takes a file system's time."""
+"""Runs a function that accesses the file system."""
 
 NAME: Final = ServiceName.KNOWN_MAP.value
 
 
 class KnownMapService:
-    """Reads the planner's map once and publishes it; the topic retains it.
+    """Reads the planning map once and publishes it on a retained topic.
 
     Args:
         place: map_server YAML, or the folder of a saved map.
         frame: frame of the map.
-        clock: time.
-        out: ``state/map``.
-        events: where events go.
-        offload: reads the file beside the event loop.
+        clock: time source.
+        out: publisher of ``state/map``.
+        events: event sink.
+        offload: reads the file outside the event loop.
     """
 
     name = NAME
@@ -47,7 +47,7 @@ class KnownMapService:
         """Publish, then wait until cancelled."""
         try:
             self._publish(await self._offload(self._load))
-        except InputError as error:  # the planner refuses it by itself
+        except InputError as error:  # the planner also refuses it
             self._events(Reason.FILE_DAMAGED, Severity.WARNING, NAME, f"{error}; operators see no map")
         ready()
         await asyncio.Event().wait()

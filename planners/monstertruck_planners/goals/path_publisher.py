@@ -1,4 +1,4 @@
-"""Paths for the tracker: published, checked against scans, ended early; and standstill without disarming."""
+"""Paths for the tracker: publishing, checking against scans, early end; and standstill without disarming."""
 
 import contextlib
 from dataclasses import dataclass
@@ -27,23 +27,23 @@ from monstertruck_schemas.state import GateState, Grid, Ground, Odometry
 
 SOURCE: Final = ServiceName.GOALS.value
 AT_REST: Final = 0.01
-"""Speed of a truck at rest, m/s."""
+"""Maximum speed of a truck at rest (m/s)."""
 
 
 @dataclass(frozen=True, slots=True)
 class GoalInputs:
-    """What the goal service reads."""
+    """Inputs of the goal service."""
 
     goals: Mailbox[GoalRequest]
     controls: Mailbox[GoalControl]
     gate: Subscription[GateState]
     pose: Subscription[Odometry]
-    """In the paths' frame."""
+    """Pose in the frame of the paths."""
     tracker: Subscription[TrackerState]
     path: Subscription[Path]
     scan: Subscription[LaserScan] | None
     grid: Subscription[Grid] | None
-    """None = the configured map."""
+    """Map topic; None for the configured map."""
     ground: Subscription[Ground] | None = None
     behaviour: Subscription[BehaviourState] | None = None
     slam: Subscription[SlamHealth] | None = None
@@ -52,7 +52,7 @@ class GoalInputs:
 
 @dataclass(frozen=True, slots=True)
 class GoalOutputs:
-    """What it writes."""
+    """Outputs of the goal service."""
 
     path: Publisher[Path]
     planner_request: Publisher[DriveRequest]
@@ -62,32 +62,32 @@ class GoalOutputs:
 
 @dataclass(frozen=True)
 class Followed:
-    """Path that the tracker follows."""
+    """Path followed by the tracker."""
 
     message: Path
     path: PosePath
-    """Content of ``message``."""
+    """Decoded ``message``."""
     before: float = 0.0
-    """Metres driven on the paths that it was deformed from."""
+    """Distance travelled on the paths from before its deformation (m)."""
 
     def report(self, newest: TrackerState | None) -> TrackerState | None:
-        """What the tracker says of it; None while that speaks of another path."""
+        """Return the tracker report on this path; None while the tracker reports on another path."""
         return newest if newest is not None and newest.path == self.message.name else None
 
     def along(self, newest: TrackerState | None) -> float:
-        """Metres driven on it."""
+        """Return the distance travelled on this path (m)."""
         report = self.report(newest)
         return 0.0 if report is None else report.along
 
 
 class PathPublisher:
-    """Publishes paths and remembers the one that is followed.
+    """Publishes paths and keeps the followed one.
 
     Args:
-        clock: time.
-        inputs: topics read.
-        outputs: topics written.
-        deceleration: with which the tracker brakes, m/s^2.
+        clock: time source.
+        inputs: input topics.
+        outputs: output topics.
+        deceleration: braking deceleration of the tracker (m/s^2).
     """
 
     def __init__(self, clock: Clock, inputs: GoalInputs, outputs: GoalOutputs, deceleration: float) -> None:
@@ -97,30 +97,30 @@ class PathPublisher:
 
     @property
     def driving(self) -> bool:
-        """Whether the tracker is on its way along what is followed."""
+        """Whether the tracker is driving along the followed path."""
         report = None if self.followed is None else self.followed.report(self._in.tracker.latest)
         return report is not None and report.outcome is Reason.DRIVING
 
     @property
     def displaced(self) -> bool:
-        """Whether another source's path is followed."""
+        """Whether the tracker follows the path of another source."""
         return self.followed is not None and self._in.path.latest is not self.followed.message
 
     def follow(self, path: PosePath, name: str, before: float = 0.0) -> None:
-        """Have a path driven.
+        """Publish a path for the tracker to drive.
 
         Args:
-            path: of the base.
-            name: of it; a number is added.
-            before: metres driven already on the route that it is part of.
+            path: path of the base.
+            name: name of the path; a number is appended.
+            before: distance already travelled on its route (m).
         """
         self._publish(path, name, before)
 
     def brake(self, name: str, *, halts: bool = False) -> None:
-        """Let what is followed end as soon as the tracker can brake; of a truck at rest, where it stands.
+        """End the followed path as soon as the tracker can brake, or in place if the truck is at rest.
 
         Args:
-            name: of the path that is left.
+            name: name of the remaining path.
             halts: see ``Path``.
         """
         odometry, followed = self._in.pose.latest, self.followed
@@ -128,7 +128,7 @@ class PathPublisher:
             return
         speed, report = abs(odometry.twist.vx), followed.report(self._in.tracker.latest)
         driven = followed.before + followed.along(report)
-        standstill_path = 0.01  # length of a path that leads nowhere, m
+        standstill_path = 0.01  # length of a path for standing still (m)
         if speed > AT_REST and report is not None:
             rest = speed * speed / (2 * self._deceleration) + standstill_path
             path = followed.path
@@ -139,12 +139,12 @@ class PathPublisher:
             self._publish(PosePath(placed(ahead, pose_of(odometry)), np.ones(2)), name, driven, halts=halts)
 
     def halt(self, name: str) -> None:
-        """Brake, and follow nothing."""
+        """Brake and stop following a path."""
         self.brake(name, halts=True)
         self.followed = None
 
     def end_other(self, name: str) -> None:
-        """Let a path that another source published, as the configured one, end as soon as the tracker can brake."""
+        """End a path of another source, such as the configured one, as soon as the tracker can brake."""
         path = self._in.path.latest
         if path is not None and not path.halts and (self.followed is None or path is not self.followed.message):
             with contextlib.suppress(InputError):  # the tracker has refused it, too
@@ -152,12 +152,12 @@ class PathPublisher:
                 self.halt(name)
 
     def stand_still(self) -> None:
-        """Ask the gate for standstill, so that the truck stays armed while nothing is driven."""
+        """Request standstill from the gate, so that the truck stays armed while it follows no path."""
         gate, now = self._in.gate.latest, self._clock.now()
         if self.driving or gate is None or not gate.mode.active:
             return
         requests = self._out.planner_request
-        # 0.25: lease of the request to stand still, s
+        # 0.25: lease of the standstill request (s)
         requests.put(planner_request(requests.next_seq(), gate, now, SOURCE, 0.25, speed=0.0, front=0.0, rear=0.0))
 
     def _publish(self, path: PosePath, name: str, before: float, *, halts: bool = False) -> None:
@@ -182,18 +182,18 @@ class PathPublisher:
 
 
 def poses_ahead(path: PosePath, along: float, reach: float, pose: Pose2) -> Array:
-    """The truck's pose, then the path's poses from ``along`` to ``along + reach``, one every few centimetres.
+    """Return the pose of the truck and the path poses from ``along`` to ``along + reach``, a few centimetres apart.
 
     Args:
-        path: of the base.
-        along: where the truck is, m.
-        reach: m.
-        pose: the truck's own.
+        path: path of the base.
+        along: position of the truck along the path (m).
+        reach: length to return (m).
+        pose: pose of the truck.
     """
     poses, travelled = path.poses, path.travelled
     first, last = np.searchsorted(travelled, (along, along + reach), side="right")
     chosen = poses[first : last + 1]
-    check_step = 0.05  # metres between two poses of a path check
+    check_step = 0.05  # spacing of the poses of a path check (m)
     if len(chosen) > 2:
         length = max(travelled[min(last, len(poses) - 1)] - along, check_step)
         spacing = max(round(check_step * (len(chosen) - 1) / length), 1)
@@ -202,28 +202,28 @@ def poses_ahead(path: PosePath, along: float, reach: float, pose: Pose2) -> Arra
 
 
 def path_blocked(footprint: Footprint, poses: Array, points: Array, at: Pose2) -> bool:
-    """Whether the footprint driven along ``poses`` (m, 3) comes upon a point of a scan.
+    """Whether the footprint touches a point of a scan when driven along ``poses``, shape (m, 3).
 
     Args:
-        footprint: the truck.
-        poses: in the map's frame, the truck's own first.
-        points: shape (n, 2), returns in the base frame.
-        at: pose of the base in the map's frame.
+        footprint: footprint of the truck.
+        poses: poses in the map frame, starting with the pose of the truck.
+        points: returns in the base frame, shape (n, 2).
+        at: pose of the base in the map frame.
     """
     return first_contact(footprint, poses_relative(poses, at), points) is not None
 
 
 def kept_poses(travelled: Array, along: float, rest: float, cusps: NDArray[np.intp]) -> slice:
-    """Poses of a path that are kept if it is to end ``rest`` metres behind ``along``; two at least.
+    """Return the poses to keep if a path is to end ``rest`` (m) after ``along``; at least two.
 
-    None before that: a path may come back over its beginning, and that is not to be driven again. Nor any behind the
-    next cusp: the truck comes to rest there anyway.
+    Earlier poses are dropped: a path may pass its start again, which must not be driven twice. Poses after the next
+    cusp are dropped too: the truck comes to rest there anyway.
 
     Args:
-        travelled: shape (n,), metres from the path's start.
-        along: where the truck is, m.
-        rest: m.
-        cusps: shape (k,), indices of the poses at which it comes to rest.
+        travelled: distance from the start of the path (m), shape (n,).
+        along: position of the truck along the path (m).
+        rest: remaining length (m).
+        cusps: indices of the poses where the truck comes to rest, shape (k,).
     """
     first = min(max(int(np.searchsorted(travelled, along, side="right")) - 1, 0), len(travelled) - 2)
     end = max(int(np.searchsorted(travelled, along + rest)), first + 1)

@@ -1,10 +1,9 @@
-"""The planning step: map and newest scan in, a drivable path out. For workers.
+"""Planning step: computes a drivable path from the map and the latest scan. For workers.
 
-It remembers the map, the obstacles that scans showed and the map does not hold, and the route, which is kept while it
-is good.
+It keeps the map, the obstacles that scans show but the map lacks, and the route, which is reused while it is valid.
 
-An obstacle is kept until a scan sees through its place: a robot that looks ahead alone must not forget what stands
-behind it, so nothing is forgotten by age.
+An obstacle is kept until a scan sees through its place. Obstacles do not expire by age, because a robot that only looks
+ahead must not forget those behind it.
 """
 
 import logging
@@ -41,83 +40,83 @@ log = logging.getLogger(__name__)
 Cells = NDArray[np.int8]
 
 SQUARE: Final = 0.05
-"""Side of the squares by which obstacles that are not in the map are remembered, m."""
+"""Grid size of the remembered obstacles that are not in the map (m)."""
 NEARBY: Final = 1.5
-"""Distance within which obstacles count when backing out, and are kept, m."""
+"""Radius of the obstacles that are considered for backing out, and kept on ``clear`` (m)."""
 
 
 OVERLAPPING: Final = frozenset({Reason.START_BLOCKED, Reason.GOAL_UNREACHABLE})
-"""Why there is no route for a truck that overlaps an obstacle where it stands."""
+"""Reasons for no route if the truck overlaps an obstacle at its current pose."""
 ASSUMED_FREE: Final = 0.15
-"""Unknown ground within this distance of the truck counts as free, m."""
+"""Unknown ground within this distance of the truck is assumed free (m)."""
 
 BEAM_WIDTH: Final = 0.012
-"""Difference in bearing up to which a beam shows a place, rad: two steps of a URG-04LX."""
+"""Maximum bearing difference between a beam and a place it shows (rad): two steps of a URG-04LX."""
 SEEN_BEYOND: Final = 0.10
-"""Distance by which all these beams must reach beyond it, m."""
+"""Minimum reach of all these beams beyond the place (m)."""
 
 
 class ObstacleMemory:
-    """Places of obstacles in the map's frame, at most one for each square.
+    """Obstacle places in the map frame, at most one per square.
 
     Args:
-        square: m.
+        square: side of the squares (m).
     """
 
     def __init__(self, square: float) -> None:
         self._square = square
         self.places: Array = np.empty((0, 2))
-        """Shape (n, 2), m."""
+        """Active places (m), shape (n, 2)."""
         self.suspended: Array = np.empty((0, 2))
-        """Shape (k, 2), m: cleared by the map, not seen free by a scan. They count where the lidar does not look."""
+        """Places cleared but not seen free by a scan (m), shape (k, 2); active only where the lidar does not look."""
 
     def look(self, points: Array, sensor: Array) -> None:
-        """Remove places that a scan shows to be free; a bearing without a return does not.
+        """Remove places that a scan shows to be free; a bearing without a return shows nothing.
 
         Args:
-            points: shape (n, 2), the scan's returns.
-            sensor: shape (2,), where it was taken.
+            points: returns of the scan, shape (n, 2).
+            sensor: position of the sensor, shape (2,).
         """
         self.places = self.places[~seen_through(self.places, points, sensor)]
         self.suspended = self.suspended[~seen_through(self.suspended, points, sensor)]
 
     def keep(self, points: Array) -> None:
-        """Remember places, shape (n, 2)."""
+        """Add places, shape (n, 2)."""
         self.places = _one_per_square(np.vstack((self.places, points)), self._square)
 
     def suspend(self, where: NDArray[np.bool_]) -> None:
-        """Mark places, shape (n,), as suspended: they no longer count where the lidar looks."""
+        """Suspend the places in the mask ``where``, shape (n,): they are ignored where the lidar looks."""
         self.suspended = _one_per_square(np.vstack((self.suspended, self.places[where])), self._square)
         self.places = self.places[~where]
 
     def restore(self, where: NDArray[np.bool_]) -> None:
-        """Count suspended places, shape (k,), again."""
+        """Reactivate the suspended places in the mask ``where``, shape (k,)."""
         self.keep(self.suspended[where])
         self.suspended = self.suspended[~where]
 
     def drop_explained(self, unexplained: Callable[[Array], NDArray[np.bool_]]) -> None:
-        """Keep the places, shape (n, 2), of which ``unexplained`` is true, shape (n,)."""
+        """Keep only places with ``unexplained`` true; it maps shape (n, 2) to (n,)."""
         self.places = self.places[unexplained(self.places)]
         self.suspended = self.suspended[unexplained(self.suspended)]
 
 
 def seen_through(places: Array, points: Array, sensor: Array) -> NDArray[np.bool_]:
-    """Whether each place is free as a scan shows it: all its returns in that direction lie beyond.
+    """Return whether a scan shows each place to be free: all its returns in that direction lie beyond.
 
     Args:
-        places: shape (n, 2).
-        points: shape (m, 2), the scan's returns.
-        sensor: shape (2,), where it was taken.
+        places: places to test, shape (n, 2).
+        points: returns of the scan, shape (m, 2).
+        sensor: position of the sensor, shape (2,).
 
     Returns:
-        Shape (n,).
+        Mask of shape (n,).
     """
     if not len(places) or not len(points):
         return np.zeros(len(places), dtype=np.bool_)
     bearings, ranges = _polar(points - sensor)
     order = np.argsort(bearings)
     bearings, ranges = bearings[order], ranges[order]
-    # Once round on both sides, so that no window is cut at +-pi.
+    # Repeat the circle on both sides, so that no window is cut at +-pi.
     bearings = np.concatenate((bearings - 2 * np.pi, bearings, bearings + 2 * np.pi))
     ranges = np.tile(ranges, 3)
     towards, far = _polar(places - sensor)
@@ -131,19 +130,19 @@ def _polar(points: Array) -> tuple[Array, Array]:
 
 
 def _one_per_square(points: Array, square: float) -> Array:
-    """The first point of each square."""
+    """Return the first point of each square."""
     _, first = np.unique(np.floor(points / square).astype(np.int64), axis=0, return_index=True)
     return np.asarray(points[np.sort(first)])
 
 
 class StaticMap:
-    """The configured or built map.
+    """Configured or built map.
 
     Args:
-        cells: shape (rows, columns), percent, -1 unknown; row 0 at the lowest y.
-        resolution: m.
+        cells: occupancy (percent, -1 unknown), shape (rows, columns); row 0 at the lowest y.
+        resolution: cell size (m).
         origin: pose of the outer corner of cell (0, 0).
-        previous: the last map: only differences are computed again.
+        previous: last map; only differences are recomputed.
     """
 
     def __init__(self, cells: Cells, resolution: float, origin: Pose2, previous: "StaticMap | None" = None) -> None:
@@ -152,26 +151,26 @@ class StaticMap:
         self.origin = origin
         known = None if previous is None else previous.walls
         self.walls: DistanceField = DistanceField(cells >= OCCUPIED, resolution, origin, known)
-        """Distance to the map's obstacles."""
+        """Distance to the map obstacles."""
 
     @classmethod
     def of(cls, grid: Grid, previous: "StaticMap | None" = None) -> "StaticMap":
-        """From a message."""
+        """Create the map from a message."""
         cells = grid.cells.reshape(grid.height, grid.width)
         return cls(cells, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw), previous)
 
     def unexplained(self, points: Array, tolerance: float) -> NDArray[np.bool_]:
-        """Which points (n, 2) are further than ``tolerance`` from all obstacles of the map, m."""
+        """Return which points (n, 2) are further than ``tolerance`` (m) from all map obstacles."""
         return np.asarray(self.walls.lookup(points) > tolerance + self.resolution / 2)
 
     def with_points(self, points: Array) -> Cells:
-        """Cells with the points' ones occupied."""
+        """Return the cells, with every cell that contains a point occupied."""
         return np.where(
             marked(np.zeros(self.cells.shape, np.bool_), points, self.resolution, self.origin), 100, self.cells
         )
 
     def obstacles(self, cells: Cells, pose: Pose2, reach: float) -> Array:
-        """Centres of the occupied cells round a pose, shape (n, 2), in the frame of the pose."""
+        """Return the centres of occupied cells around a pose, in the frame of the pose, shape (n, 2)."""
         rows, columns = np.nonzero(cells >= OCCUPIED)
         centres = np.column_stack((columns + 0.5, rows + 0.5)) * self.resolution
         there = points_relative(points_placed(centres, self.origin), pose)
@@ -179,7 +178,7 @@ class StaticMap:
 
 
 def marked(cells: NDArray[np.bool_], points: Array, resolution: float, origin: Pose2) -> NDArray[np.bool_]:
-    """Cells of a grid (rows, columns) with those set that hold a point; points (n, 2) in the frame of ``origin``."""
+    """Set and return the grid cells (rows, columns) that contain a point; points (n, 2) in the frame of ``origin``."""
     column, row = (np.floor(v / resolution).astype(np.int64) for v in points_relative(points, origin).T)
     rows, columns = cells.shape
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
@@ -190,18 +189,18 @@ def marked(cells: NDArray[np.bool_], points: Array, resolution: float, origin: P
 def standing_free(
     cells: Cells, resolution: float, origin: Pose2, footprint: Footprint, pose: Pose2, beside: float = 0.0
 ) -> Cells:
-    """Cells with those under the truck set free: unknown ones, and obstacles that it overlaps by its edge only.
+    """Return the cells with those under the truck freed: unknown cells, and obstacles overlapped only at its edge.
 
-    A map is as exact as its cells: a truck next to a wall overlaps it by up to a cell. What it overlaps by more stays,
-    for then map or pose is wrong.
+    A map is as accurate as its cells: a truck next to a wall overlaps it by up to a cell. Deeper overlaps stay, as they
+    mean that the map or the pose is wrong.
 
     Args:
-        cells: shape (rows, columns), percent, -1 unknown.
-        resolution: m.
+        cells: occupancy (percent, -1 unknown), shape (rows, columns).
+        resolution: cell size (m).
         origin: pose of the outer corner of cell (0, 0).
-        footprint: the truck.
-        pose: of it, in the map's frame.
-        beside: unknown cells this near to it are free too, m.
+        footprint: footprint of the truck.
+        pose: pose of the truck in the map frame.
+        beside: unknown cells within this distance of the truck are freed too (m).
     """
     at = points_relative(np.array([pose[:2]]), origin)[0] / resolution
     reach = math.ceil((footprint.circumscribed_radius + beside) / resolution) + 1
@@ -213,7 +212,7 @@ def standing_free(
     centres = np.column_stack((column + 0.5, row + 0.5)) * resolution
     gap = rectangle_distance(footprint, np.array([pose]), points_placed(centres, origin))[0]
     unknown, touched = cells[row, column] < 0, resolution * math.sqrt(0.5)
-    # 1.5: cells by which the truck may overlap an obstacle of the map where it stands
+    # 1.5: maximum overlap of the standing truck with a map obstacle (cells)
     freed = np.where(unknown, gap < touched + beside, (gap < touched) & (gap > -1.5 * resolution))
     kept = cells.copy()
     kept[row[freed], column[freed]] = 0
@@ -221,9 +220,9 @@ def standing_free(
 
 
 def ground_layers(ground: Ground, grid: StaticMap, reach: float) -> tuple[Array, Array]:
-    """Worst tilt, rad, and roughness, m, within ``reach`` (m) of a map's cells, 0 where nothing is known.
+    """Return the worst tilt (rad) and roughness (m) within ``reach`` (m) of each map cell, 0 where unknown.
 
-    Both of the map's shape: what a vehicle meets whose middle is there.
+    Both have the shape of the map: the values for a vehicle with its centre at the cell.
     """
     pad = math.ceil(reach / ground.resolution)
     shape = np.array((ground.height, ground.width)) + 2 * pad
@@ -247,7 +246,7 @@ def ground_layers(ground: Ground, grid: StaticMap, reach: float) -> tuple[Array,
 
 
 def _cells_within(grid: StaticMap, corner: Pose2, size: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of a map's cells round a rectangle: the pose of its corner, and its height and width, m."""
+    """Return rows and columns of map cells around a rectangle, given its corner pose, height and width (m)."""
     corners = np.array([(x, y) for x in (0.0, size[1]) for y in (0.0, size[0])])
     box = points_relative(points_placed(corners, corner), grid.origin) / grid.resolution
     rows, columns = grid.cells.shape
@@ -258,28 +257,28 @@ def _cells_within(grid: StaticMap, corner: Pose2, size: Array) -> tuple[NDArray[
 
 
 class PlanningStep:
-    """Answers tasks one by one; without a clock equal tasks give equal answers."""
+    """Answers tasks in sequence; without a clock, equal tasks give equal answers."""
 
     def __init__(self) -> None:
         self._setup: Setup | None = None
         self._map: StaticMap | None = None
         self._without = Reason.NO_MAP, "no map yet"
-        """Why there is no map."""
+        """Reason and text if there is no map."""
         self._ground: Ground | None = None
         self._layers: tuple[Array, Array] | None = None
-        """Tilt and roughness of the map's cells."""
+        """Tilt and roughness of the map cells."""
         self._route_map: RouteMap | None = None
         self._memory = ObstacleMemory(SQUARE)
         self._route: MotionPath | None = None
         self._closed: Array = np.empty((0, 2))
-        """Shape (k, 2), m: unseen places onto which the present route must not reverse."""
+        """Unseen places onto which the current route must not reverse (m), shape (k, 2)."""
         self._now: Clock | None = None
 
     def step(self, task: PlanTask) -> RouteAnswer:
-        """Do one task.
+        """Carry out one task.
 
         Raises:
-            InputError: no setup came first.
+            InputError: the first task had no setup.
         """
         if task.setup is not None:
             self._set_up(task.setup)
@@ -325,7 +324,7 @@ class PlanningStep:
             self._map = StaticMap(world.cells, world.resolution, (*world.origin, 0.0))
 
     def _observe(self, setup: Setup, static_map: StaticMap, task: PlanTask) -> None:
-        """Update the remembered obstacles by a scan and by the newest map."""
+        """Update the remembered obstacles from the scans and the latest map."""
         memory = self._memory
         for scan in task.seen:
             memory.look(scan.points, scan.sensor)
@@ -338,9 +337,9 @@ class PlanningStep:
         memory.drop_explained(lambda places: static_map.unexplained(places, tolerance))
 
     def _plan(self, static_map: StaticMap, task: PlanTask) -> RouteAnswer:
-        """A route that does not reverse onto unseen ground, or one to where that can be seen.
+        """Plan a route that does not reverse onto unseen ground, or one to a lookout on that ground.
 
-        What one route would cover is closed to the next.
+        Unseen ground covered by one route is closed to the next.
         """
         self._closed = np.empty((0, 2))
         answer = self._plan_known(static_map, task)
@@ -348,7 +347,7 @@ class PlanningStep:
         if unseen is None or not answer.drivable or not len(met := self._met(unseen, answer)):
             return answer
         x, y = met.mean(axis=0).tolist()
-        for _ in range(2):  # routes planned around unseen ground, at most; each closes more of it
+        for _ in range(2):  # maximum number of routes around unseen ground; each closes more of it
             self._closed, self._route = np.vstack((self._closed, met)), None
             answer = self._plan_known(static_map, task)
             if answer.path is None:
@@ -362,16 +361,16 @@ class PlanningStep:
         return look or RouteAnswer(Reason.UNSEEN_STOP, text)
 
     def _look(self, static_map: StaticMap, task: PlanTask, unseen: Unseen) -> RouteAnswer | None:
-        """A route to a place from which the closed ground can be seen; None if none was found."""
+        """Plan a route to a lookout on the closed ground; None if none was found."""
         assert self._route_map is not None
         lookouts = unseen.lookouts(self._closed, self._route_map.field, self._planner.config.margin)
         if not len(lookouts):
             return None
-        # 5.0: weight of a metre backward where those are chosen: the robot comes to them forward
+        # 5.0: reverse cost when choosing lookouts, so that the robot reaches them driving forward
         ahead = replace(self._vehicle.reeds_shepp(), reverse_cost=5.0)
         there = np.array([self._vehicle.reference_pose(pose) for pose in lookouts])
         far = ahead.distance(np.tile(self._vehicle.reference_pose(task.pose), (len(there), 1)), there)
-        for index in np.argsort(far)[:4].tolist():  # places to look at it from to which a route is planned, at most
+        for index in np.argsort(far)[:4].tolist():  # maximum number of tried lookouts
             x, y, yaw = lookouts[index].tolist()
             answer = self._plan_known(static_map, replace(task, goal=(x, y, yaw), via=()))
             self._route = None
@@ -386,7 +385,7 @@ class PlanningStep:
         return np.empty((0, 2)) if answer.path is None else unseen.met(answer.path, self._route_map.field)
 
     def _unseen(self, task: PlanTask) -> Unseen | None:
-        """Unseen ground around the robot; None where it may reverse anywhere."""
+        """Return the unseen ground around the robot; None if it may reverse anywhere."""
         assert self._setup is not None
         seen, keep = task.ground_seen, self._setup.seen_for
         return (
@@ -396,7 +395,7 @@ class PlanningStep:
         )
 
     def _plan_known(self, static_map: StaticMap, task: PlanTask) -> RouteAnswer:
-        """A route that does not reverse into suspended places: those near it count again, then all."""
+        """Plan a route that does not reverse into suspended places; reactivate those near touched ones, then all."""
         answer = self._plan_once(static_map, task)
         for nearby in (NEARBY, math.inf):
             suspended = self._memory.suspended
@@ -410,7 +409,7 @@ class PlanningStep:
         return answer
 
     def _backs_into(self, answer: RouteAnswer, places: Array) -> NDArray[np.bool_]:
-        """Whether the backward motions of a route touch each place; shape (k,)."""
+        """Return whether the reverse motions of a route touch each place, shape (k,)."""
         assert self._setup is not None
         if answer.path is None or not len(places):
             return np.zeros(len(places), dtype=np.bool_)
@@ -424,7 +423,7 @@ class PlanningStep:
         assert self._setup is not None
         points = self._memory.places
         if len(points):
-            # An obstacle that touches the standing truck would make every route impossible; the gate checks it.
+            # An obstacle touching the standing truck would make every route impossible; the gate checks it.
             pose = np.array([task.pose])
             touching = rectangle_distance(self._setup.footprint, pose, points)[0] < 1.5 * static_map.resolution
             points = points[~touching]
@@ -477,13 +476,13 @@ class PlanningStep:
         )
 
     def _closed_cells(self, shape: tuple[int, ...], resolution: float, origin: Pose2) -> NDArray[np.bool_] | None:
-        """Cells of a grid with the closed unseen places; None without any."""
+        """Return the grid cells of the closed unseen places; None without any."""
         if not len(self._closed):
             return None
         return marked(np.zeros(shape, np.bool_), self._closed, resolution, origin)
 
     def _standing(self, static_map: StaticMap, cells: Cells, pose: Pose2) -> RouteMap:
-        """The map with the ground under the truck free, and with a margin if the truck is at its edge."""
+        """Return the map with free ground under the truck, padded in case the truck is at its edge."""
         assert self._setup is not None
         footprint = self._setup.footprint
         margin = math.ceil(2 * footprint.circumscribed_radius / static_map.resolution)
@@ -507,11 +506,11 @@ class PlanningStep:
 
     def _clearance(self, route_map: RouteMap, path: PosePath) -> Array:
         assert self._setup is not None
-        # 0.2: clearance of the poses of an answer is measured up to this, m
+        # 0.2: maximum measured clearance of the poses of an answer (m)
         return route_map.field.clearance(self._setup.footprint, path.poses, 0.2)
 
     def _cusp_clearance(self, route_map: RouteMap, result: RouteResult) -> float:
-        """Least clearance of the cusps, m; +inf of a route without any, -inf without a route."""
+        """Return the minimum clearance at the cusps (m); +inf without cusps, -inf without a route."""
         if result.path is None:
             return math.inf if result.ok else -math.inf
         path = result.path.base_path()
@@ -541,13 +540,13 @@ class PlanningStep:
         return RouteAnswer(Reason.OK, "", path, path.length, path.length)
 
     def _unseen_near(self, task: PlanTask) -> Array:
-        """Unseen places around the robot, in base, shape (n, 2), m."""
+        """Return the unseen places around the robot in base (m), shape (n, 2)."""
         unseen = self._unseen(task)
         return np.empty((0, 2)) if unseen is None else unseen.near(task.pose)
 
 
 def shortened(answer: RouteAnswer) -> RouteAnswer:
-    """The part of a path that fits one message: ``MAX_RUNS`` runs, ``MAX_POSES`` poses."""
+    """Return the part of a path that fits into one message: ``MAX_RUNS`` runs, ``MAX_POSES`` poses."""
     path = answer.path
     assert path is not None
     ends = [*path.stops[:MAX_RUNS].tolist(), len(path.poses) - 1]
@@ -560,10 +559,10 @@ def shortened(answer: RouteAnswer) -> RouteAnswer:
 
 
 class PlanningWorker(PlanningStep):
-    """The step in a worker, with its numba code compiled.
+    """Planning step in a worker, with its numba code compiled.
 
     Args:
-        configs: route planners whose code is compiled; default: all.
+        configs: route planners to compile; default: all.
     """
 
     def __init__(self, configs: Sequence[GoalConfig] = (HybridConfig(), LatticeConfig(), GridAstarConfig())) -> None:
@@ -576,5 +575,5 @@ class PlanningWorker(PlanningStep):
 
 
 def hybrid_worker() -> PlanningWorker:
-    """A worker that compiles the code of hybrid A* only, for robots that plan by it."""
+    """Create a worker that compiles only hybrid A*, for robots that plan with it."""
     return PlanningWorker((HybridConfig(),))

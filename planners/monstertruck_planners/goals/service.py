@@ -1,4 +1,4 @@
-"""The goal service: passes requests and observations to the state machine, and carries out its decisions."""
+"""Goal service: passes requests and observations to the state machine and carries out its decisions."""
 
 import asyncio
 import math
@@ -54,31 +54,31 @@ from monstertruck_schemas.state import GateMode, GateState, Grid, Ground, Odomet
 from monstertruck_schemas.topics import ODOMETRY, SCAN
 
 REPORT: Final = SECOND // 2
-"""Period of reports without a change, ns."""
+"""Report period without a change (ns)."""
 CHANGES: Final = ("phase", "outcome", "number", "routes", "recoveries")
-"""Fields of the report whose change is reported at once."""
+"""Report fields whose change triggers an immediate report."""
 JUMP: Final = 0.5
-"""Distance between the poses of two ticks that counts as a jump, m: the kept scans are dropped."""
+"""Minimum distance between the poses of two ticks that is a jump (m); a jump drops the kept scans."""
 
 Route = tuple[Pose2, tuple[Place, ...]]
-"""A goal, and what is passed before it."""
+"""Goal and its waypoints."""
 
 
 class GoalService:
-    """Drives to goals, one at a time; a new one replaces the present one, and any path that another source published.
+    """Drives to one goal at a time; a new goal replaces the current one and any path of another source.
 
-    An emergency stop ends a goal, and none is taken on before its reset. While a route is planned and none is followed,
-    it requests standstill of the gate, so that the truck stays armed.
+    An emergency stop ends a goal; new goals are refused until its reset. While a route is planned and none is followed,
+    the service requests standstill from the gate to keep the truck armed.
 
     Args:
-        setup: configuration and truck.
-        clock: time.
+        setup: configuration and truck data.
+        clock: time source.
         actor: computes the routes.
-        deceleration: of the tracker, m/s^2.
+        deceleration: deceleration of the tracker (m/s^2).
         max_age: see ``GateConfig.max_request_age``.
-        inputs: topics read.
-        outputs: topics written.
-        deformation: local planning around obstacles; None = routes are followed as planned.
+        inputs: input topics.
+        outputs: output topics.
+        deformation: local planning around obstacles; None to follow routes as planned.
     """
 
     name = ServiceName.GOALS.value
@@ -118,24 +118,24 @@ class GoalService:
         self._planning: asyncio.Task[RouteAnswer] | None = None
         self._actor: Actor | None = None
         self._trouble: TruckError | None = None
-        """Why the planner did not start the last time."""
+        """Why the planner failed to start last time."""
         self._tasks: asyncio.TaskGroup | None = None
         self._fresh = True
         self._sent_grid: Grid | None = None
         self._sent_ground: Ground | None = None
         self._scanned: tuple[LaserScan, Odometry] | None = None
         self._points: Array = np.empty((0, 2))
-        self._seen: deque[tuple[Pose2, Array]] = deque(maxlen=40)  # scans kept for the next plan, the newest
+        self._seen: deque[tuple[Pose2, Array]] = deque(maxlen=40)  # latest scans kept for the next plan
         """Poses and returns in base of scans since the last plan."""
         self._trail: deque[tuple[int, Pose2]] = deque()
-        """Times (ns) and poses of the last ticks."""
+        """Times (ns) and poses of recent ticks."""
         self._before: Pose2 | None = None
 
     async def run(self, ready: Ready) -> None:
         """Serve goals until cancelled.
 
         Raises:
-            TruckError: the planner does not start; until it does, goals are refused for that.
+            TruckError: the planner does not start; goals are refused until it does.
         """
         async with self._place as actor:
             try:
@@ -161,7 +161,7 @@ class GoalService:
     # Requests
 
     def _take_requests(self) -> None:
-        """Carry out requests that came by topic: a refusal becomes an event."""
+        """Carry out requests received by topic; report refusals as events."""
         requests: list[GoalRequest | GoalControl] = [*self._in.goals.drain(), *self._in.controls.drain()]
         for request in requests:
             try:
@@ -172,14 +172,14 @@ class GoalService:
 
     @property
     def running(self) -> bool:
-        """Whether a goal is pursued."""
+        """Whether a goal is active."""
         return self._goal is not None and self._goal.active
 
     def accept(self, request: GoalRequest | GoalControl) -> Route:
-        """Check a goal, whose route is planned once it has begun.
+        """Check a goal; its route is planned after ``begin``.
 
         Raises:
-            RequestRefusedError: the goal is not valid, there is no planner or pose, or the emergency stop is latched.
+            RequestRefusedError: invalid goal, no planner, no pose, or the emergency stop is latched.
         """
         assert isinstance(request, GoalRequest)
         if self._actor is None and self._trouble is not None:
@@ -207,7 +207,7 @@ class GoalService:
         return goal, via
 
     def begin(self, accepted: Route, request: GoalRequest | GoalControl, number: int) -> None:
-        """Pursue a goal in place of the present one."""
+        """Replace the current goal by a new one."""
         if self._goal is not None and self._goal.active:
             self._do(goal_run.order(self._goal, GoalOrder.CANCEL, request.source, self._seconds()))
         self._paths.end_other("standstill")
@@ -215,7 +215,7 @@ class GoalService:
         self._do(goal_run.begin(number, goal, request.source, self._seconds(), via))
 
     def control(self, request: GoalRequest | GoalControl) -> None:
-        """Pause, resume or cancel the present goal."""
+        """Pause, resume or cancel the current goal."""
         assert isinstance(request, GoalControl)
         assert self._goal is not None
         if request.order is GoalOrder.RESUME and self._goal.phase is GoalPhase.PAUSED:
@@ -223,24 +223,24 @@ class GoalService:
         self._do(goal_run.order(self._goal, request.order, request.source, self._seconds()))
 
     def hold(self, who: str, *, on: bool) -> None:
-        """Keep the truck armed between goals, by requests for standstill; for services that send several goals.
+        """Keep the truck armed between goals by requesting standstill, for services that send several goals.
 
-        A path of another source, as the configured one, is not followed any longer. While a behaviour runs there are
-        no such requests: its own keep the truck armed.
+        Ends a path of another source, such as the configured one. While a behaviour runs, its own requests keep the
+        truck armed, so no standstill is requested.
 
         Args:
-            who: the service.
-            on: until it is called with False.
+            who: name of the service.
+            on: whether to hold; lasts until a call with False.
         """
         if on and who not in self._held:
             self._paths.end_other("standstill")
         (self._held.add if on else self._held.discard)(who)
 
     async def settled(self, number: int) -> GoalState:
-        """State of a goal once its first route was found, or not.
+        """Wait until the first route of a goal is found, and return the state of the goal.
 
         Raises:
-            RequestRefusedError: none does, or another goal has taken its place.
+            RequestRefusedError: no route was found, or another goal has replaced it.
         """
         while (state := self.tasks.reported) is None or (state.number == number and _undecided(state)):
             await self.tasks.next_report()
@@ -292,7 +292,7 @@ class GoalService:
         )
 
     def _left(self, followed: Followed | None, along: float) -> float:
-        """Length of the route ahead, m; +inf without a route."""
+        """Return the remaining length of the route (m); +inf without a route."""
         if self._deformation is not None and self._deformation.active:
             return self._deformation.left
         return math.inf if followed is None else max(float(followed.path.travelled[-1]) - along, 0.0)
@@ -302,7 +302,7 @@ class GoalService:
         return odometry if odometry is not None and now - odometry.received <= ODOMETRY.fresh_for() * SECOND else None
 
     def _outcome(self, outcome: Reason) -> Reason:
-        """The tracker's outcome; a deformed path that ends before its route is still driven."""
+        """Return the outcome of the tracker; DRIVING at the end of a deformed path that ends before its route."""
         on_the_way = self._deformation is not None and not self._deformation.complete
         return Reason.DRIVING if on_the_way and outcome in goal_run.ENDED else outcome
 
@@ -317,12 +317,12 @@ class GoalService:
         return path_blocked(self._setup.footprint, ahead, points, pose)
 
     def _keep_scan(self, now: int) -> None:
-        """Keep poses and scans along the motion for the next plan, which then knows what is behind the truck."""
+        """Keep recent poses and scans for the next plan, so that it includes obstacles behind the truck."""
         odometry = self._odometry(now)
         pose = None if odometry is None else pose_of(odometry)
         if odometry is not None and pose is not None:
             self._keep_pose(odometry.stamp, pose)
-        # 4 * SECOND: time for which poses are kept, to place the ground seen, which is surveyed for a second, ns
+        # 4 * SECOND: retention of poses (ns), to locate the seen ground, whose survey takes a second
         while self._trail and now - self._trail[0][0] > 4 * SECOND:
             self._trail.popleft()
         if pose is None or self._before is None or math.dist(pose[:2], self._before[:2]) > JUMP:
@@ -334,7 +334,7 @@ class GoalService:
             self._seen.append((pose, points))
 
     def _keep_pose(self, stamp: int, pose: Pose2) -> None:
-        """Keep a pose; after a jump the poses before it move along: not the robot has moved, but the map's frame."""
+        """Keep a pose; after a jump, move the earlier poses along, as the map frame has jumped and not the robot."""
         if self._trail and math.dist(pose[:2], self._trail[-1][1][:2]) > JUMP:
             stamps, poses = zip(*self._trail, strict=True)
             moved = placed(poses_relative(np.array(poses), poses[-1]), pose).tolist()
@@ -342,7 +342,7 @@ class GoalService:
         self._trail.append((stamp, pose))
 
     def _ground_seen(self) -> SeenGround | None:
-        """The newest survey of seen ground; None if there is none, its place is not known, or the gate needs none."""
+        """Return the latest survey of seen ground; None without one, without its pose, or if the gate needs none."""
         grid = None if self._in.seen is None else self._in.seen.latest
         scan = None if self._in.scan is None else self._in.scan.latest
         if self._setup.seen_for is None or grid is None or scan is None or not self._trail:
@@ -353,7 +353,7 @@ class GoalService:
         return SeenGround(grid, pose, scan.field, scan.range_max)
 
     def _scan(self, odometry: Odometry, now: int) -> Array:
-        """Returns of the newest scan in base as it is now; none if it is old or tilted."""
+        """Return the points of the latest scan in the current base; none if it is stale or tilted."""
         scan = None if self._in.scan is None else self._in.scan.latest
         if scan is None or now - scan.received > SCAN.fresh_for() * SECOND:
             return np.empty((0, 2))
@@ -415,7 +415,7 @@ class GoalService:
         self._planning = self._tasks.create_task(self._ask(task))
 
     async def _ask(self, task: PlanTask) -> RouteAnswer:
-        """The planner's answer; if it failed and is restarted, an answer that says so."""
+        """Return the answer of the planner; if it failed and restarts, an answer with the failure."""
         assert self._actor is not None
         try:
             answer: RouteAnswer = await self._actor.step(task)
@@ -458,7 +458,7 @@ class GoalService:
         self._paths.halt(f"halt-{0 if self._goal is None else self._goal.number}")
 
     def state(self, now: int) -> GoalState:
-        """The report on the newest goal."""
+        """Return the report on the latest goal."""
         left = 0.0 if self._deformation is None else self._deformation.left
         return goal_state(self._goal, now, self._paths.followed, self._in, left)
 
@@ -466,12 +466,12 @@ class GoalService:
         return self._clock.now() / SECOND
 
     def register(self, rpc: RpcRegistry) -> None:
-        """Serve ``goal``, answered once the first route is known, and ``goal_control``."""
+        """Serve ``goal``, answered when the first route is known, and ``goal_control``."""
 
         async def goal(payload: dict[str, Any]) -> dict[str, Any]:
             number = self.tasks.take(parse_request(GoalRequest, payload))
             try:
-                # 4.0: seconds a remote call waits for the first route; the goal goes on after that
+                # 4.0: seconds a remote call waits for the first route; the goal continues after that
                 async with self._clock.deadline(4.0):
                     state = await self.settled(number)
             except TimeoutError:
@@ -492,8 +492,8 @@ def _estopped(gate: GateState | None) -> bool:
 
 def _moved_on(before: Pose2, pose: Pose2) -> bool:
     turned = abs(math.remainder(pose[2] - before[2], math.tau))
-    # 0.25: distance between two of them, m
-    # 0.4: turn between two of them, rad
+    # 0.25: distance between kept scans (m)
+    # 0.4: turn between kept scans (rad)
     return math.dist(before[:2], pose[:2]) > 0.25 or turned > 0.4
 
 
@@ -508,7 +508,7 @@ def _undecided(state: GoalState) -> bool:
 def goal_state(
     run: GoalRun | None, now: int, followed: Followed | None, inputs: GoalInputs, left: float = 0.0
 ) -> GoalState:
-    """The report on a goal, with sequence number 0; at least ``left`` metres of the route are ahead."""
+    """Return the report on a goal, with sequence number 0; the remaining length is at least ``left`` (m)."""
     odometry = inputs.pose.latest
     frame = "map" if odometry is None else odometry.frame
     if run is None:

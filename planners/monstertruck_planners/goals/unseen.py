@@ -1,8 +1,8 @@
-"""Ground that no sensor has seen, and which motions backwards of a route would cover it. For workers.
+"""Ground that no sensor has seen, and the reverse motions of a route that would cover it. For workers.
 
-The gate stops the robot in reverse before ground that it does not remember as seen. What a route reveals on its way
-counts as seen: the beams of the lidar at every pose before, up to the obstacles of the map, and the ground under the
-body. Ground that the gate has seen ceases to count: a route must come to it before.
+When reversing, the gate stops the robot before ground that it does not remember as seen. Ground that a route reveals is
+treated as seen: the ground under the body, and the lidar beams at every earlier pose, up to the obstacles of the map.
+The gate forgets seen ground after a time; a route must reach it before then.
 """
 
 import math
@@ -19,26 +19,26 @@ from monstertruck_planners.goals.exchange import SeenGround
 from monstertruck_planners.pose_path import PosePath
 
 SOON: Final = 5.0
-"""Time before a route begins, s."""
+"""Assumed time until a route begins (s)."""
 PACE: Final = 0.1
-"""Mean speed along a route by which it is estimated when it comes to some ground, m/s."""
+"""Mean speed along a route (m/s), used to estimate its time of arrival at a place."""
 SHOWN: Final = 0.6
-"""Share of the ground that has to be visible from such a place."""
+"""Fraction of the ground that must be visible from a lookout."""
 BESIDE: Final = 0.03
-"""Ground this near to a body counts as under it, m; as by the gate."""
+"""Ground within this distance of the body is treated as under it (m), as in the gate."""
 
 
 @dataclass(frozen=True)
 class Unseen:
-    """Ground around a robot that no sensor has seen, or that soon ceases to count as seen.
+    """Ground around a robot that is unseen or that the gate will soon forget.
 
     Args:
-        places: centres of its cells in the map's frame, shape (n, 2), m.
-        left: time for which each counts as seen, shape (n,), s; 0 = not seen.
-        lidar: pose of the lidar in base, m, m, rad.
-        field: least and greatest bearing that it measures, rad.
-        reach: its range, m.
-        footprint: of the robot.
+        places: cell centres in the map frame (m), shape (n, 2).
+        left: remaining time as seen ground (s), shape (n,); 0 if not seen.
+        lidar: pose of the lidar in base (m, m, rad).
+        field: minimum and maximum bearing of the lidar (rad).
+        reach: range of the lidar (m).
+        footprint: footprint of the robot.
     """
 
     places: Array
@@ -49,15 +49,15 @@ class Unseen:
     footprint: Footprint
 
     def near(self, pose: Pose2) -> Array:
-        """Places that count as unseen now, in base at ``pose``, shape (n, 2), m."""
+        """Return the places treated as unseen now, in base at ``pose`` (m), shape (n, 2)."""
         return points_relative(self.places[self.left < SOON], pose)
 
     def met(self, path: PosePath, obstacles: DistanceField) -> Array:
-        """Unseen places at and near the first pose at which a path backs onto one; shape (k, 2), m; empty if none.
+        """Return the unseen places at and near the first pose that backs onto one (m), shape (k, 2); empty if none.
 
         Args:
-            path: of the base.
-            obstacles: of the map, which block the lidar's view.
+            path: path of the base.
+            obstacles: map obstacles, which block the view of the lidar.
         """
         places, left = self.places, self.left
         if not (path.directions < 0).any():
@@ -73,11 +73,11 @@ class Unseen:
             gaps = rectangle_distance(self.footprint, pose[None], places)[0]
             unseen = left < SOON + along / PACE
             if direction < 0 and (unseen & (gaps < -self.footprint.padding)).any():
-                # 0.6: unseen ground within this distance of what a route would cover in reverse is closed to the next
-                # one, m: a truck's length, as a route beside it is no better
+                # 0.6: unseen ground within this distance (m) of the reverse motion is closed to the next route: one
+                # truck length, since a route next to it would not be better
                 return np.asarray(places[unseen & (gaps < 0.6)])
             known = gaps < (BESIDE if direction > 0 else 0.0)
-            # 0.1: distance (m) and turn (rad) together between two poses from which a route looks round
+            # 0.1: sum of distance (m) and turn (rad) between evaluations of the lidar view
             if change - looked >= 0.1:
                 looked = change
                 known |= self._visible(places, pose, obstacles)
@@ -85,17 +85,17 @@ class Unseen:
         return np.empty((0, 2))
 
     def lookouts(self, places: Array, obstacles: DistanceField, margin: float) -> Array:
-        """Poses of base from which most of some places can be seen, shape (k, 3), m, m, rad.
+        """Return poses of base with a view of most of the places (m, m, rad), shape (k, 3).
 
         Args:
-            places: shape (n, 2), m.
-            obstacles: of the map.
-            margin: kept to them, m.
+            places: places to see (m), shape (n, 2).
+            obstacles: map obstacles.
+            margin: clearance from the obstacles (m).
         """
-        directions = 12  # directions in which they lie, and into which the robot faces there
+        directions = 12  # number of directions for the positions, and for the headings there
         around = np.arange(directions) * (math.tau / directions)
         x, y = places.mean(axis=0).tolist()
-        # (0.7, 1.1, 1.5): distances from unseen ground at which places to look at it are tried, m
+        # (0.7, 1.1, 1.5): distances of tried lookouts from the unseen ground (m)
         poses = np.array(
             [(x + r * math.cos(a), y + r * math.sin(a), yaw) for r in (0.7, 1.1, 1.5) for a in around for yaw in around]
         )
@@ -104,7 +104,7 @@ class Unseen:
         return np.asarray(poses[np.array(shown, np.bool_)])
 
     def _visible(self, places: Array, pose: Array, obstacles: DistanceField) -> NDArray[np.bool_]:
-        """Which places the lidar sees from a pose of base."""
+        """Return which places the lidar sees from a pose of base."""
         (lidar,) = placed(np.array([self.lidar]), (pose[0], pose[1], pose[2]))
         x, y = points_relative(places, (lidar[0], lidar[1], lidar[2])).T
         bearing, far = np.arctan2(y, x), np.hypot(x, y)
@@ -117,13 +117,13 @@ class Unseen:
 
 
 def unseen_around(seen: SeenGround, keep: float, lidar: Pose2, footprint: Footprint) -> Unseen:
-    """Ground of a survey that counts as unseen now or soon.
+    """Return the ground of a survey that is unseen now or will soon be.
 
     Args:
-        seen: the survey, and where it was made.
-        keep: age up to which ground counts as seen, s.
-        lidar: pose of the lidar in base, m, m, rad.
-        footprint: of the robot.
+        seen: survey and its pose.
+        keep: maximum age of seen ground (s).
+        lidar: pose of the lidar in base (m, m, rad).
+        footprint: footprint of the robot.
     """
     grid = seen.grid
     ages = grid.cells.reshape(grid.height, grid.width)

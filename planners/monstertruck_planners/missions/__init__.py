@@ -1,1 +1,1 @@
-"""Missions: steps done one after the other by goals, behaviours and explorations."""
+"""Missions: sequences of steps, each done as a goal, behaviour or exploration."""

@@ -1,4 +1,4 @@
-"""Where a mission stands, and what follows a step: pure."""
+"""Progress of a mission and the transition after each step, as pure functions."""
 
 import math
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ from monstertruck_schemas.mission import (
 from monstertruck_schemas.reasons import Reason
 
 FINAL = frozenset({Reason.CANCELLED, Reason.DISARMED, Reason.ESTOPPED, Reason.SHUTDOWN})
-"""Ends of a step after which no policy counts: somebody, or the gate, has ended the mission."""
+"""Step outcomes that override the failure policy: a client or the gate has ended the mission."""
 GOOD = frozenset(
     {
         Reason.OK,
@@ -36,14 +36,14 @@ GOOD = frozenset(
         Reason.MISSION_DONE,
     }
 )
-"""Ends of a step that was done."""
+"""Outcomes of a successful step."""
 
 Next = Literal["step", "again", "return", "done", "ended"]
 
 
 @dataclass(frozen=True, slots=True)
 class StepEnd:
-    """How a step ended."""
+    """Outcome of a step."""
 
     reason: Reason
     text: str = ""
@@ -51,38 +51,38 @@ class StepEnd:
 
 @dataclass(frozen=True, slots=True)
 class MissionProgress:
-    """One mission and how far it has come."""
+    """A mission and its progress."""
 
     mission: Mission
     start: Pose2
-    """Where it began, in map."""
+    """Start pose in the map frame."""
     index: int = 0
-    """Index of the present step."""
+    """Index of the current step."""
     attempt: int = 0
-    """Times that the present step was tried without success."""
+    """Number of failed attempts at the current step."""
     failures: int = 0
     why: StepEnd = StepEnd(Reason.OK)
-    """The last failure."""
+    """Last failure."""
     returning: bool = False
-    """Whether the robot drives back to where it began, and ends there."""
+    """Whether the robot is driving back to the start, where the mission ends."""
 
     @property
     def step(self) -> AnyStep:
-        """The present one."""
+        """Current step."""
         return self.mission.steps[self.index]
 
     @property
     def doing(self) -> str:
-        """What the robot does, in a few words."""
+        """Short description of the current action."""
         return "return" if self.returning else in_words(self.step)
 
 
 def after(progress: MissionProgress, end: StepEnd) -> tuple[MissionProgress, Next]:
-    """What follows the end of the present step, or that of the way back.
+    """Advance the mission at the end of the current step or of the drive back.
 
     Returns:
-        The progress then, and what is next: the step that is now the present one, the same once more, the way back,
-        the end after all steps, or an end before.
+        The new progress and the next action: the (new) current step, a retry, the drive back,
+        the end after all steps, or an early end.
     """
     if progress.returning:
         return replace(progress, why=_returned(progress.why, end)), "ended"
@@ -103,7 +103,7 @@ def after(progress: MissionProgress, end: StepEnd) -> tuple[MissionProgress, Nex
 
 
 def _returned(why: StepEnd, end: StepEnd) -> StepEnd:
-    """Why a mission ended whose step failed with ``why``, and whose way back ended with ``end``."""
+    """Return the outcome of a mission whose step failed with ``why`` and whose drive back ended with ``end``."""
     failed = why.text or why.reason.text
     if end.reason in GOOD:
         return StepEnd(why.reason, f"{failed}, back where it began")
@@ -117,7 +117,7 @@ def _onward(progress: MissionProgress) -> tuple[MissionProgress, Next]:
 
 
 def outcome(progress: MissionProgress, following: Next) -> StepEnd:
-    """Of the whole mission."""
+    """Return the outcome of the whole mission."""
     count = len(progress.mission.steps)
     if following == "done":
         if progress.failures == 0:
@@ -128,7 +128,7 @@ def outcome(progress: MissionProgress, following: Next) -> StepEnd:
 
 
 def in_words(step: AnyStep) -> str:
-    """What a step does, in a line: all that it says, but for retries, policy and limit."""
+    """Describe a step in one line: all its fields except retries, policy and limit."""
     match step:
         case GoToStep(x=x, y=y, yaw=yaw, via=via):
             return " ".join((f"goto {x:g} {y:g} {yaw:g}", *(f"via {a:g},{b:g}" for a, b in via)))
@@ -154,7 +154,7 @@ def in_words(step: AnyStep) -> str:
 
 
 class SavedProgress(Schema):
-    """A mission that is under way, on the disk: what a restarted daemon knows of it."""
+    """Running mission as stored on disk, for resuming after a restart of the daemon."""
 
     mission: Mission
     source: str
@@ -162,13 +162,13 @@ class SavedProgress(Schema):
     index: Annotated[int, Field(ge=0)]
     failures: Annotated[int, Field(ge=0)]
     at: Pose2D | None = None
-    """Where the robot was, in map"""
+    """Last pose of the robot in the map frame"""
     why: Reason = Reason.OK
-    """The last failure"""
+    """Last failure"""
     text: str = ""
-    """The same in words"""
+    """Description of the last failure"""
     returning: bool = False
-    """Whether it was driving back to where the mission began"""
+    """Whether the robot was driving back to the start of the mission"""
 
     @model_validator(mode="after")
     def _at_a_step(self) -> Self:
@@ -178,7 +178,7 @@ class SavedProgress(Schema):
 
     @classmethod
     def of(cls, progress: MissionProgress, source: str, at: Pose2 | None = None) -> "SavedProgress":
-        """What is kept of a mission."""
+        """Return the stored form of a mission."""
         x, y, yaw = progress.start
         return cls(
             mission=progress.mission,
@@ -193,12 +193,12 @@ class SavedProgress(Schema):
         )
 
     def progress(self) -> MissionProgress:
-        """The mission at the beginning of the step, or of the way back, at which it was interrupted."""
+        """Return the mission at the beginning of the interrupted step, or of the interrupted drive back."""
         start, why = (self.start.x, self.start.y, self.start.yaw), StepEnd(self.why, self.text)
         return MissionProgress(
             self.mission, start, self.index, failures=self.failures, why=why, returning=self.returning
         )
 
     def away(self, pose: Pose2) -> float:
-        """Metres of a pose from where the robot was."""
+        """Distance from the last pose of the robot to a pose (m)."""
         return 0.0 if self.at is None else math.dist(pose[:2], (self.at.x, self.at.y))

@@ -1,4 +1,4 @@
-"""Missions as a service: one step after the other, by the services for goals, behaviours and exploration."""
+"""Mission service: does the steps in sequence through the goal, behaviour and exploration services."""
 
 import asyncio
 import contextlib
@@ -70,27 +70,27 @@ T = TypeVar("T", GoalState, ExplorationState, BehaviourState)
 SOURCE: Final = ServiceName.MISSIONS.value
 """Source of the goals, behaviours and explorations of a mission."""
 OWN: Final = frozenset({SOURCE, ServiceName.EXPLORER.value})
-"""Sources of the goals that are pursued for a mission, or for an exploration."""
+"""Sources of goals that belong to a mission or to an exploration."""
 MISSION_CHECK_RATE: Final = 5.0
 """Checks per second."""
 CHANGES: Final = ("number", "running", "step", "attempt", "outcome", "resumable")
-"""Fields of the report whose change is reported at once."""
+"""Report fields whose change triggers an immediate report."""
 PASSING: Final = frozenset(
     {Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.POSE_LOST, Reason.LEASE_EXPIRED, Reason.BUSY}
 )
-"""Refusals that pass: it is requested again. Busy is the robot with the step before: after a goal it brakes along a
-path, after an exploration the map is saved."""
+"""Temporary refusals; the request is repeated. The robot may be busy with the previous step: after a goal it brakes
+along a path, after an exploration the map is saved."""
 SILENT: Final = 10.0
-"""Seconds without a report of what does a step, which comes twice a second, after which it has failed."""
+"""Timeout of the reports on a step (s), which arrive twice a second; beyond, the step has failed."""
 
 
 @dataclass(frozen=True, slots=True)
 class MissionInputs:
-    """Topics read."""
+    """Input topics."""
 
     gate: Subscription[GateState]
     pose: Subscription[Odometry]
-    """In map."""
+    """Pose in the map frame."""
     goal: Subscription[GoalState]
     behaviour: Subscription[BehaviourState]
     explore: Subscription[ExplorationState]
@@ -100,7 +100,7 @@ class MissionInputs:
 
 @dataclass(frozen=True, slots=True)
 class MissionParts:
-    """What steps are done by."""
+    """Services that do the steps."""
 
     goals: GoalService
     behaviours: BehaviourService | None
@@ -108,18 +108,18 @@ class MissionParts:
 
 
 class MissionService:
-    """Does one mission at a time.
+    """Runs one mission at a time.
 
     Args:
-        parts: what steps are done by.
-        clock: time.
-        file: where the progress is kept, for a restart; None = nowhere.
-        localised: the robot finds its place in a known map, where poses hold after a restart, too.
-        offload: where it is written.
+        parts: services that do the steps.
+        clock: time source.
+        file: stores the progress across restarts; None to store nothing.
+        localised: whether the robot localises in a known map, so poses stay valid after a restart.
+        offload: runs the writing of the file.
         max_age: see ``GateConfig.max_request_age``.
-        inputs: topics read.
-        state: ``plan/mission``.
-        events: where steps and ends are reported.
+        inputs: input topics.
+        state: publisher of ``plan/mission``.
+        events: sink for steps and ends.
     """
 
     name = SOURCE
@@ -148,7 +148,7 @@ class MissionService:
             max_age,
             state,
             changes=CHANGES,
-            period=SECOND // 2,  # period of reports without a change, ns
+            period=SECOND // 2,  # report period without a change (ns)
             others=(inputs.goal, inputs.behaviour, inputs.explore),
             own=OWN,
         )
@@ -158,22 +158,22 @@ class MissionService:
         self._began = 0
         self._end: StepEnd | None = None
         self._waits = ""
-        """What the present step waits for."""
+        """Reason why the current step waits."""
         self._failed = ""
-        """Why the last attempt at a step failed."""
+        """Reason why the last attempt at a step failed."""
         self._interrupted: SavedProgress | None = None
         self._writing = asyncio.Lock()
         self._keeping: asyncio.Task[None] | None = None
-        """Writes what the newest request changed."""
+        """Writes the changes of the latest request."""
         self._limit: asyncio.Timeout | None = None
-        """Of the present step."""
+        """Time limit of the current step."""
         self._noted: Pose2 | None = None
-        """Where the robot was when that was last kept."""
+        """Pose of the robot that was last stored."""
         self._task: asyncio.Task[None] | None = None
         self._group: asyncio.TaskGroup | None = None
 
     async def run(self, ready: Ready) -> None:
-        """Serve until cancelled; what runs then can be resumed after a restart."""
+        """Serve until cancelled; a mission running then can be resumed after a restart."""
         try:
             self._interrupted = await self._offload(self._load)
         except InputError as error:
@@ -197,28 +197,28 @@ class MissionService:
 
     @property
     def running(self) -> bool:
-        """Whether a mission is being done."""
+        """Whether a mission is running."""
         return self._task is not None and not self._task.done()
 
     @property
     def resumable(self) -> bool:
-        """Whether a restart interrupted one."""
+        """Whether a restart interrupted a mission."""
         return self._interrupted is not None
 
     def accept(self, request: MissionRequest) -> MissionProgress:
-        """Check a mission and where the robot is; returns what is to be done of it.
+        """Check a mission and the pose of the robot; return the initial progress of the mission.
 
         Raises:
-            RequestRefusedError: the pose is not known, or the robot is not where the mission was interrupted.
-            NotFoundError: steps need what the robot does not have.
-            InputError: a start without a mission, or steps with settings that their behaviours do not take.
+            RequestRefusedError: the pose is unknown, or the robot is not where the mission was interrupted.
+            NotFoundError: steps need parts that the robot does not have.
+            InputError: a start without a mission, or steps with settings that their behaviours refuse.
         """
         progress = self._progress_of(request)
         self._check(progress.mission)
         return progress
 
     def begin(self, accepted: MissionProgress, request: MissionRequest, number: int) -> None:
-        """Do a mission from its present step on."""
+        """Run a mission from its current step."""
         assert self._group is not None
         self._source, self._progress = request.source, accepted
         self._began, self._end = self._clock.now(), None
@@ -231,23 +231,23 @@ class MissionService:
         self._task = self._group.create_task(self._do_all(accepted))
 
     def control(self, request: MissionRequest) -> None:
-        """Stop the mission, or give up the one that was interrupted."""
+        """Stop the running mission, or give up the interrupted one."""
         if self._task is not None and self.running:
             self._stop(self._task, request.source)
         elif self._interrupted is not None:
             self._drop(self._interrupted, request.source)
 
     def register(self, rpc: RpcRegistry) -> None:
-        """Serve ``mission``, answered once the request outlasts a restart."""
+        """Serve ``mission``; answer once the request is stored for a restart."""
         self.tasks.register(rpc, "mission", MissionRequest, self.kept)
 
     async def kept(self) -> None:
-        """Wait until the newest request outlasts a restart, or could not be written, which an event reports."""
+        """Wait until the latest request is stored for a restart, or an event reports that it could not be written."""
         if self._keeping is not None:
             await asyncio.wait([self._keeping])
 
     def _stop(self, task: asyncio.Task[None], source: str) -> None:
-        """End the mission that ``task`` does; its end may have been reported already."""
+        """End the mission that ``task`` runs; its end may have been reported already."""
         assert self._group is not None
         if self._end is not None:
             return
@@ -256,7 +256,7 @@ class MissionService:
         self._keeping = self._group.create_task(self._forget())
 
     def _drop(self, interrupted: SavedProgress, source: str) -> None:
-        """Forget a mission that nobody wants to resume."""
+        """Discard an interrupted mission that a client has given up."""
         assert self._group is not None
         self._interrupted = None
         self._events(Reason.CANCELLED, Severity.INFO, SOURCE, f"{interrupted.mission.name}: given up by {source}")
@@ -272,7 +272,7 @@ class MissionService:
             raise RequestRefusedError(Reason.NO_MAP, "no pose in a map yet")
         require_place(None if self._in.slam is None else self._in.slam.latest)
         if resumed is not None:
-            # 1.0: metres from where it was interrupted at which a robot counts as moved, or its odometry as begun again
+            # 1.0: distance (m) from the interruption beyond which the robot was moved or its odometry was reset
             if not self._localised and not request.moved and (away := resumed.away(pose)) > 1.0:
                 text = f"its pose is {away:.1f} m from where {resumed.mission.name} was interrupted"
                 hint = "if it was put there, `--moved` goes on; else its odometry began anew (`odometry.start`)"
@@ -282,11 +282,11 @@ class MissionService:
         return MissionProgress(request.mission, pose)
 
     def _check(self, mission: Mission) -> None:
-        """Whether the robot has what the steps need, and its behaviours take their settings.
+        """Check that the robot has the parts that the steps need, and that its behaviours accept their settings.
 
         Raises:
-            NotFoundError: what it does not have, naming every step and part.
-            InputError: settings are wrong as well, or they alone.
+            NotFoundError: parts are missing; lists every step and part.
+            InputError: settings are wrong, alone or as well.
         """
         wrong: list[tuple[int, TruckError]] = []
         for number, step in enumerate(mission.steps, 1):
@@ -312,7 +312,7 @@ class MissionService:
     # Steps
 
     async def _do_all(self, progress: MissionProgress) -> None:
-        """Do a mission from its present step on."""
+        """Run a mission from its current step."""
         self._parts.goals.hold(SOURCE, on=True)
         following: Next = "step"
         try:
@@ -331,7 +331,7 @@ class MissionService:
                     await self._save(progress)
             self._finish(outcome(progress, following))
         except asyncio.CancelledError:
-            if self._end is None:  # the daemon ends: the progress stays on the disk
+            if self._end is None:  # the daemon exits: the progress stays on disk
                 await self._save(progress)
             raise
         finally:
@@ -397,11 +397,11 @@ class MissionService:
         return StepEnd(Reason.OK)
 
     def _before(self, step: PointStep) -> Pose2:
-        """Pose before a point of interest.
+        """Return the pose in front of a point of interest.
 
         Raises:
-            RequestRefusedError: none are known yet.
-            NotFoundError: none has this name.
+            RequestRefusedError: no points of interest are known yet.
+            NotFoundError: no point of interest has this name.
         """
         message = None if self._in.points is None else self._in.points.latest
         if message is None:
@@ -413,10 +413,10 @@ class MissionService:
         raise NotFoundError(f"no point of interest {step.point!r} is known")
 
     def _towards(self, x: float, y: float) -> Pose2:
-        """Pose of the robot as it is, turned towards a place.
+        """Return the current position of the robot with the heading towards a place.
 
         Raises:
-            RequestRefusedError: where it is is not known.
+            RequestRefusedError: the pose is unknown.
         """
         if (pose := self._pose()) is None:
             raise RequestRefusedError(Reason.NO_MAP, "no fresh pose")
@@ -476,14 +476,14 @@ class MissionService:
         """Have another service do a task, and return how it ended.
 
         Args:
-            server: of its kind of task.
-            start: makes the request.
-            stop: makes the request that stops it, sent when this is cancelled, out of time, or ``enough``.
-            reports: of that service.
+            server: task server of that service.
+            start: creates the request.
+            stop: creates the request that stops the task, sent on cancellation, on timeout, or after ``enough``.
+            reports: reports of that service.
             enough: returns the end of a running task that has done enough, else None.
 
         Raises:
-            TruckError: it was refused.
+            TruckError: the task was refused.
         """
         number = await self._taken(lambda: server.take(start()))
         schedule, newest, silent = Schedule(self._clock, MISSION_CHECK_RATE), reports.latest, 0
@@ -493,7 +493,7 @@ class MissionService:
                 state = reports.latest
                 if state is not None and state.number == number and (done := enough(state)) is not None:
                     return done
-                # Counted by checks: while this process stands, as in a suspended computer, nobody can report.
+                # Count checks, not time: while this process is suspended, as with the computer, no service can report.
                 self._wait_for_resume()
                 silent = silent + 1 if state is newest else 0
                 newest = state
@@ -507,12 +507,12 @@ class MissionService:
         return ended
 
     async def _taken(self, take: Callable[[], int]) -> int:
-        """Number of what ``take`` requests; it is requested again while what refuses it passes.
+        """Call ``take`` and return its task number; repeat the request while it is refused for a temporary reason.
 
         Raises:
-            TruckError: it was refused for another reason or for longer than 3 minutes, or another source drives.
+            TruckError: refused for another reason or for more than 3 minutes, or another source drives.
         """
-        # 180.0: seconds for which it is requested again; a planner compiles for a minute or two after an installation
+        # 180.0: seconds of repeated requests; a planner compiles for a minute or two after an installation
         until, refused = self._clock.now() + 180.0 * SECOND, False
         while True:
             if (other := self.tasks.other()) is not None:
@@ -524,13 +524,13 @@ class MissionService:
             except RequestRefusedError as error:
                 if error.refusal not in PASSING or self._clock.now() > until:
                     raise
-                if refused:  # the first time it may only brake, which is nothing to tell
+                if refused:  # the first refusal may only be due to braking: not reported
                     self._waits = str(error)
                 refused = True
-            await self._clock.sleep(1.0)  # seconds until it is requested again
+            await self._clock.sleep(1.0)  # seconds until the next request
 
     def _wait_for_resume(self) -> None:
-        """Have the step's limit not run while its goal is paused; called with every check."""
+        """Stop the step's time limit while its goal is paused; called at every check."""
         goal, limit = self._in.goal.latest, self._limit
         if goal is None or goal.phase is not GoalPhase.PAUSED or limit is None or limit.expired():
             return
@@ -547,20 +547,20 @@ class MissionService:
             return None
         return pose_of(pose)
 
-    # What outlasts a restart
+    # Persistence across restarts
 
     def _load(self) -> SavedProgress | None:
-        """What was interrupted; to be called in a thread.
+        """Load the interrupted mission; call in a thread.
 
         Raises:
-            InputError: the file is not what it should be.
+            InputError: the file is damaged.
         """
         file = self._file
         expected = "the progress of a mission"
         with reading(str(file), expected):
             if file is None or not file.exists():
                 return None
-            # 1_000_000: size of the saved progress at most
+            # 1_000_000: maximum size of the saved progress (bytes)
             return SavedProgress.model_validate_json(contents(file, expected, 1_000_000))
 
     async def _say_damaged(self, why: str) -> None:
@@ -575,10 +575,10 @@ class MissionService:
         await self._write(lambda file: replace_file(file, text))
 
     async def _note_place(self) -> None:
-        """Keep where the robot is while a mission runs."""
+        """Store the pose of the robot while a mission runs."""
         pose, noted, progress = self._pose(), self._noted, self._progress
         running = progress is not None and self._end is None
-        # 0.5: metres after which it is noted again where the robot is
+        # 0.5: distance (m) until the pose is stored again
         if progress is None or not running or pose is None or noted is None or math.dist(pose[:2], noted[:2]) < 0.5:
             return
         await self._save(progress)
@@ -598,7 +598,7 @@ class MissionService:
     # Reports
 
     def state(self, now: int) -> MissionState:
-        """The report on the newest mission."""
+        """Return the report on the latest mission."""
         header: dict[str, Any] = {"stamp": now, "received": now, "seq": 0, "frame": "map", "number": self.tasks.number}
         if self._interrupted is not None:
             saved = self._interrupted
@@ -620,7 +620,7 @@ class MissionService:
 
 
 def _end_of(state: TaskState | None, number: int, noun: str) -> StepEnd | None:
-    """How task ``number`` of a kind ended, by the newest report; None while it runs."""
+    """Return how task ``number`` ended according to the latest report; None while it runs."""
     if state is None or state.number < number:
         return None
     if state.number > number:

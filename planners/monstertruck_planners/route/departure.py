@@ -1,9 +1,9 @@
-"""Leaving a place that is nearer to an obstacle than routes pass: what a route from there begins with. Loads numba.
+"""Departure: first motions of a route whose start is nearer to an obstacle than the margin. Loads numba.
 
-A search whose margin the start does not keep finds nothing, as all of its motions begin too near. So the route begins
-with few arcs and translations, on which the footprint comes no nearer to anything, up to a pose that keeps the margin;
-from there on it is planned like any other. Where no such motion exists the footprint may come nearer once more, as the
-end of a car that leaves a wall at its side, yet never touches: first by half of what there is.
+If the start does not keep the margin, a search finds nothing, as all its motions begin too near. So the route begins
+with few arcs and translations during which the footprint comes no nearer to anything, up to a pose that keeps the
+margin; the rest is planned as usual. If no such motion exists the footprint may come nearer once more without touching,
+like the end of a car that leaves a wall at its side: first by half of the available clearance.
 """
 
 import math
@@ -41,19 +41,19 @@ from monstertruck_planners.route.search import CHECK_MARGIN, CHECK_STEP
 from monstertruck_schemas.reasons import Reason
 
 LEVEL: Final = 0.0005
-"""Clearances are compared in whole steps of this, m."""
+"""Step for comparing clearances (m)."""
 SPARE_MARGIN: Final = 0.002
-"""Kept beyond the margin where a departure ends, m: the first motion of a search may come a little nearer."""
+"""Extra margin at the end of a departure (m): the first motion of a search may come a little nearer."""
 CHECK: Final = 0.004
-"""Distance between two poses checked, m."""
+"""Distance between two checked poses (m)."""
 BRANCH: Final = 0.2
-"""Distance between two poses of an arc from which further arcs are tried, m."""
+"""Distance between two branching poses on an arc (m)."""
 SHORTEST: Final = 0.02
-"""Least length of an arc, m: less is not driven exactly."""
+"""Minimum length of an arc (m): the truck cannot drive shorter arcs exactly."""
 CURVATURES: Final = (0.0, *(0.5**k for k in range(7)))
-"""Of the arcs tried, as shares of the greatest one: the wider a body turns, the less near its end comes to a wall."""
+"""Curvatures of the tried arcs, as fractions of the maximum: in wider turns the body's end stays clear of a wall."""
 PLACE: Final = np.array([0.01, 0.01, 0.03])
-"""Poses nearer than this to each other are one, m, m, rad."""
+"""Difference below which two poses are the same (m, m, rad)."""
 
 
 @njit(cache=True)
@@ -154,9 +154,9 @@ class Departure:
     end: Array
     """Pose of the reference point, shape (3,)."""
     cost: float
-    """m."""
+    """Cost (m)."""
     turns: bool
-    """A search may turn the vehicle there, or move it sideways; else it can only go straight on."""
+    """Whether a search may turn the vehicle or move it sideways there; else it can only continue straight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,9 +173,9 @@ class Departures:
     """Paths from a start to poses that keep the margin with a little to spare."""
 
     found: list[Departure]
-    """Those from whose end a search can turn come first, then the cheapest."""
+    """Departures; those with an end where a search can turn come first, then the cheapest."""
     exhausted: bool
-    """There are no others than these; else the budget ended the search for them."""
+    """Whether these are all departures; else the budget ended the search for them."""
 
 
 def departures(
@@ -213,7 +213,7 @@ def departures(
 
 
 def _wanted(margin: float) -> int:
-    """Clearance at the end, in steps of LEVEL."""
+    """Return the clearance at the end, in steps of LEVEL."""
     return int(np.ceil((margin + CHECK_MARGIN + SPARE_MARGIN) / LEVEL))
 
 
@@ -370,12 +370,12 @@ def needs_departure(route_map: RouteMap, vehicle: Vehicle, start: Array, margin:
 
 @dataclass(frozen=True, slots=True)
 class Leaving:
-    """How a path leaves a place that is nearer to an obstacle than the margin."""
+    """Departure of a path from a place nearer to an obstacle than the margin."""
 
     length: float
-    """From here on to its end it keeps the margin, m from its start."""
+    """Distance from the start after which the path keeps the margin up to its end (m)."""
     fall: float
-    """Of the clearance below the greatest one before, m."""
+    """Drop of the clearance below its previous maximum (m)."""
 
 
 def leaving(

@@ -1,11 +1,11 @@
 """Heuristics of the searches: cost to go on a coarse grid, and length of the obstacle-free motion. Loads numba.
 
-The first one is the shortest way round the obstacles for a point. A coarse cell is open if any cell inside it may hold
-the middle of the footprint; near obstacles a metre costs more, because the vehicle is no point. Every cell knows the
-next one, which the analytic expansions follow.
+The first is the shortest path around the obstacles for a point. A coarse cell is open if any cell inside it may hold
+the centre of the footprint; distance near obstacles costs more, because the vehicle is not a point. Every cell stores
+its successor, which the analytic expansions follow.
 
-The second one is the length of the best motion without obstacles (Reeds-Shepp, with translations), tabulated around
-the goal in turning radii, so that one table serves every radius.
+The second is the length of the best motion without obstacles (Reeds-Shepp, with translations), tabulated around the
+goal in turning radii, so that one table serves every radius.
 """
 
 from functools import lru_cache
@@ -23,18 +23,18 @@ from monstertruck_planners.route.reeds_shepp import COST, MAX_SEGMENTS, connect
 from monstertruck_planners.route.search import CostLayer, clearance_cost, extra_cost
 
 UNIT = 100
-"""Cost of a step to the next column or row in the open."""
+"""Cost of a step to the next column or row in open space."""
 
 UNREACHED = 2**30
 BUCKETS = 2048
-"""More than an estimate may grow with a step: by the greatest cost of a step and by that of a step in the open."""
+"""Upper bound of an estimate's growth per step: the maximum step cost plus the cost of a step in open space."""
 
 NEIGHBOURS = np.array([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]], dtype=np.int64)
 """Column and row of each neighbour, counter-clockwise."""
 
 
 COARSE_CELL = 0.1
-"""Cells are joined up to about this size, m."""
+"""Approximate maximum size of a coarse cell (m)."""
 
 TABLE_REACH = 4.0
 """Half size of the Reeds-Shepp table, turning radii."""
@@ -48,31 +48,31 @@ OVERRUN = 1.3
 
 
 USED, WAITING, LEVEL, LIMIT = 0, 1, 2, 3
-"""Fields of a spread's state: entries used, entries waiting, estimate it has come to, greatest estimate regarded."""
+"""Fields of a search state: entries used, entries waiting, current estimate, maximum estimate considered."""
 
 
 class CostToGo(NamedTuple):
-    """Shortest ways to the goal over the ringed grid of a field.
+    """Shortest paths to the goal over the ringed grid of a field.
 
-    A* from the goal to the start, which goes on whenever the cost of a cell is requested that it has not come to: in
-    the open few cells round the shortest path are visited. Its open list is one of buckets (Dial). Source: D. Silver,
-    "Cooperative pathfinding", 2005 (reverse resumable A*).
+    A* from the goal to the start that resumes whenever the cost of an unvisited cell is requested: in open space it
+    visits few cells around the shortest path. Its open list is a bucket queue (Dial). Source: D. Silver, "Cooperative
+    pathfinding", 2005 (reverse resumable A*).
     """
 
     cost: NDArray[np.int32]
-    """In 1/UNIT cells, see ``cost_at``; UNREACHED where no path is known."""
+    """Cost in 1/UNIT cells, see ``cost_at``; UNREACHED where no path is known."""
     step: NDArray[np.int8]
     """Index of the next neighbour on the path, -1 at the goal."""
     cell_cost: NDArray[np.int16]
-    """Cost of a straight step into the cell, 0 = closed."""
+    """Cost of a straight step into the cell; 0 for a closed cell."""
     cell: float
-    """Size, m."""
+    """Cell size (m)."""
     start: tuple[int, int]
-    """Row and column the estimates lead to."""
+    """Row and column that the estimates lead to."""
     least: int
-    """No straight step costs less; 0: no estimates, all ways are followed alike."""
+    """Minimum cost of a straight step; 0: no estimates, all directions are searched equally."""
     head: NDArray[np.int32]
-    """Newest entry of each bucket, -1 = none."""
+    """Latest entry of each bucket, -1 if empty."""
     following: NDArray[np.int32]
     """Next entry in the bucket."""
     cell_of: NDArray[np.int32]
@@ -82,16 +82,16 @@ class CostToGo(NamedTuple):
 
 
 class CellRule(NamedTuple):
-    """What coarse cells cost a vehicle, by their distance to obstacles."""
+    """Cost of coarse cells for a vehicle, by distance to obstacles."""
 
     factor: int
-    """Fine cells per coarse one, each way."""
+    """Fine cells per coarse cell in each direction."""
     closed: float
-    """Nearer than this no pose can be free, m: 0."""
+    """Distance below which no pose can be free (m): cost 0."""
     side: float
-    """Nearer than this only the footprint's ends may be, m: four times UNIT."""
+    """Distance below which only the footprint's ends may be (m): cost four times UNIT."""
     wide: float
-    """From here on UNIT, half as much more at ``side``, m."""
+    """Distance above which the cost is UNIT (m); it rises to 1.5 UNIT at ``side``."""
 
 
 @njit(cache=True)

@@ -1,4 +1,4 @@
-"""Routes over waypoints, and routes that are kept while they are good. Loads numba."""
+"""Routes over waypoints, and reuse of the previous route while it is good. Loads numba."""
 
 import math
 from collections.abc import Sequence
@@ -17,12 +17,12 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 
 PASSING = 0.1
-"""A route passes a waypoint if it comes this near, m."""
+"""Maximum distance at which a route passes a waypoint (m)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViaPoint:
-    """A waypoint; without a heading it gets that of the path through it."""
+    """Waypoint; without a heading it gets the heading of the path through it."""
 
     x: float
     y: float
@@ -36,10 +36,10 @@ def plan_through(
     waypoints: Sequence[ViaPoint],
     now: Clock | None = None,
 ) -> RouteResult:
-    """Route over all waypoints in turn, the last one being the goal; the budget is shared by the legs.
+    """Plan a route over all waypoints in turn; the last is the goal, and the legs share the budget.
 
     Raises:
-        InputError: no waypoint.
+        InputError: there is no waypoint.
     """
     if not waypoints:
         raise InputError("route over waypoints: expected one at least")
@@ -67,7 +67,7 @@ def plan_through(
 
 
 def _joined(legs: Sequence[RouteResult]) -> RouteResult:
-    """One path where all legs are paths, else poses."""
+    """Join the legs to one path if all are paths, else to poses."""
     paths = [leg.path for leg in legs if leg.path is not None]
     if len(paths) == len(legs):
         return RouteResult(Reason.OK, joined(paths))
@@ -76,7 +76,7 @@ def _joined(legs: Sequence[RouteResult]) -> RouteResult:
 
 
 def with_headings(start: ArrayLike, waypoints: Sequence[ViaPoint]) -> list[Array]:
-    """Poses of all waypoints: where one has no heading, from the place before to the one after."""
+    """Return the poses of all waypoints; a missing heading points from the previous to the next waypoint."""
     start = np.asarray(start, dtype=np.float64)
     places = [(float(start[0]), float(start[1])), *((w.x, w.y) for w in waypoints)]
     goals = []
@@ -91,14 +91,14 @@ def with_headings(start: ArrayLike, waypoints: Sequence[ViaPoint]) -> list[Array
 
 @dataclass(frozen=True, slots=True)
 class KeepPolicy:
-    """When a route is kept."""
+    """Conditions for keeping a route."""
 
     reach: float = 0.5
-    """The truck may be this far from the route, m."""
+    """Maximum distance of the truck from the route (m)."""
     gain: float = 0.1
-    """A new route has to cost less than the old one by this share of it."""
+    """Minimum cost reduction of a new route, as a fraction of the old cost."""
     fall: float = 0.005
-    """A kept route may come nearer to an obstacle than a new one by this much before it keeps the margin, m."""
+    """Distance by which a kept route may be nearer to an obstacle than a new route before it keeps the margin (m)."""
 
 
 def replan(
@@ -111,14 +111,14 @@ def replan(
     policy: KeepPolicy | None = None,
     via: Sequence[Array] = (),
 ) -> RouteResult:
-    """The rest of the previous route while it is free and leads to the goal, unless a new one is much better.
+    """Return the rest of the previous route while it is free and leads to the goal, unless a new one is much better.
 
     This hysteresis keeps a truck before an obstacle from changing sides.
-    ``statistics["kept_route"]`` is 1 if it is kept. Only paths are kept; routes that are mere poses are planned again.
+    ``statistics["kept_route"]`` is 1 if the route is kept. Only paths are kept; routes of mere poses are replanned.
 
     Args:
-        planner: of both.
-        route_map: the newest map.
+        planner: planner of both routes.
+        route_map: latest map.
         previous: the route so far.
         pose: of the reference point.
         goal: of the reference point.

@@ -1,13 +1,13 @@
-"""Steering that is not as calibrated: gain, trim and compliance of each axle, estimated from how the truck moves.
+"""Deviation of the steering from its calibration: gain, trim and compliance of each axle, estimated from the motion.
 
-An axle that is asked for an angle q points, when it has turned, at
+After turning, an axle with requested angle q points at
 
     angle = gain q + trim - compliance a        a = v^2 (front - rear) / L, the lateral acceleration
 
-A wrong servo or linkage shows in gain and trim at every speed, slip of the tyres only as the square of the speed. Over
-short intervals the turn, and the sideways motion where the position is measured too, are linear in these six numbers to
-first order (eqs. 2.34 and 2.37), so an extended Kalman filter estimates them with their covariance. Outliers count less
-(Student's t), and the noise is that of the residuals.
+A wrong servo or linkage appears in gain and trim at every speed; tyre slip grows with the square of the speed. Over
+short intervals the turn, and the sideways motion if the position is measured too, are linear in these six numbers to
+first order (eqs. 2.34 and 2.37), so an extended Kalman filter estimates them with their covariance. Outliers are
+down-weighted (Student's t), and the noise is estimated from the residuals.
 """
 
 import math
@@ -26,61 +26,61 @@ from monstertruck_kinematics.truck import FourWheelSteering
 Angles = tuple[float, float]
 
 BASE: Final = 0.25
-"""Least time between two poses that are compared, s: noise of single poses hardly counts any more."""
+"""Minimum time between two compared poses (s): the noise of single poses hardly matters any more."""
 KEPT: Final = 32
-"""Control steps for which a late heading is still placed."""
+"""Maximum age of a late heading, in control steps."""
 FREEDOM: Final = 4.0
-"""Degrees of freedom of Student's t by which residuals count."""
+"""Degrees of freedom of Student's t for the residual weights."""
 BELIEVED: Final = 5.0
-"""Intervals that the assumed noise is worth."""
+"""Weight of the assumed noise, in intervals."""
 FADE: Final = 1.0 - 1.0 / 150.0
-"""Share of the residuals' sums that remains after each interval."""
+"""Fraction of the residual sums that remains after each interval."""
 FORGET: Final = 200.0
-"""Distance after which what was learnt counts for a third, m: parts wear."""
+"""Distance after which older knowledge weighs a third (m): parts wear."""
 NOISE: Final = (0.003, 0.002)
-"""Standard deviation of a turn (rad) and of a sideways motion (m) before any was compared."""
+"""Standard deviation of a turn (rad) and of a sideways motion (m) before any comparison."""
 
 GAIN: Final = 0.15
-"""Standard deviation of the gain of a truck that was not driven: hobby servos differ so much in pulse per angle."""
+"""Standard deviation of the gain of an undriven truck: the spread of hobby servos in pulse per angle."""
 TOOTH: Final = 0.047
 """Standard deviation of the trim, rad: a servo horn put on up to half of a tooth of 25 off, uniformly, at 0.64 rad of
 the axle per rad of the servo."""
 COMPLIANCE: Final = 0.03
 """Standard deviation of the compliance, rad s^2/m: rubber tyres under a light truck."""
 DEAD_BAND: Final = 0.0012
-"""Standard deviation of where a servo stops, rad of the axle: a dead band of 2 us to either side, uniformly."""
+"""Standard deviation of the servo's stop position (rad of the axle): a dead band of 2 us to either side, uniformly."""
 
 
 INDEPENDENT: Final[Mapping[Freedom | None, tuple[Angles, ...]]] = MappingProxyType(
     {"both": ((1.0, 0.0), (0.0, 1.0)), "front": ((1.0, 0.0),), "parallel": ((1.0, 1.0),), None: ()}
 )
-"""Axles that err independently, by the body's freedom: one servo that turns both errs on both alike."""
+"""Axles with independent errors, by freedom of the body: a single servo for both axles has the same error on both."""
 
 
 class AxleError(NamedTuple):
-    """One axle against its calibration."""
+    """Deviation of one axle from its calibration."""
 
     gain: float = 1.0
     trim: float = 0.0
-    """Rad, left positive."""
+    """Trim (rad), left positive."""
     compliance: float = 0.0
-    """Angle lost by slip for each m/s^2 of lateral acceleration, rad s^2/m."""
+    """Angle lost by slip per lateral acceleration (rad s^2/m)."""
 
 
 class AxleErrors(NamedTuple):
-    """Both axles against their calibration."""
+    """Deviations of both axles from their calibration."""
 
     front: AxleError = AxleError()
     rear: AxleError = AxleError()
 
     @classmethod
     def of(cls, state: Array) -> Self:
-        """From the filter's state: gain less 1, trim, compliance, front then rear."""
+        """Convert the filter state: gain minus 1, trim, compliance, front then rear."""
         f_gain, f_trim, f_slip, r_gain, r_trim, r_slip = state.tolist()
         return cls(AxleError(1.0 + f_gain, f_trim, f_slip), AxleError(1.0 + r_gain, r_trim, r_slip))
 
     def wheels(self, requested: Angles, grip: float) -> Angles:
-        """Angles at which axles that have turned to ``requested`` act, rad; ``grip``: speed^2 / wheelbase, m/s^2."""
+        """Return the effective angles of axles turned to ``requested`` (rad); ``grip``: speed^2 / wheelbase (m/s^2)."""
         front = self.front.gain * requested[0] + self.front.trim
         rear = self.rear.gain * requested[1] + self.rear.trim
         # 0.5: no slip doubles a turn
@@ -88,7 +88,7 @@ class AxleErrors(NamedTuple):
         return front - self.front.compliance * acceleration, rear - self.rear.compliance * acceleration
 
     def requests(self, wheels: Angles, grip: float) -> Angles:
-        """Angles to request so that the axles act at ``wheels``, rad: inverse of ``wheels``."""
+        """Return the requests for effective angles ``wheels`` (rad); inverse of the method ``wheels``."""
         acceleration = grip * (wheels[0] - wheels[1])
         front, rear = (
             (angle + axle.compliance * acceleration - axle.trim) / axle.gain
@@ -98,53 +98,53 @@ class AxleErrors(NamedTuple):
 
 
 class AxleMotion(NamedTuple):
-    """What is known at one control step."""
+    """Motion data of one control step."""
 
     t: float
-    """S."""
+    """Time (s)."""
     swept: Angles
-    """Integrals of the requested angles of both axles, after dead time and lag, rad s."""
+    """Time integrals of both axles' requested angles, after dead time and lag (rad s)."""
     angles: Angles
-    """These angles now, rad."""
+    """These angles now (rad)."""
     pose: tuple[float, float, float]
-    """M and rad."""
+    """Pose (m, rad)."""
     speed: float
-    """Forward, m/s."""
+    """Forward speed (m/s)."""
     heading: tuple[float, float] | None
-    """Instant (s) and measured yaw (rad); None: that of the pose, if it is located."""
+    """Time (s) and measured yaw (rad); None: the yaw of the pose, if it is located."""
     located: bool
-    """The pose is measured, not computed from the requests."""
+    """Whether the pose is measured rather than computed from the requests."""
 
 
 class _Sums(NamedTuple):
     """Sums up to a control step, or between two."""
 
     motion: AxleMotion
-    """At the step, or at the next one."""
+    """Motion at the step, or at the next step."""
     values: Array
-    """Shape (2, 7): turn (rad) and sideways motion (m), as a constant and their change by the six numbers."""
+    """Turn (rad) and sideways motion (m), each as a constant and its derivatives by the six numbers; (2, 7)."""
     distance: float
-    """M."""
+    """Distance (m)."""
     sideways: float
-    """Measured sideways motion, m."""
+    """Measured sideways motion (m)."""
 
 
 class _Mark(NamedTuple):
-    """Beginning of an interval."""
+    """Start of an interval."""
 
     t: float
     yaw: float
     measured: bool
-    """The yaw is a heading's."""
+    """Whether the yaw comes from a heading measurement."""
     sums: _Sums
 
 
 class AxleErrorEstimator:
-    """See the module.
+    """Estimator of the axle errors; see the module.
 
     Args:
-        geometry: the truck's.
-        freedom: angles that the axles can take; None: nothing is steered, so nothing is learnt.
+        geometry: geometry of the truck.
+        freedom: angles that the axles can take; None: no axle is steered, so nothing is learnt.
     """
 
     def __init__(self, geometry: FourWheelSteering, freedom: Freedom | None = "both") -> None:
@@ -155,28 +155,28 @@ class AxleErrorEstimator:
         self.covariance: Array = self._prior.copy()
         self.errors = AxleErrors()
         self.metres = 0.0
-        """Distance over which motion was compared."""
+        """Compared distance (m)."""
         self.samples = 0
-        """Compared intervals."""
+        """Number of compared intervals."""
         self._squares, self._counts = [0.0, 0.0], [0.0, 0.0]
         self.restart()
 
     def restart(self) -> None:
-        """Begin a new interval: the axles are not where the requests say, or were computed anew."""
+        """Begin a new interval, because the axles do not match the requests or were recomputed."""
         self._sums: deque[_Sums] = deque(maxlen=KEPT)
         self._begin: _Mark | None = None
 
     def curvature_deviation(self, angles: Angles) -> float:
-        """Standard deviation of the curvature when the axles are asked for ``angles``, 1/m."""
+        """Return the standard deviation of the curvature for requested ``angles`` (1/m)."""
         by = np.array((angles[0], 1.0, 0.0, -angles[1], -1.0, 0.0)) / self._geometry.wheelbase
         return math.sqrt(float(by @ self.covariance @ by))
 
     def observe(self, motion: AxleMotion, delay_deviation: float) -> bool:
-        """Compare the motion since the last interval with the requests; whether the estimate has changed.
+        """Compare the motion since the last interval with the requests; return whether the estimate changed.
 
         Args:
-            motion: now.
-            delay_deviation: standard deviation of the axles' delay, s.
+            motion: current motion.
+            delay_deviation: standard deviation of the axle delay (s).
         """
         if not self._prior.any() or (not motion.located and motion.heading is None):
             return False
@@ -197,7 +197,7 @@ class AxleErrorEstimator:
         return self._compare(begin, mark, delay_deviation)
 
     def _compare(self, begin: _Mark, end: _Mark, delay_deviation: float) -> bool:
-        """Learn from one interval; whether the truck moved."""
+        """Learn from one interval; return whether the truck moved."""
         way = end.sums.distance - begin.sums.distance
         if abs(way) < 0.001:  # a truck at rest, m
             return False
@@ -234,7 +234,7 @@ class AxleErrorEstimator:
         self._sums.append(_Sums(motion, values, last.distance + speed * dt, last.sideways + aside))
 
     def _rows(self, asked: Angles, speed: float) -> Array:
-        """Turn and sideways motion per metre, each as a constant and its change by the six numbers; (2, 7)."""
+        """Return turn and sideways motion per metre, each as constant and derivatives by the six numbers; (2, 7)."""
         geometry, grip = self._geometry, speed * speed / self._geometry.wheelbase
         acceleration = grip * (asked[0] - asked[1])
         tangents, by_axle = [], []
@@ -251,7 +251,7 @@ class AxleErrorEstimator:
         return rows
 
     def _at(self, t: float) -> _Sums | None:
-        """The sums at an instant between two steps; None if no step is as old."""
+        """Return the sums at an instant between two steps; None if no step is that old."""
         for after, before in zip(reversed(self._sums), list(reversed(self._sums))[1:], strict=False):
             if before.motion.t <= t <= after.motion.t:
                 share = (t - before.motion.t) / (after.motion.t - before.motion.t)
@@ -264,14 +264,14 @@ class AxleErrorEstimator:
         return None
 
     def _forget(self, way: float) -> None:
-        """Let the covariance grow back towards what was known before any drive."""
+        """Let the covariance grow back towards the prior."""
         keep = math.exp(-way / FORGET)
         self.covariance = keep * self.covariance + (1.0 - keep) * self._prior
         self.metres += way
         self.samples += 1
 
     def _update(self, kind: int, row: Array, measured: float, known: float) -> None:
-        """One measurement: turn (0) or sideways motion (1); ``known`` is the variance of what has a name."""
+        """Add one measurement: turn (0) or sideways motion (1); ``known`` is the variance of modelled effects."""
         by = row[1:]
         residual = measured - float(row[0] + by @ self.state)
         noise = (self._squares[kind] + BELIEVED * NOISE[kind] ** 2) / (self._counts[kind] + BELIEVED) + known

@@ -1,8 +1,8 @@
-"""What the learnt errors of the axles mean for an operator: which axle steers otherwise than calibrated, and why.
+"""Operator report on the learnt axle errors: which axle deviates from its calibration, and why.
 
-A servo's gain and slip act alike at one speed: what they do together is known best at the speed at which the covariance
-says so. A difference is named once it exceeds its own standard deviation and that of a calibration by so many times
-that the number in the sentence is right.
+Servo gain and slip have the same effect at a single speed. Their combined effect is evaluated at the speed where the
+covariance makes it most certain. A difference is reported once it exceeds its standard deviation, combined with the
+calibration uncertainty, by a factor large enough for the reported number to be right.
 """
 
 import math
@@ -15,53 +15,53 @@ from monstertruck_planners.track.axle_errors import AxleErrorEstimator
 from monstertruck_schemas.plan import AxleDeviation
 
 SURE: Final = 4.0
-"""Standard deviations by which an axle must differ: its difference is known to a quarter then."""
+"""Threshold of a reported difference, in standard deviations: the difference is then known to a quarter."""
 CALIBRATED: Final = (0.025 / 1.96, math.radians(0.5) * 0.64 / 1.96)
 """Standard deviations of gain and trim (rad) of a calibrated axle: `calibrate steering` aims at intervals (95 %) of
 2.5 % for the scale and half a degree of the servo for the centre; the axle turns 0.64 times as far."""
 NAMES: Final[tuple[Literal["front", "rear"], ...]] = ("front", "rear")
 
 TURN: Final = np.array(((0.5, 0, 0, 0.5, 0, 0), (0, 1.0, 0, 0, -1.0, 0), (0, 0, 0.5, 0, 0, 0.5)))
-"""Weights of the estimator's numbers where only the turn is known, not the axle that makes it: mean gain, difference of
-the trims, mean slip."""
+"""Weights of the estimator's numbers when only the turn is known, not the axle that causes it: mean gain, trim
+difference, mean slip."""
 
 Name = Literal["front", "rear", "both axles"]
 
 
 class _Estimate(NamedTuple):
-    """A number and its standard deviation, with what a calibrated truck may have."""
+    """An estimate and its standard deviation, including the tolerance of a calibrated truck."""
 
     value: float
     deviation: float
 
     @property
     def sure(self) -> bool:
-        """Whether it cannot be 0."""
+        """Whether the value differs from 0 for certain."""
         return abs(self.value) > SURE * self.deviation
 
     @property
     def gone(self) -> bool:
-        """Whether it may be 0."""
+        """Whether the value may be 0."""
         return abs(self.value) <= self.deviation
 
 
 class _Finding(NamedTuple):
-    """One axle, or both where their errors are known together only."""
+    """Errors of one axle, or of both if only their combined errors are known."""
 
     name: Name
     share: _Estimate
-    """By which it turns more, at ``speed``; of servo and slip together."""
+    """Excess turn at ``speed``, as a fraction; servo and slip combined."""
     servo: _Estimate
-    """By which the servo turns it more."""
+    """Excess turn caused by the servo, as a fraction."""
     slip: _Estimate
-    """Rad s^2/m."""
+    """Slip (rad s^2/m)."""
     trim: _Estimate
-    """Rad, left positive."""
+    """Trim (rad), left positive."""
     speed: float
-    """Speed at which ``share`` is known best, m/s."""
+    """Speed at which ``share`` is known best (m/s)."""
 
     def sentence(self) -> str:
-        """What differs; empty if nothing does."""
+        """Return the differences as text; empty if there are none."""
         parts = []
         if self.servo.sure:
             parts.append(f"{_percent(self.servo.value)} than calibrated")
@@ -80,22 +80,22 @@ class _Finding(NamedTuple):
 
     @property
     def servo_differs(self) -> bool:
-        """Whether a calibration helps."""
+        """Whether a calibration would help."""
         return self.servo.sure or self.trim.sure
 
     @property
     def gone(self) -> bool:
-        """Whether nothing differs any longer."""
+        """Whether the differences have disappeared."""
         return self.share.gone and self.trim.gone
 
 
 class SteeringReport(NamedTuple):
-    """The steering against its calibration."""
+    """Comparison of the steering with its calibration."""
 
     text: str
-    """Empty if nothing is known to differ."""
+    """Known differences; empty if there are none."""
     agrees: bool
-    """Every estimate is within one standard deviation of the calibration."""
+    """Whether every estimate is within one standard deviation of the calibration."""
     axles: tuple[AxleDeviation, ...]
 
 
@@ -103,8 +103,8 @@ def report(estimator: AxleErrorEstimator, wheelbase: float) -> SteeringReport:
     """Compare the estimate with the calibration.
 
     Args:
-        estimator: of the axles' errors.
-        wheelbase: m.
+        estimator: axle error estimator.
+        wheelbase: wheelbase (m).
     """
     state, covariance = estimator.state, estimator.covariance
     alone = [_finding(name, np.eye(6)[3 * k : 3 * k + 3], state, covariance, wheelbase) for k, name in enumerate(NAMES)]
@@ -131,9 +131,9 @@ def report(estimator: AxleErrorEstimator, wheelbase: float) -> SteeringReport:
 
 
 def _finding(name: Name, rows: Array, state: Array, covariance: Array, wheelbase: float) -> _Finding:
-    """Of gain, trim and slip, each a row of weights of the estimator's six numbers; (3, 6)."""
+    """Return the finding for gain, trim and slip; each of ``rows`` (3, 6) weights the estimator's six numbers."""
     mean, spread = rows @ state, rows @ covariance @ rows.T
-    # The lateral acceleration for each rad at which gain and slip together have the least variance.
+    # Lateral acceleration per rad that minimises the combined variance of gain and slip.
     grip = max(float(spread[0, 2] / spread[2, 2]), 0.0) if spread[2, 2] > 0.0 else 0.0
     both = float(spread[0, 0] - 2.0 * grip * spread[0, 2] + grip**2 * spread[2, 2])
     gain, trim = CALIBRATED

@@ -1,6 +1,6 @@
-"""Settings of the trackers: what all share, and one model per ``kind``.
+"""Tracker settings: a shared base and one model per ``kind``.
 
-Light on purpose: reading a configuration loads no tracker. ``catalog`` names the class behind each kind.
+Light on purpose: reading a configuration loads no tracker. ``catalog`` maps each kind to its class.
 """
 
 import math
@@ -18,64 +18,64 @@ STEERING_MODES: Final[dict[Steering, tuple[float, float]]] = {
     "crab": (0.1, 0.1),
     "hybrid": (0.1, 0.05),
 }
-"""An example of each way of steering: front and rear axle angle, rad."""
+"""Example of each steering mode: front and rear axle angle (rad)."""
 
 
 class TrackerConfig(Schema):
-    """What every tracker knows."""
+    """Settings shared by all trackers."""
 
     rate: Annotated[float, Field(gt=0, le=100)] = 20.0
     """Requests per second."""
     lease: Annotated[float, Field(gt=0, le=2)] = 0.25
     """Lease of each request, s."""
     steering: Steering = "counter"
-    """Steered axles where the path does not say: one alone; both by opposite or (keeping the heading) equal angles;
-    or hybrid, opposite for the curve and equal for the lateral error"""
+    """Steered axles if the path specifies none: one alone; both by opposite or (keeping the heading) equal angles; or
+    hybrid, opposite for the curve and equal for the lateral error"""
     angle: Annotated[float, Field(gt=0, lt=1)] = 0.362
-    """Greatest axle angle, rad: with both axles opposite a circle of 0.42 m; less where the servos reach less."""
+    """Maximum axle angle, rad: with both axles opposite a circle of 0.42 m; smaller if the servos reach less."""
     speed: Positive = 0.18
-    """Forward, m/s."""
+    """Forward speed, m/s."""
     reverse_speed: Positive = 0.12
-    """Backward, m/s."""
+    """Reverse speed, m/s."""
     min_speed: Positive = 0.03
-    """Slowest speed before a stop, m/s."""
+    """Minimum speed before a stop, m/s."""
     acceleration: Positive = 0.3
-    """With which the truck is taken to gain speed, m/s^2."""
+    """Assumed acceleration of the truck, m/s^2."""
     deceleration: Positive = 0.1
-    """Deceleration before curves, the end of the path and where the direction changes, m/s^2."""
+    """Deceleration before curves, changes of direction and the end of the path, m/s^2."""
     lateral_acceleration: Positive = 0.5
-    """Greatest speed squared times curvature, m/s^2."""
+    """Maximum speed squared times curvature, m/s^2."""
     goal_tolerance: Positive = 0.02
-    """A path is completed if the truck stops within this distance of its end, m."""
+    """Maximum distance from the path end at which a stopped truck has completed the path, m."""
     goal_yaw_tolerance: Annotated[float, Field(gt=0, le=math.pi)] = 0.2
-    """A path is completed if the heading differs from its end by no more than this, rad."""
+    """Maximum heading error at the end of a completed path, rad."""
     lost_distance: Positive = 0.5
-    """Further away than this from the path the tracker gives up, m."""
+    """Distance from the path beyond which the tracker gives up, m."""
     slow_clearance: Positive = 0.12
-    """Clearance along the next metres below which the speed falls in proportion, m."""
+    """Clearance along the next metres below which the tracker reduces the speed in proportion, m."""
     slow_tilt: Annotated[float, Field(gt=0, lt=math.pi / 4)] = 0.1
-    """Tilt from which on the speed falls, to nothing but ``min_speed`` at twice as much, rad."""
+    """Tilt above which the tracker reduces the speed, down to ``min_speed`` at twice this tilt, rad."""
     slow_roughness: Annotated[float, Field(gt=0, lt=math.pi / 4)] = 0.05
-    """Standard deviation of the tilt over the last seconds from which on it falls likewise, rad."""
+    """Standard deviation of the tilt over the last seconds above which the speed falls in the same manner, rad."""
     dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
-    """From a request to the first movement of the wheels, s; null: as the servos are configured, else estimated while
-    driving. A value that the truck's motion contradicts is replaced by the estimate, with an event"""
+    """Time from a request to the first movement of the wheels, s; null: the servos' configured value, else estimated
+    while driving. If the truck's motion contradicts a value, the estimate replaces it, with an event"""
     lag: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Time constant with which the axles then turn, s; null likewise"""
+    """Time constant of the axles after the dead time, s; null: as for ``dead_time``"""
     steering_rate: Positive = 1.0
-    """Greatest turning rate of the axles, rad/s."""
+    """Maximum turning rate of the axles, rad/s."""
 
     steering_distance: Positive = 0.05
-    """Distance in which the axles can turn as the path asks at the speed chosen, m."""
+    """Distance in which the axles can reach the path's steering angles at the chosen speed, m."""
 
     @property
     def reach(self) -> float:
-        """How far ahead of its last place on the path the truck is looked for, m."""
+        """Search distance for the truck ahead of its last position on the path (m)."""
         return 0.4
 
     @property
     def beyond(self) -> float:
-        """How far the way has to go on behind the end of the path, m."""
+        """Required length of the extension past the end of the path (m)."""
         return 2 * self.reach
 
     @model_validator(mode="after")
@@ -90,15 +90,15 @@ class TrackerConfig(Schema):
 
 
 class PurePursuitConfig(TrackerConfig):
-    """Drives the arc through a point ahead, chosen by the speed where ``lookahead_time`` is not 0."""
+    """Pure pursuit: drives the arc through a point ahead, chosen by the speed unless ``lookahead_time`` is 0."""
 
     kind: Literal["pure_pursuit"] = "pure_pursuit"
     lookahead: Positive = 0.4
-    """Distance along the path to the point driven at, m; the greatest one if it depends on the speed."""
+    """Distance along the path to the target point, m; the maximum if it depends on the speed."""
     min_lookahead: Positive = 0.2
-    """The least one, m."""
+    """Minimum look-ahead distance, m."""
     lookahead_time: Annotated[float, Field(ge=0, le=5)] = 0.0
-    """Seconds ahead; 0: always ``lookahead``."""
+    """Look-ahead time, s; 0: always ``lookahead``."""
 
     @property
     def reach(self) -> float:
@@ -107,28 +107,28 @@ class PurePursuitConfig(TrackerConfig):
 
 
 class StanleyConfig(TrackerConfig):
-    """Points the leading axle back to where it belongs."""
+    """Stanley controller: steers the leading axle back to the path."""
 
     kind: Literal["stanley"]
     gain: Positive = 2.0
-    """The leading axle's distance from its place falls at this rate, 1/s, while the speed allows."""
+    """Decay rate of the leading axle's lateral error, 1/s, while the speed allows."""
     softening: Positive = 0.1
-    """Added to the speed, m/s: calms the truck at low speed."""
+    """Term added to the speed, m/s: calms the truck at low speed."""
     heading_gain: Positive = 6.0
-    """Turn per metre and radian where the axle that leads cannot steer, 1/m."""
+    """Turn per metre and radian if the leading axle cannot steer, 1/m."""
 
 
 class FuzzyConfig(TrackerConfig):
-    """The fuzzy controller of rsband_local_planner: its rules as published, or with their slips corrected."""
+    """Fuzzy controller of rsband_local_planner: its rules as published, or with their mistakes corrected."""
 
     kind: Literal["fuzzy"]
     rules: Literal["published", "corrected"] = "corrected"
     sub_goal: Positive = 0.6
-    """Distance along the path to the pose steered at, m."""
+    """Distance along the path to the target pose, m."""
     near: Positive = 0.2
-    """Up to this distance the sub-goal is close, from twice as much on it is far, m."""
+    """Maximum distance of a close sub-goal, m; at twice this distance it is far."""
     lateral_tolerance: Positive = 0.05
-    """Lateral deviation called small, m."""
+    """Lateral deviation classified as small, m."""
 
     @property
     def reach(self) -> float:
@@ -137,11 +137,11 @@ class FuzzyConfig(TrackerConfig):
 
 
 class LqrConfig(TrackerConfig):
-    """Linear-quadratic regulator with preview of the path, its gains for the present speed."""
+    """Linear-quadratic regulator with path preview; gains computed for the current speed."""
 
     kind: Literal["lqr"]
     preview: Annotated[float, Field(gt=0, le=5)] = 1.5
-    """Seconds of the path ahead that count."""
+    """Preview time, s."""
     lateral_scale: Positive = 0.01
     """Distance from the path that weighs 1, m."""
     heading_scale: Positive = 0.2
@@ -160,4 +160,4 @@ class MpcConfig(LqrConfig):
 
     kind: Literal["mpc"]  # type: ignore[assignment]
     iterations: Annotated[int, Field(ge=10, le=2000)] = 200
-    """Of the solver, at most."""
+    """Maximum number of solver iterations."""

@@ -1,7 +1,7 @@
-"""Linear-quadratic regulator with preview, its gains for the present speed and way of steering.
+"""Linear-quadratic regulator with preview; gains depend on the current speed and steering mode.
 
-Dead time is bridged by prediction, the axles' lag is part of the state, and the path's coming curves act through the
-optimal preview gains; so the wheels begin to turn before the curve does.
+Prediction bridges the dead time, the axles' lag is part of the state, and upcoming curves act through the optimal
+preview gains, so the wheels begin to turn before the curve.
 """
 
 import math
@@ -18,25 +18,25 @@ from monstertruck_planners.track.path_tracker import Angles, PathTracker, Tracki
 from monstertruck_schemas.plan import Steering
 
 BETWEEN: Final = 4
-"""Samples per period whose mean is the reference."""
+"""Samples per period averaged into the reference."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """For inputs (m), states (n) and k periods of preview."""
+    """Gains for m inputs, n states and k preview periods."""
 
     feedback: Array
-    """Shape (m, n): change of the input by the error; states e, p, axles, last input."""
+    """Shape (m, n): change of the input per error; states e, p, axles, last input."""
     preview: Array
-    """Shape (m, 2 k): by the reference's slip and turn, period by period."""
+    """Shape (m, 2 k): change of the input per slip and turn of the reference, period by period."""
     furthest: float
-    """Greatest distance from the path that counts, m."""
+    """Limit to which the distance from the path is clipped (m)."""
     least: Array
-    """Shape (2, 2): cost of e and p for all time, with the axles where they are best."""
+    """Shape (2, 2): infinite-horizon cost of e and p, with the axles at their optimum."""
 
 
 class Lqr(PathTracker[LqrConfig]):
-    """See the module."""
+    """Linear-quadratic tracker; see the module."""
 
     def __init__(self, config: LqrConfig, geometry: FourWheelSteering) -> None:
         super().__init__(config, geometry)
@@ -46,7 +46,7 @@ class Lqr(PathTracker[LqrConfig]):
         self._gains = GainTable(config, geometry, self._periods)
 
     def steer(self, state: TrackingState) -> Angles:
-        """Axle angles for the coming period."""
+        """Return the axle angles for the next period."""
         basis = BASES[state.steering]
         gains = self._gains.at(state.steering, float(state.speeds(self._soon).mean()), self.response.lag)
         onto = np.linalg.pinv(basis)
@@ -59,7 +59,7 @@ class Lqr(PathTracker[LqrConfig]):
         return float(front), float(rear)
 
     def _reference(self, state: TrackingState) -> Array:
-        """Slip and turn of the coming periods, shape (2 k,)."""
+        """Return slip and turn of the next periods, shape (2 k,)."""
         # What comes after a change of steering is not for these axles: as if the path went on as it is.
         # 0.03: a change of steering, m: more than the spacing of the reference
         end = state.reference.section_end(state.s) - 0.03
@@ -74,12 +74,12 @@ class Lqr(PathTracker[LqrConfig]):
 
 
 class GainTable:
-    """Gains by way of steering, speed and the axles' lag, each computed once.
+    """Gains by steering mode, speed and axle lag, each computed once.
 
     Args:
         config: scales.
-        geometry: the truck's.
-        periods: of preview.
+        geometry: geometry of the truck.
+        periods: number of preview periods.
     """
 
     def __init__(self, config: LqrConfig, geometry: FourWheelSteering, periods: int) -> None:
@@ -89,7 +89,7 @@ class GainTable:
         self._known: dict[tuple[Steering, bool, int, float], Gains] = {}
 
     def at(self, steering: Steering, speed: float, lag: float) -> Gains:
-        """Gains for a speed, m/s, not 0, and a lag, s."""
+        """Return the gains for a non-zero speed (m/s) and a lag (s)."""
         speed_step = 0.05  # speeds this near to each other (relatively) share their gains
         key = (steering, speed > 0, round(math.log(abs(speed)) / speed_step), lag)
         if key not in self._known:

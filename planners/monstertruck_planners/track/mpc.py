@@ -29,30 +29,30 @@ from monstertruck_schemas.plan import Steering
 
 MOST_PERIODS: Final = 30
 FINE: Final = 0.05
-"""Longest step the errors are integrated with, s."""
+"""Maximum integration step of the errors (s)."""
 APPROACH: Final = 0.3
-"""Distance from the path that counts, as a share of the distance to be driven."""
+"""Limit of the distance from the path, as a fraction of the distance to be driven."""
 GENTLE: Final = 1e-6
-"""Weight that keeps inputs without effect where they are."""
+"""Weight that keeps inputs without effect unchanged."""
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What depends on the ways of steering of all periods alone."""
+    """Matrices that depend only on the steering modes of all periods."""
 
     bases: Array
     """Axle angles of each period's inputs, shape (k, 2, m); an input without effect has zeros."""
     onto: Array
-    """Inputs of the first period by its axle angles, shape (m, 2)."""
+    """Map from the first period's axle angles to its inputs, shape (m, 2)."""
     effect: Array
-    """Axle angles in the middle of each fine step by the plan, shape (f, 2, k m)."""
+    """Map from the plan to the axle angles in the middle of each fine step, shape (f, 2, k m)."""
     weights: Array
     """Of the squared errors, shape (2 f,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rollout:
-    """Errors along a plan, at the end of each fine step, and how they move with it."""
+    """Errors along a plan, at the end of each fine step, and their derivatives by the plan."""
 
     errors: Array
     """Shape (2 f,): distance, then yaw error."""
@@ -62,7 +62,7 @@ class Rollout:
 
 @dataclass(frozen=True, slots=True)
 class Terminal:
-    """Errors after the last period, how they move with the plan, and their cost for all time to come."""
+    """Errors after the last period, their derivatives by the plan, and their infinite-horizon cost."""
 
     errors: Array
     """Shape (2,)."""
@@ -73,7 +73,7 @@ class Terminal:
 
 
 class Mpc(PathTracker[MpcConfig]):
-    """See the module."""
+    """Model-predictive tracker; see the module."""
 
     def __init__(self, config: MpcConfig, geometry: FourWheelSteering) -> None:
         super().__init__(config, geometry)
@@ -103,7 +103,7 @@ class Mpc(PathTracker[MpcConfig]):
         self._layouts.clear()
 
     def steer(self, state: TrackingState) -> Angles:
-        """Axle angles for the coming period."""
+        """Return the axle angles for the next period."""
         modes = tuple(state.reference.steerings(state.distances(self._times)))
         modes = (state.steering, *modes[1:])
         layout = self._layout(modes)
@@ -130,7 +130,7 @@ class Mpc(PathTracker[MpcConfig]):
         return known
 
     def _nominal(self, state: TrackingState, modes: tuple[Steering, ...], bases: Array) -> Array:
-        """Plan to linearise about, shape (k, m): the last one, one period on; else what the path asks for."""
+        """Return the linearisation plan (k, m): the last plan shifted by one period, else the path's angles."""
         old = self._plan
         if old is not None and old.shape == (len(modes), bases.shape[2]) and self._planned[1] == modes[0]:
             return np.vstack((old[1:], old[-1:]))
@@ -140,7 +140,7 @@ class Mpc(PathTracker[MpcConfig]):
         return np.asarray(np.clip(inputs, -self.config.angle, self.config.angle))
 
     def _responses(self) -> tuple[Array, Array]:
-        """Axle angle in the middle of each fine step, by the requests (f, k) and by the present angle (f,)."""
+        """Return the axle angle in the middle of each fine step, per request (f, k) and per current angle (f,)."""
         middle = self._middles
         begin = np.arange(self._periods, dtype=np.float64) * self.period
         lag = max(self.response.lag, LEAST_LAG)
@@ -168,7 +168,7 @@ class Mpc(PathTracker[MpcConfig]):
     def _integrate(
         self, state: TrackingState, reference: ReferenceStates, turn: Array, slip: Array, steps: Array
     ) -> Array:
-        """Errors along the plan in the path's curved frame; ``steps`` are the metres of the fine steps."""
+        """Return the errors along the plan in the path's curved frame; ``steps``: lengths of the fine steps (m)."""
         furthest = APPROACH * float(state.distances(self._times[-1:])[0] - state.s)
         side, turned = min(max(state.lateral_error, -furthest), furthest), state.heading_error
         bend = state.run.direction * reference.curvature
@@ -191,7 +191,7 @@ class Mpc(PathTracker[MpcConfig]):
         return np.concatenate((np.full(self._fine, self._h / config.lateral_scale**2), heading))
 
     def _end(self, state: TrackingState, mode: Steering, rollout: Rollout) -> Terminal | None:
-        """What remains to be paid after the last period with the axles where they are best; None for crab."""
+        """Return the terminal cost after the last period with the axles at their optimum; None for crab."""
         if mode == "crab":
             return None
         least = self._gains.at(mode, float(state.speeds(self._times[-1:])[0]), self.response.lag).least
@@ -199,7 +199,7 @@ class Mpc(PathTracker[MpcConfig]):
         return Terminal(rollout.errors[ends], rollout.by_plan[ends], least)
 
     def _solve(self, rollout: Rollout, weights: Array, end: Terminal | None, nominal: Array, last: Array) -> Array:
-        """The best plan, shape (k, m)."""
+        """Return the best plan, shape (k, m)."""
         count, m = nominal.shape
         if m not in self._solvers:
             self._solvers[m] = Solver(count, m, self.config, self.period)
@@ -216,13 +216,13 @@ class Mpc(PathTracker[MpcConfig]):
 
 
 class Solver:
-    """The programme of one size: inputs limited in size and in change from period to period.
+    """Solver of a quadratic programme of fixed size: limited inputs and input changes between periods.
 
     Args:
-        count: periods.
+        count: number of periods.
         m: inputs per period.
         config: limits and the weight of changes.
-        period: s.
+        period: period (s).
     """
 
     def __init__(self, count: int, m: int, config: MpcConfig, period: float) -> None:
@@ -236,7 +236,7 @@ class Solver:
         self._iterations = config.iterations
 
     def solve(self, quadratic: Array, linear: Array, last: Array) -> Array | None:
-        """Minimise x'Qx/2 + l'x + changes from ``last`` on; None if the solver found nothing."""
+        """Minimise x'Qx/2 + l'x + changes starting from ``last``; None if the solver found no solution."""
         n = len(linear)
         q = linear.copy()
         q[: self._m] -= self._pull * last

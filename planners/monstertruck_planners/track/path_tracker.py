@@ -1,11 +1,11 @@
-"""What all trackers have in common: progress, cusps, speed, prediction over the dead time, limits.
+"""Base of all trackers: progress, cusps, speed, prediction over the dead time, limits.
 
-Dead time and lag are the configured ones until the truck's turns contradict them, and estimated where none are
-configured (``response``).
+Dead time and lag are the configured ones until the truck's turns contradict them; without configured values they are
+estimated (``response``).
 
-A run ends for good: its successor, with its own direction and steering, begins when the truck has come to rest at
-the end, and starts to roll when the wheels have turned. No bearing decides the direction, so nothing chatters. Each
-end is judged by the pose at rest: at a cusp by the clearance there, at the end of the path by the tolerances.
+A run that has ended never resumes. Its successor, with a separate direction and steering mode, begins once the truck is
+at rest at the end, and rolls once the wheels have turned. No bearing decides the direction, so the direction cannot
+chatter. The tracker judges each end by the pose at rest: a cusp by the clearance there, the path end by the tolerances.
 """
 
 import math
@@ -38,18 +38,18 @@ from monstertruck_schemas.reasons import Reason
 Angles = tuple[float, float]
 
 EXACT: Final = AxleErrors()
-"""Axles as they are calibrated."""
+"""Errors of perfectly calibrated axles."""
 FORGET: Final = 1.0
-"""Pause after which the state of the axles is not known, s; older requests no longer act."""
+"""Pause after which the axle state is unknown (s); older requests no longer act."""
 
 
 class AxleModel:
-    """Both axles' present angles, computed from the requests: servos report their commands, not where they are.
+    """Model of both axle angles, driven by the requests: servos report their commands, not their positions.
 
     Args:
-        dead_time: s.
-        lag: time constant, s; 0: none.
-        rate: greatest turning rate, rad/s.
+        dead_time: dead time (s).
+        lag: time constant (s); 0 for none.
+        rate: maximum turning rate (rad/s).
     """
 
     def __init__(self, dead_time: float, lag: float, rate: float) -> None:
@@ -62,9 +62,9 @@ class AxleModel:
         """Forget all requests."""
         self.angles: Angles = (0.0, 0.0)
         self.requested: Angles = (0.0, 0.0)
-        """Axle angles of the newest request."""
+        """Axle angles of the latest request."""
         self.swept: Angles = (0.0, 0.0)
-        """Integrals of the angles over time since the beginning, rad s."""
+        """Time integrals of the angles since the start (rad s)."""
         self._due: deque[tuple[float, Angles]] = deque()
         self._requests: deque[tuple[float, Angles]] = deque()
         """Requests of the last second."""
@@ -72,7 +72,7 @@ class AxleModel:
         self._t: float | None = None
 
     def request(self, t: float, angles: Angles) -> None:
-        """Note a request made at ``t``."""
+        """Record a request made at ``t``."""
         self.requested = angles
         self._due.append((t + self.dead_time, angles))
         self._requests.append((t, angles))
@@ -80,7 +80,7 @@ class AxleModel:
             self._requests.popleft()
 
     def respond(self, response: Response) -> None:
-        """Take another dead time and lag, for the requests of the last second as well."""
+        """Change dead time and lag, including for the requests of the last second."""
         self.dead_time, self.lag = response
         if self._t is None or not self._requests:
             return
@@ -95,7 +95,7 @@ class AxleModel:
         self.advance(now)
 
     def advance(self, t: float) -> None:
-        """Bring the angles to the time ``t``."""
+        """Advance the angles to time ``t``."""
         if self._t is None or not 0.0 <= t - self._t <= FORGET:
             asked = self.requested
             self.reset()
@@ -119,14 +119,14 @@ class AxleModel:
         seconds: float,
         errors: AxleErrors = EXACT,
     ) -> tuple[Pose2, Angles]:
-        """Pose and angles in ``seconds``, at a constant speed and if nothing else is requested.
+        """Predict pose and angles after ``seconds`` at constant speed without further requests.
 
         Args:
-            pose: m and rad.
-            speed: m/s.
-            geometry: the truck's.
-            seconds: ahead.
-            errors: how the axles act at these angles.
+            pose: current pose (m, rad).
+            speed: speed (m/s).
+            geometry: geometry of the truck.
+            seconds: prediction time (s).
+            errors: axle errors.
         """
         grip = speed * speed / geometry.wheelbase
         angles = self.angles
@@ -142,7 +142,7 @@ class AxleModel:
         return pose, angles
 
     def _pieces(self, begin: float, end: float) -> list[tuple[float, float, Angles]]:
-        """Times in which the axles turn to one target: when, how long, which."""
+        """Return the intervals with a single target: start, duration, target."""
         pieces = []
         target, at = self._target, begin
         for due, angles in self._due:
@@ -160,7 +160,7 @@ class AxleModel:
         return self._one(angles[0], target[0], dt), self._one(angles[1], target[1], dt)
 
     def _one(self, angle: float, target: float, dt: float) -> float:
-        """First-order lag with a limited rate, exactly."""
+        """Return the exact response of a first-order lag with limited rate."""
         gap = target - angle
         linear = self.rate * self.lag
         if abs(gap) > linear:
@@ -213,17 +213,17 @@ class Command:
 
 
 class SpeedProfile:
-    """Speed from which every place ahead is reached at what its curvature and the path allow, and the axles keep up.
+    """Speed profile of a run that respects curvature and path speeds ahead and lets the axles keep up.
 
     Args:
         config: accelerations, and the distance within which the axles can turn.
         run: part of a path, with its speeds.
-        reference: of the run.
+        reference: reference states of the run.
     """
 
     def __init__(self, config: TrackerConfig, run: PathRun, reference: RunStates) -> None:
         s = reference.places
-        least_curvature = 1e-6  # curvatures (1/m) and turns (rad) are taken to be no smaller
+        least_curvature = 1e-6  # lower bound of curvatures (1/m) and turns (rad)
         allowed = config.lateral_acceleration / np.maximum(np.abs(reference.at(s).curvature), least_curvature)
         change = np.maximum(reference.axle_change(config.steering_distance), least_curvature)
         turning = config.steering_distance * config.steering_rate / change
@@ -233,7 +233,7 @@ class SpeedProfile:
         self._rows = np.column_stack((s, np.maximum(least - gained, 0.0)))
 
     def at(self, s: float) -> float:
-        """Greatest speed at ``s`` metres, m/s."""
+        """Return the maximum speed at ``s`` m (m/s)."""
         last = len(self._rows) - 1
         i = min(max(int(self._rows[:, 0].searchsorted(s, "right")) - 1, 0), last - 1)
         (begin, here), (end, there) = self._rows[i : i + 2].tolist()
@@ -244,7 +244,7 @@ class SpeedProfile:
 def target_speed(
     config: TrackerConfig, truck: TruckState, run: PathRun, profile: SpeedProfile, s: float, dead_time: float
 ) -> float:
-    """Speed along the run, m/s, at ``s`` metres and acting after ``dead_time`` s; its sign is the direction."""
+    """Return the speed along the run (m/s) at ``s`` m that takes effect after ``dead_time`` s; signed by direction."""
     if truck.speed * run.direction < -config.min_speed:
         return 0.0  # still rolling the other way
     speed = config.speed if run.direction > 0 else config.reverse_speed
@@ -256,60 +256,60 @@ def target_speed(
 
 
 def speed_share(amount: float, limit: float) -> float:
-    """Share of the speed: 1 up to the limit, falling to 0 at twice as much; 0 for what is not a number."""
+    """Return the speed factor: 1 up to the limit, falling to 0 at twice the limit; 0 for NaN."""
     return min(max(2.0 - amount / limit, 0.0), 1.0) if math.isfinite(amount) else 0.0
 
 
 C = TypeVar("C", bound=TrackerConfig)
 
 REST: Final = 0.01
-"""Speed of a truck at rest, m/s."""
+"""Maximum speed of a truck at rest (m/s)."""
 STEEPEST: Final = 1.4
-"""Angles are cut to this before their curvature is kept, rad."""
+"""Limit to which angles are clipped before their curvature is kept (rad)."""
 
 
 class TrackingState(NamedTuple):
-    """The predicted state at which a request made at this step begins to act, and the reference there."""
+    """Predicted state when a request made at this step takes effect, and the reference there."""
 
     pose: Pose2
     """x, y (m), yaw (rad)."""
     angles: Angles
-    """At which the axles act, as the way of steering sees them, rad."""
+    """Effective axle angles, as seen by the steering mode (rad)."""
     requested: Angles
-    """The same of the newest request."""
+    """Axle angles of the latest request, as seen by the steering mode (rad)."""
     speed: float
-    """Forward, m/s; at least ``min_speed`` in size."""
+    """Forward speed (m/s); magnitude at least ``min_speed``."""
     target_speed: float
-    """Speed that will be requested, m/s."""
+    """Speed to be requested (m/s)."""
     acceleration: float
-    """With which it is reached, m/s^2."""
+    """Acceleration towards ``target_speed`` (m/s^2)."""
     run: PathRun
     reference: RunStates
-    """Along the run."""
+    """Reference states along the run."""
     s: float
-    """Metres from the run's beginning."""
+    """Distance from the start of the run (m)."""
     steering: Steering
     lateral_error: float
-    """Distance left of the reference, seen along ``target.heading``, m."""
+    """Distance to the left of the reference, seen along ``target.heading`` (m)."""
     target: ReferenceState
     """The reference at ``s``."""
     heading_error: float
-    """Yaw less the reference's and less what axles out of trim slip, rad."""
+    """Yaw minus the reference yaw and the sideslip of axles out of trim (rad)."""
 
     def speeds(self, times: Array) -> Array:
-        """Forward speed after ``times`` seconds: gained, never lost, as braking depends on what lies ahead."""
+        """Return the forward speed after ``times`` s: it never decreases, as braking depends on the path ahead."""
         size, most = abs(self.speed), max(abs(self.target_speed), abs(self.speed))
         return self.run.direction * np.minimum(size + self.acceleration * times, most)
 
     def distances(self, times: Array) -> Array:
-        """Metres from the run's beginning after ``times`` seconds."""
+        """Return the distance from the start of the run after ``times`` s (m)."""
         size, most = abs(self.speed), max(abs(self.target_speed), abs(self.speed))
         gaining = np.minimum(times, (most - size) / self.acceleration)
         return self.s + size * times + self.acceleration * gaining * (times - 0.5 * gaining)
 
 
 def as_steered(steering: Steering, angles: Angles) -> Angles:
-    """The angles of a way of steering that turn the truck as these do (crab: move it sideways), rad."""
+    """Return the angles of a steering mode that turn the truck as these do (crab: move it sideways) (rad)."""
     front, rear = angles
     match steering:
         case "front":
@@ -324,54 +324,54 @@ def as_steered(steering: Steering, angles: Angles) -> Angles:
 
 
 class PathTracker(ABC, Generic[C]):
-    """Follows segmented paths; subclasses steer. It remembers its own requests only, to predict the axles.
+    """Tracker of segmented paths; subclasses steer. It keeps only past requests, to predict the axles.
 
     Args:
-        config: speeds, distances, the axles' behaviour.
-        geometry: the truck's.
+        config: speeds, distances, axle behaviour.
+        geometry: geometry of the truck.
     """
 
     def __init__(self, config: C, geometry: FourWheelSteering) -> None:
         self.config = config
         self.geometry = geometry
         self.configured: Response | None = None
-        """Dead time and lag that the configuration states."""
+        """Configured dead time and lag."""
         if config.dead_time is not None or config.lag is not None:
             self.configured = Response(config.dead_time or 0.0, config.lag or 0.0)
         self.estimator = ResponseEstimator(geometry, config.steering_rate)
         self.response = self.configured or rounded(self.estimator.estimate)
         """Dead time and lag in use."""
         self.axles = AxleModel(*self.response, config.steering_rate)
-        """In angles as they are requested."""
+        """Axle model in requested angles."""
         self.axle_errors = AxleErrorEstimator(geometry)
         self.period = 1.0 / config.rate
         self._stop = min(config.min_speed**2 / (2 * config.deceleration), config.goal_tolerance)
-        """Metres before the end at which the truck, then at its slowest, stops."""
+        """Stopping distance before the end, at minimum speed (m)."""
         self._prepared: dict[int, tuple[PathRun, RunStates, SpeedProfile]] = {}
 
     def reset(self) -> None:
-        """Forget the requests: they were not obeyed."""
+        """Forget requests that were not obeyed."""
         self.axles.reset()
         self.axle_errors.restart()
         self.estimator.forget_requests()
         self._prepared.clear()
 
     def limit_learning(self, freedom: Freedom | None) -> None:
-        """Learn only errors that a body of this freedom can have; None: its axles are not steered."""
+        """Learn only errors that a body with this freedom can have; None for unsteered axles."""
         self.axle_errors = AxleErrorEstimator(self.geometry, freedom)
 
     @property
     def prediction(self) -> float:
-        """Seconds ahead for which ``steer`` is asked."""
+        """Prediction time of ``steer`` (s)."""
         return self.response.dead_time
 
     @property
     def contradicted(self) -> bool:
-        """Whether the truck answers otherwise than configured, so that the estimate is used."""
+        """Whether the truck's response contradicts the configured one, so that the estimate is used."""
         return self.configured is not None and self.response != self.configured
 
     def respond(self, response: Response) -> None:
-        """Use another dead time and lag from here on."""
+        """Use another dead time and lag from now on."""
         self.response = response
         self.axles.respond(response)
         self.axle_errors.restart()
@@ -381,7 +381,7 @@ class PathTracker(ABC, Generic[C]):
         """Wanted angles of front and rear axle, rad, not yet limited."""
 
     def prepare(self, path: SegmentedPath, progress: PathProgress) -> bool:
-        """Compute what ``control`` needs of a path's present run, once; whether that had to be done."""
+        """Prepare the path's current run for ``control``, once; return whether that was necessary."""
         run = path.runs[progress.run]
         known = self._prepared.get(id(run))
         if known is not None and known[0] is run:
@@ -440,11 +440,11 @@ class PathTracker(ABC, Generic[C]):
         )
 
     def _ended(self, run: PathRun, nearest: Projection) -> bool:
-        """Whether the truck has come so near to the run's end that it stops."""
+        """Whether the truck is close enough to the end of the run to stop."""
         return run.length - nearest.s <= self._stop
 
     def _judge(self, truck: TruckState, run: PathRun, *, last: bool) -> Reason:
-        """How a run's end was met by a truck that stops: OK at a cusp within tolerance, DRIVING while it rolls."""
+        """Judge how a stopping truck met the end of a run: OK at a cusp within tolerance, DRIVING while it rolls."""
         config, end = self.config, run.at(run.length)
         dx, dy = truck.pose[0] - end.point[0], truck.pose[1] - end.point[1]
         past = math.cos(end.tangent) * dx + math.sin(end.tangent) * dy
@@ -466,11 +466,11 @@ class PathTracker(ABC, Generic[C]):
         return Reason.OK if off <= tolerance else Reason.CUSP_MISSED
 
     def speed(self, state: TrackingState) -> float:
-        """Speed to request, m/s."""
+        """Return the speed to request (m/s)."""
         return state.target_speed
 
     def limited(self, steering: Steering, front: float, rear: float) -> Angles:
-        """Angles within the limits of a way of steering."""
+        """Return the angles clipped to the limits of a steering mode."""
         angle = self.config.angle
         front, rear = min(max(front, -STEEPEST), STEEPEST), min(max(rear, -STEEPEST), STEEPEST)
         if steering == "crab":
@@ -483,7 +483,7 @@ class PathTracker(ABC, Generic[C]):
         return float(front), float(rear)
 
     def _request(self, steering: Steering, wheels: Angles, speed: float) -> Angles:
-        """What to request so that the truck turns as axles at these angles would; an axle that is not steered stays."""
+        """Return the request that turns the truck as axles at these angles would; an unsteered axle stays."""
         errors, grip, most = self.axle_errors.errors, speed * speed / self.geometry.wheelbase, self.config.angle
         front, rear = errors.requests(wheels, grip)
         turn = wheels[0] - wheels[1]
@@ -496,7 +496,7 @@ class PathTracker(ABC, Generic[C]):
         return min(max(front, -most), most), min(max(rear, -most), most)
 
     def _observe(self, truck: TruckState, t: float) -> None:
-        """Learn from the truck's motion how the axles answer, and how they stand."""
+        """Learn the axles' response and errors from the truck's motion."""
         if not truck.obeyed:
             self.estimator.forget_requests()
             self.axle_errors.restart()
@@ -512,7 +512,7 @@ class PathTracker(ABC, Generic[C]):
                 self.respond(response)
 
     def _prepare(self, run: PathRun) -> tuple[RunStates, SpeedProfile]:
-        """Reference and greatest speeds of a run, computed once."""
+        """Return reference and maximum speeds of a run, computed once."""
         known = self._prepared.get(id(run))
         if known is None or known[0] is not run:
             if len(self._prepared) >= MAX_RUNS:
@@ -555,12 +555,12 @@ class PathTracker(ABC, Generic[C]):
         )
 
     def _slip_besides(self, steering: Steering, angles: Angles) -> float:
-        """Sideslip of axle angles that is not of the way of steering, rad."""
+        """Return the sideslip of axle angles beyond that of the steering mode (rad)."""
         front, rear = as_steered(steering, angles)
         return float(self.geometry.tan_sideslip(angles[0] - front, angles[1] - rear))
 
     def _turning_at_rest(self, truck: TruckState, angles: Angles) -> bool:
-        """Whether the truck stands with its wheels still turning to where they are wanted."""
+        """Whether the truck is at rest while its wheels still turn to the wanted angles."""
         if abs(truck.speed) > REST:
             return False
         now = self.axles.angles

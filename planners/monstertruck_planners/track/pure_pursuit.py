@@ -1,4 +1,4 @@
-"""Regulated pure pursuit for a truck with two steered axles: drive the arc that passes through a point ahead."""
+"""Regulated pure pursuit for a truck with two steered axles: drive the arc through a point ahead."""
 
 import math
 
@@ -7,11 +7,11 @@ from monstertruck_planners.track.path_tracker import Angles, PathTracker, Tracki
 from monstertruck_planners.track.segments import Projection
 
 LEAST_SQUARE = 1e-6
-"""Goals nearer than the root of this are not divided by, m^2."""
+"""Minimum squared goal distance used as a divisor (m^2)."""
 
 
 class PurePursuit(PathTracker[PurePursuitConfig]):
-    """See the module; the arc begins where the truck will be when the wheels have turned."""
+    """Pure pursuit tracker; the arc begins at the truck's position after the wheels have turned."""
 
     @property
     def prediction(self) -> float:
@@ -19,7 +19,7 @@ class PurePursuit(PathTracker[PurePursuitConfig]):
         return self.response.total
 
     def steer(self, state: TrackingState) -> Angles:
-        """Axle angles of the arc through the point ahead."""
+        """Return the axle angles of the arc through the point ahead."""
         x, y, yaw = state.pose
         goal = self._goal(state, state.s + self._lookahead(state.speed))
         c, sn = math.cos(yaw), math.sin(yaw)
@@ -49,7 +49,7 @@ class PurePursuit(PathTracker[PurePursuitConfig]):
         return float(front), float(rear)
 
     def _goal(self, state: TrackingState, s: float) -> Projection:
-        """Point at ``s`` metres; beyond a change of steering as if the path went on straight."""
+        """Return the point at ``s`` m; past a change of the steering mode the path is extended straight."""
         end = state.reference.section_end(state.s)
         if s <= end or end >= state.run.end:
             return state.run.at(s)
@@ -65,7 +65,7 @@ class PurePursuit(PathTracker[PurePursuitConfig]):
         return min(max(config.lookahead_time * abs(speed), config.min_lookahead), config.lookahead)
 
     def _hybrid(self, state: TrackingState, ahead: float, aside: float, tangent: float) -> Angles:
-        """Turn by the path's own heading at the goal, and go sideways by what is left."""
+        """Turn by the path heading at the goal, and cover the remainder sideways."""
         distance = max(math.hypot(ahead, aside), LEAST_SQUARE)
         heading = state.reference.state(state.s + distance).yaw
         turn = state.run.direction * math.remainder(heading - state.pose[2], math.tau) / distance

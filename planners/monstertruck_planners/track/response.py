@@ -1,9 +1,9 @@
-"""How the axles answer requests, estimated while driving: dead time and lag from the turns that requests bring about.
+"""Online estimate of the axles' response to requests: dead time and lag, from the turns that requests cause.
 
-Candidates are all pairs of a dead time and a lag. For each the turn between two poses is predicted from the requests
-and the speed; measured turns are regressed on it with a gain (the linkage may turn less than it should) and a trim (the
-axles may be off centre), both near 1 and 0 beforehand. What remains unexplained gives every candidate its probability.
-Turns about which the candidates agree say nothing: they are left out, and the estimate does not fade on a straight.
+Candidates are all pairs of a dead time and a lag. Each candidate predicts the turn between two poses from the requests
+and the speed. Measured turns are regressed on it with a gain (the linkage may turn less than it should) and a trim (the
+axles may be off centre), with priors near 1 and 0. The residuals give each candidate its probability. Turns for which
+all candidates agree carry no information: they are left out, so the estimate does not fade on a straight.
 """
 
 import math
@@ -19,28 +19,28 @@ from monstertruck_kinematics.truck import FourWheelSteering
 LAG_CELL: Final = 0.01
 """Spacing of the history and of the candidates' dead times, s."""
 DEAD_TIMES: Final = 31
-"""Candidates: 0 to 0.3 s."""
+"""Number of candidate dead times: 0 to 0.3 s."""
 LAGS: Final = np.array((0.0, 0.05, 0.1, 0.15, 0.2))
-"""Candidates, s."""
+"""Candidate lags (s)."""
 KEPT_CELLS: Final = 100
-"""Cells of history that are needed before the newest: the longest dead time and the longest pause between poses."""
+"""Required history before the latest cell, in cells: the longest dead time plus the longest pause between poses."""
 EARLY: Final = 1e-6
-"""Cells by which rounding may make an instant early."""
+"""Maximum rounding error of an instant, in cells early."""
 TURN_NOISE: Final = 0.003
-"""Standard deviation of a measured turn before any was compared, rad."""
+"""Standard deviation of a measured turn before any comparison (rad)."""
 
 
 class Response(NamedTuple):
-    """How the axles follow requests."""
+    """Response of the axles to requests."""
 
     dead_time: float
-    """From a request to the first movement of the wheels, s."""
+    """Time from a request to the first movement of the wheels (s)."""
     lag: float
-    """Time constant with which the axles then turn, s."""
+    """Time constant of the axles after the dead time (s)."""
 
     @property
     def total(self) -> float:
-        """Delay of slow requests, s."""
+        """Total delay of slow requests (s)."""
         return self.dead_time + self.lag
 
 
@@ -50,19 +50,19 @@ class ResponseEstimate:
 
     response: Response
     deviation: float
-    """Standard deviation of their sum, s."""
+    """Standard deviation of the sum of dead time and lag (s)."""
     shape_deviation: float
-    """Standard deviation of the dead time alone, s: how the sum is divided shows later."""
+    """Standard deviation of the dead time alone (s): the split of the sum becomes known later."""
     samples: int
-    """Telling turns so far."""
+    """Number of informative turns so far."""
 
 
 class ResponseEstimator:
-    """See the module.
+    """Estimator of dead time and lag; see the module.
 
     Args:
-        geometry: the truck's.
-        rate: greatest turning rate of the axles, rad/s.
+        geometry: geometry of the truck.
+        rate: maximum turning rate of the axles (rad/s).
     """
 
     def __init__(self, geometry: FourWheelSteering, rate: float) -> None:
@@ -70,14 +70,14 @@ class ResponseEstimator:
         self._rate = rate
         dead_times, by_lag = (a.ravel() for a in np.broadcast_arrays(LAG_CELL * np.arange(DEAD_TIMES), LAGS[:, None]))
         totals = dead_times + by_lag
-        # mean and standard deviation of dead time and lag together of a truck that was not measured, s
+        # mean and standard deviation of dead time plus lag of an unmeasured truck, s
         expected = (0.05, 0.08)
         self._prior = 0.5 * ((totals - expected[0]) / expected[1]) ** 2
         self._keep = [math.exp(-LAG_CELL / lag) if lag else 0.0 for lag in LAGS.tolist()]
         self._powers = np.stack((np.ones(len(totals)), dead_times, by_lag, dead_times**2, totals**2))
         """Powers of the candidates; their weighted sums are the moments of the estimate."""
         self._by_x: Array = np.zeros((3, len(totals)))
-        """Sums of the predicted turns' products with themselves, the measured turns and the ways, by candidate."""
+        """Sums of products of predicted turns with themselves, measured turns and distances, by candidate."""
         self._products = np.empty_like(self._by_x)
         self._yy = self._yd = self._dd = self._count = 0.0
         self._samples = 0
@@ -87,25 +87,25 @@ class ResponseEstimator:
         self._end = DEAD_TIMES + 1  # a truck begins with its wheels straight
 
     def forget_requests(self) -> None:
-        """Requests were not obeyed, so the axles are somewhere; what was learnt stays."""
+        """Forget requests that were not obeyed, as the axle angles are unknown; keep the estimate."""
         self._request = (0.0, 0.0)
         self._bend = 0.0
-        """Turn per metre that is requested, rad/m."""
+        """Requested turn per metre (rad/m)."""
         self._most = math.inf
-        """Greatest change within one cell, rad/m."""
+        """Maximum change within one cell (rad/m)."""
         self._curvatures = [0.0] * len(self._keep)
         self._turns = [0.0] * len(self._keep)
         self._history = np.zeros((len(self._keep), 4 * KEPT_CELLS))
-        """Turn per metre, summed up over time, at the end of each cell, rad s/m."""
+        """Time integral of the turn per metre at the end of each cell (rad s/m)."""
         self._end = 1
-        """Cells written."""
+        """Number of cells written."""
         self._begin = math.nan
         """Time of the first cell, s."""
         self._seen: tuple[float, float, float, bool] | None = None
         """Time (s), yaw (rad), speed (m/s) and kind of the last yaw."""
 
     def request(self, t: float, angles: tuple[float, float]) -> None:
-        """Note axle angles, rad, requested at ``t``."""
+        """Record axle angles (rad) requested at ``t``."""
         if math.isnan(self._begin):
             self._begin = t - (self._end - 1) * LAG_CELL
         self._fill(t)
@@ -116,13 +116,13 @@ class ResponseEstimator:
         self._request, self._bend = angles, bend
 
     def observe(self, t: float, yaw: float, speed: float, *, measured: bool = False) -> bool:
-        """Compare the turn since the last pose with the requests; whether that said anything.
+        """Compare the turn since the last pose with the requests; return whether it was informative.
 
         Args:
-            t: s.
-            yaw: rad.
-            speed: forward, m/s.
-            measured: the yaw is a sensor's; turns are taken between yaws of one kind only.
+            t: time (s).
+            yaw: yaw (rad).
+            speed: forward speed (m/s).
+            measured: whether a sensor measured the yaw; turns are computed only between yaws of the same kind.
         """
         before, self._seen = self._seen, (t, yaw, speed, measured)
         # 0.5: poses further apart in time than this are not compared, s
@@ -133,14 +133,14 @@ class ResponseEstimator:
         if first is None or last is None:
             return False
         x = 0.5 * (before[2] + speed) * (last - first)
-        if float(x.max() - x.min()) < 0.001:  # turns whose predictions differ by less than this say nothing, rad
+        if float(x.max() - x.min()) < 0.001:  # minimum spread of the predictions of an informative turn, rad
             return False
         self._learn(x, wrap_angle(yaw - before[1]), 0.5 * (before[2] + speed) * (t - before[0]))
         self.estimate = self._judged()
         return True
 
     def _fill(self, t: float) -> None:
-        """Write the cells that end up to ``t``."""
+        """Write all cells that end by ``t``."""
         count = math.floor((t - self._begin) / LAG_CELL + EARLY) + 1 - self._end
         if count > 2 * KEPT_CELLS:
             self.forget_requests()
@@ -158,7 +158,7 @@ class ResponseEstimator:
             self._end += 1
 
     def _at(self, t: float) -> Array | None:
-        """The sums at ``t`` less each dead time, by candidate; None if that is before the history."""
+        """Return the sums at ``t`` minus each dead time, by candidate; None if that precedes the history."""
         cells = (t - self._begin) / LAG_CELL + EARLY
         i = math.floor(cells)
         if i < DEAD_TIMES or i >= self._end:
@@ -168,7 +168,7 @@ class ResponseEstimator:
         return np.ravel(low + (cells - i) * (high - low))
 
     def _learn(self, x: Array, y: float, way: float) -> None:
-        fade, products = 1.0 - 1.0 / 150.0, self._products  # telling turns after which the older ones count for a third
+        fade, products = 1.0 - 1.0 / 150.0, self._products  # 150: memory in informative turns; older ones weigh a third
         np.multiply(x, x, out=products[0])
         np.multiply(x, y, out=products[1])
         np.multiply(x, way, out=products[2])
@@ -181,8 +181,8 @@ class ResponseEstimator:
         self._samples += 1
 
     def _judged(self) -> ResponseEstimate:
-        # 0.15: standard deviation of the share by which the truck may turn more or less than requested
-        # 0.1: standard deviation of the curvature that is there without being requested, 1/m
+        # 0.15: prior standard deviation of the relative error of a turn
+        # 0.1: prior standard deviation of the curvature without a request, 1/m
         by_gain, by_trim = self._variance / 0.15**2, self._variance / 0.1**2
         (xx, xy, xd), dd = self._by_x, self._dd + by_trim
         xx, xy = xx + by_gain, xy + by_gain
@@ -190,7 +190,7 @@ class ResponseEstimator:
         most = float(explained.max())
         believed = 5.0  # turns that this is worth
         self._variance = (self._yy + by_gain - most + believed * TURN_NOISE**2) / (self._count + believed)
-        # 3.0: turns that say as much as one independent turn: what the model does not know lasts longer than a step
+        # 3.0: turns equivalent to one independent turn: model errors last longer than a step
         cost = (most - explained) / (2 * self._variance * 3.0) + self._prior
         moments = (self._powers @ np.exp(float(cost.min()) - cost)).tolist()
         dead_time, lag, dead_time_squared, total_squared = (moment / moments[0] for moment in moments[1:])
@@ -201,27 +201,27 @@ class ResponseEstimator:
 
 
 def rounded(estimate: ResponseEstimate) -> Response:
-    """The estimated delay: dead time alone until it shows how it is divided; the lag is a multiple of 0.05 s."""
+    """Return the estimated delay: dead time alone until the split is known; the lag is a multiple of 0.05 s."""
     found = estimate.response
-    lag_step = 0.05  # estimated lags are rounded to multiples of this, s: every lag needs gains of its own
+    lag_step = 0.05  # rounding step of estimated lags, s: every lag needs separate gains
     lag = lag_step * round(found.lag / lag_step) if estimate.shape_deviation < lag_step / 2 else 0.0
     return Response(max(found.total - lag, 0.0), lag)
 
 
 def choose(used: Response, configured: Response | None, estimate: ResponseEstimate) -> Response:
-    """The response to use next: the configured one unless the estimate contradicts it; ``used`` itself for no change.
+    """Return the response to use next: the configured one unless the estimate contradicts it; ``used`` for no change.
 
-    A configured response that was contradicted counts again when the estimate comes back to it.
+    A contradicted configured response is used again once the estimate returns to it.
     """
     found = estimate.response
     if configured is not None:
-        # 3.0: standard deviations by which the estimate must differ from the configured response to contradict it
-        # 1.0: standard deviations within which it must come back for the configured response to count again
+        # 3.0: difference at which the estimate contradicts the configured response, in standard deviations
+        # 1.0: difference below which the configured response is used again, in standard deviations
         sure, share = (3.0, 1.0) if used == configured else (1.0, 0.5)
-        # 0.03: least difference from the configured delay, s: effects that are not modelled look like a delay of this
+        # 0.03: minimum difference from the configured delay, s: effects that are not modelled look like a delay of this
         # size
         near = abs(found.total - configured.total) <= sure * estimate.deviation + share * 0.03
-        # 0.05: least difference from the configured dead time alone, s
+        # 0.05: minimum difference from the configured dead time alone, s
         alike = abs(found.dead_time - configured.dead_time) <= sure * estimate.shape_deviation + share * 0.05
         if near and alike:
             return configured

@@ -1,6 +1,6 @@
 """A path prepared for tracking: runs of one direction, all crab or none of it, measured by arc length.
 
-Progress along it only grows and is searched near the present one, so a path may cross or repeat itself.
+Progress only increases and is searched near its current value, so a path may cross or repeat itself.
 """
 
 import math
@@ -19,47 +19,47 @@ from monstertruck_schemas.plan import MAX_COORDINATE, MAX_POSES, MAX_RUNS, Path,
 from monstertruck_schemas.reasons import Reason
 
 LEAST_STEP: Final = 1e-6
-"""Shorter steps between two poses are left out, m."""
+"""Minimum step between two poses (m); shorter steps are dropped."""
 
 MAX_NAME: Final = 128
 MANY: Final = 40
-"""Steps from which on arrays find the nearest one sooner than floats do."""
+"""Number of steps above which arrays find the nearest step faster than floats."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathProgress:
-    """Place on a segmented path."""
+    """Position on a segmented path."""
 
     run: int = 0
     """Index of the run."""
     s: float = 0.0
     """Metres from the run's beginning."""
     outcome: Reason = Reason.DRIVING
-    """How the path ended, once it is judged."""
+    """Outcome at the end of the path, once judged."""
 
 
 class Projection(NamedTuple):
-    """Point of a run nearest to the truck."""
+    """Point of a run closest to the truck."""
 
     s: float
     point: tuple[float, float]
     tangent: float
-    """Direction of travel there, rad."""
+    """Direction of travel there (rad)."""
 
 
 class PathRun:
-    """Part of a path driven without a stop, with a straight or given extension behind its end.
+    """Part of a path driven without a stop, with a straight or given extension past its end.
 
     Args:
         points: shape (n, 2), n >= 2, m; from index ``last`` on they are the extension.
         last: index of the run's own last point.
         direction: +1 forward, -1 backward.
-        before: metres of the runs before this one.
-        yaws: of the own points, shape (last + 1,), rad.
-        steering: of each own step, or empty.
-        lap: the extension is the path's own beginning.
-        clearance: between footprint and obstacles at its end, m.
-        speeds: greatest ones at the own points, shape (last + 1,), m/s; None: the path sets none.
+        before: total length of the previous runs (m).
+        yaws: yaws at the run's points, shape (last + 1,), rad.
+        steering: steering mode of each step of the run, or empty.
+        lap: whether the extension is the start of the same path.
+        clearance: clearance between footprint and obstacles at the end (m).
+        speeds: maximum speeds at the run's points, shape (last + 1,), m/s; None: the path sets none.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class PathRun:
         self.before = before
         self.length = float(self._s[last])
         self.end = float(self._s[-1]) if lap else self.length
-        """Length that is part of the path, m."""
+        """Length that belongs to the path (m)."""
         self.yaws = np.zeros(last + 1) if yaws is None else yaws
         self.steering = steering
         self.clearance = clearance
@@ -92,29 +92,29 @@ class PathRun:
 
     @property
     def vertices(self) -> Array:
-        """Metres from the beginning to each own point."""
+        """Distance from the start to each point of the run (m)."""
         return self._s[: len(self.yaws)]
 
     def points(self, s: Array) -> Array:
-        """Points at ``s`` metres, shape (m, 2)."""
+        """Return the points at ``s`` m, shape (m, 2)."""
         x, y = self._points.T
         return np.column_stack((np.interp(s, self._s, x), np.interp(s, self._s, y)))
 
     def speeds(self, s: Array) -> Array:
-        """Greatest speeds that the path sets at ``s`` metres, m/s; +inf if it sets none."""
+        """Return the path's speed limits at ``s`` m (m/s); +inf without limits."""
         if self._speeds is None:
             return np.full(len(s), math.inf)
         return np.interp(np.remainder(s, self.length) if self.end > self.length else s, self.vertices, self._speeds)
 
     def at(self, s: float) -> Projection:
-        """Point at ``s`` metres."""
+        """Return the point at ``s`` m."""
         i = min(max(int(self._s.searchsorted(s, "right")) - 1, 0), len(self._steps) - 1)
         x, y, dx, dy, length, begin, tangent = self._steps[i].tolist()
         share = (s - begin) / length
         return Projection(s, (x + share * dx, y + share * dy), tangent)
 
     def project(self, x: float, y: float, low: float, high: float) -> Projection:
-        """Nearest point between ``low`` and ``high`` metres."""
+        """Return the nearest point between ``low`` and ``high`` m."""
         first = max(int(self._s.searchsorted(low, "right")) - 1, 0)
         end = max(int(self._s.searchsorted(high, "left")), first + 1)
         steps = self._steps[first:end]
@@ -142,14 +142,14 @@ def _nearest_step(steps: Array, x: float, y: float, low: float, high: float) -> 
 
 
 class SegmentedPath:
-    """A whole path, to be driven from its vertex nearest to the start pose.
+    """Whole path, to be driven from its vertex nearest to the start pose.
 
-    A closed path is driven once around from there; an open one from there to its end.
+    A closed path is driven once around from there, an open path to its end.
 
     Args:
         path: poses and directions.
         start: pose (x, y, yaw) of the truck in the path's frame.
-        beyond: metres by which each end is extended, at least the look-ahead.
+        beyond: length of the extension at each end (m), at least the look-ahead.
 
     Raises:
         InputError: see ``check_path``.
@@ -171,11 +171,11 @@ class SegmentedPath:
         self.start = self._progress_of(vertices.poses[:, :2], first)
 
     def along(self, progress: PathProgress) -> float:
-        """Metres from the line's beginning."""
+        """Return the distance from the start of the path (m)."""
         return self.runs[progress.run].before + progress.s
 
     def ahead(self, progress: PathProgress, horizon: float, count: int) -> Array:
-        """Poses of the truck along the present run's next ``horizon`` metres, shape (count, 3)."""
+        """Return the truck poses along the next ``horizon`` m of the current run, shape (count, 3)."""
         run = self.runs[progress.run]
         turned = 0.0 if run.direction > 0 else math.pi
         projections = [run.at(progress.s + horizon * i / (count - 1)) for i in range(count)]
@@ -189,10 +189,10 @@ class SegmentedPath:
 
 
 def check_path(path: Path) -> None:
-    """Refuse what cannot be tracked: paths come from files and from outside.
+    """Reject untrackable paths: paths come from files and from outside.
 
     Raises:
-        InputError: shape, size or numbers out of bounds, and what was expected.
+        InputError: shape, size or numbers are out of bounds; the message gives the expected values.
     """
     if len(path.poses) % 3 or not 2 <= len(path.poses) // 3 <= MAX_POSES:
         _refuse(path, f"{len(path.poses)} numbers: expected 2 to {MAX_POSES} rows of x, y, yaw")
@@ -224,15 +224,15 @@ def _refuse(path: Path, text: str) -> NoReturn:
 
 
 def _lap(path: PosePath) -> PosePath:
-    """A closed path, which ends on its beginning."""
+    """Return a closed path that ends at its start."""
     return path.at(np.append(np.arange(len(path.poses)), 0))
 
 
 def _distinct(vertices: PosePath, path: Path) -> PosePath:
-    """Without points that lie less than ``LEAST_STEP`` from the one that is kept before them; yaws are continuous.
+    """Drop points less than ``LEAST_STEP`` from the previously kept point; make yaws continuous.
 
     Raises:
-        InputError: only one is left.
+        InputError: only one point is left.
     """
     points, kept = vertices.poses[:, :2], np.arange(len(vertices.poses))
     while True:
@@ -248,7 +248,7 @@ def _distinct(vertices: PosePath, path: Path) -> PosePath:
 
 
 def _rolled(lap: PosePath, first: int) -> PosePath:
-    """A closed path from another vertex on."""
+    """Return a closed path that starts at another vertex."""
     last = len(lap.poses) - 1
     begin, rest = np.arange(first, last), np.arange(1, first + 1)
     arriving = lap.at(np.concatenate((begin, [last], rest)))
@@ -257,7 +257,7 @@ def _rolled(lap: PosePath, first: int) -> PosePath:
 
 
 def _nearest(points: Array, directions: Array, start: tuple[float, float, float], *, closed: bool) -> int:
-    """Vertex to start from: near, and if several are, the first one that is also headed like the truck."""
+    """Return the start vertex: the nearest; among equally near ones, the first with the truck's heading."""
     step = np.diff(points, axis=0)
     tangents = np.arctan2(step[:, 1], step[:, 0]) + np.where(directions > 0, 0.0, math.pi)
     distance = np.hypot(points[:, 0] - start[0], points[:, 1] - start[1])
@@ -302,35 +302,35 @@ def _runs(path: PosePath, beyond: float, *, closed: bool) -> tuple[PathRun, ...]
 
 
 def _reach(points: Array, beyond: float) -> int:
-    """Number of steps from the beginning that cover ``beyond`` metres, or all."""
+    """Return the number of steps from the start that cover ``beyond`` m, or all."""
     step = np.diff(points, axis=0)
     travelled = np.cumsum(np.hypot(step[:, 0], step[:, 1]))
     return int(np.searchsorted(travelled, beyond)) + 1
 
 
 PATH_GRID: Final = 0.025
-"""Spacing of the reference and half the chord a heading is taken from, m."""
+"""Spacing of the reference, and half the chord for computing a heading (m)."""
 QUANTILES: Final = -np.log1p(-(np.arange(16) + 0.5) / 16)
 """Quantiles of the exponential distribution: a mean over them is a first-order lag."""
 
 
 class ReferenceStates(NamedTuple):
-    """Values at places of a run, arrays of one shape."""
+    """Values at positions on a run, arrays of equal shape."""
 
     heading: Array
-    """Direction of the body-forward motion, rad: the path's tangent, turned round backwards."""
+    """Direction of the body-forward motion (rad): the path tangent, reversed when driving backwards."""
     yaw: Array
-    """Of the body, rad."""
+    """Yaw of the body (rad)."""
     slip: Array
-    """Heading less yaw: sideslip at C, rad."""
+    """Heading minus yaw: sideslip at C (rad)."""
     turn: Array
-    """Yaw per metre of forward motion, 1/m."""
+    """Yaw per distance of forward motion (1/m)."""
     curvature: Array
-    """Of the path in the direction of travel, 1/m."""
+    """Path curvature in the direction of travel (1/m)."""
 
 
 class ReferenceState(NamedTuple):
-    """``ReferenceStates`` at one place."""
+    """``ReferenceStates`` at one position."""
 
     heading: float
     yaw: float
@@ -340,12 +340,12 @@ class ReferenceState(NamedTuple):
 
 
 class RunStates:
-    """States that a tracker wants along one run: its reference.
+    """Reference states of a tracker along one run.
 
     Args:
-        run: part of a line.
-        geometry: the truck's.
-        steering: where the run does not say.
+        run: part of a path.
+        geometry: geometry of the truck.
+        steering: steering mode where the run specifies none.
     """
 
     def __init__(self, run: PathRun, geometry: FourWheelSteering, steering: Steering) -> None:
@@ -380,15 +380,15 @@ class RunStates:
 
     @property
     def places(self) -> Array:
-        """Metres from the run's beginning where the reference was computed: from 0 to the end of the extension."""
+        """Reference positions, as distance from the start of the run (m): from 0 to the end of the extension."""
         return self._s
 
     def steering(self, s: float) -> Steering:
-        """How the axles steer at ``s`` metres; where a path crabs its yaws are meant: they may differ to keep them."""
+        """Return the steering mode at ``s`` m; a crabbing path sets the yaws: axle angles may differ to keep them."""
         return self._modes(np.array([s]))[0] if self.given else self._default
 
     def has_yaw(self, s: float) -> bool:
-        """Whether the path says which yaw the body has at ``s`` metres: not where it crabs by the tracker's choice."""
+        """Whether the path prescribes the body yaw at ``s`` m: not where the tracker chose to crab."""
         return self.steering(s) != "crab"
 
     def steerings(self, s: Array) -> list[Steering]:
@@ -396,7 +396,7 @@ class RunStates:
         return self._modes(s) if self.given else [self._default] * len(s)
 
     def at(self, s: Array) -> ReferenceStates:
-        """Values at ``s`` metres; outside the run those of its ends."""
+        """Return the values at ``s`` m, clamped to the ends of the run."""
         return ReferenceStates(*(np.asarray(np.interp(s, self._s, column)) for column in self._table))
 
     def state(self, s: float) -> ReferenceState:
@@ -410,12 +410,12 @@ class RunStates:
         return ReferenceState(*[(b - a) / width * past + a for a, b in zip(here, there, strict=True)])
 
     def axle_change(self, ahead: float) -> Array:
-        """How far the axles have to turn in the ``ahead`` metres after each of the places, rad; the further one's."""
+        """Return the larger of both axles' required turns in the ``ahead`` m after each position (rad)."""
         change = [np.abs(np.interp(self._s + ahead, self._s, axle) - axle) for axle in self._axles]
         return np.asarray(np.maximum(*change))
 
     def section_end(self, s: float) -> float:
-        """Where the steering changes next, m; the end of the extension if it does not."""
+        """Return the position of the next steering change (m), else the end of the extension."""
         i = int(self._changes.searchsorted(s, "right"))
         return float(self._changes[i]) if i < len(self._changes) else self._segment.end
 
@@ -424,13 +424,13 @@ class RunStates:
         return ["hybrid" if mode == "crab" else mode for mode in modes]
 
     def _step_at(self, s: Array) -> NDArray[np.intp]:
-        """Index of the run's step at each of the places."""
+        """Return the index of the run's step at each position."""
         run = self._segment
         index = np.searchsorted(run.vertices, np.remainder(s, run.length) if run.end > run.length else s, side="right")
         return np.clip(index - 1, 0, len(run.steering) - 1)
 
     def _lagged(self, heading: Array, curvature: Array, a: float) -> tuple[Array, Array]:
-        """Yaw and turn of a body that does not slip sideways at its point ``a``."""
+        """Return yaw and turn of a body without sideslip at its point ``a``."""
         direction = self._segment.direction
         if abs(a) < 1e-9:
             return heading, direction * curvature
@@ -447,14 +447,14 @@ class RunStates:
 
 
 def _slip_free(mode: Steering, geometry: FourWheelSteering) -> float:
-    """Where the point is that never slips sideways, x in m."""
+    """Return x of the point that never slips sideways (m)."""
     if mode == "front":
         return -geometry.l_r
     return geometry.l_f if mode == "rear" else 0.5 * (geometry.l_f - geometry.l_r)
 
 
 def _tangents(run: PathRun, s: Array) -> tuple[Array, Array]:
-    """Tangent (continuous) and curvature from chords."""
+    """Return tangent (continuous) and curvature from chords."""
     half = min(PATH_GRID, run.end / 4)
     at = np.clip(s, half, run.end - half)
     tangent = np.unwrap(_chord(run, at - half, at + half))

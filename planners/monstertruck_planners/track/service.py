@@ -38,9 +38,9 @@ SOURCE: Final = ServiceName.TRACKER.value
 
 
 UNSEEN_AFTER: Final = SECOND
-"""Time before unseen ground after which a path is left, ns: no waiting changes what was seen there."""
+"""Waiting time before unseen ground after which the path is abandoned (ns): waiting cannot reveal that ground."""
 STUCK_AFTER: Final = 1.0
-"""Distance commanded without progress after which the truck is stuck, m."""
+"""Distance commanded without progress after which the truck is stuck (m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,22 +53,22 @@ class TrackSetup:
     lidar: Pose2
     """Pose of the lidar in base."""
     located: bool = False
-    """Whether poses are measured, not computed from the requests."""
+    """Whether poses are measured rather than computed from the requests."""
     freedom: Freedom | None = "both"
-    """Angles that the axles can take; None: they are not steered."""
+    """Angles that the axles can take; None for unsteered axles."""
 
 
 class Newest(NamedTuple):
-    """The newest message of each input; None before the first, or where the robot has no such input."""
+    """Latest message of each input; None before the first, or if the robot lacks the input."""
 
     pose: Odometry | None = None
-    """Of base in the paths' frame."""
+    """Pose of base in the paths' frame."""
     path: Path | None = None
     gate: GateState | None = None
     scan: LaserScan | None = None
-    """Slows the truck down in narrow places."""
+    """Scan that slows the truck down in narrow places."""
     attitude: Attitude | None = None
-    """Slows it down on slopes and rough ground."""
+    """Attitude that slows the truck down on slopes and rough ground."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,18 +83,18 @@ class StepEvent:
 
 @dataclass(slots=True)
 class TrackOutput:
-    """What one step decided."""
+    """Result of one step."""
 
     command: Command | None = None
-    """None = no request is sent."""
+    """Command; None to send no request."""
     drive: bool = False
     """Whether the command is sent to the gate."""
     frame: str = ""
     path: str = ""
     along: float = 0.0
-    """Metres of the path driven."""
+    """Distance travelled along the path (m)."""
     length: float = 0.0
-    """Of the whole path, m."""
+    """Length of the whole path (m)."""
     axles: AxleResponse | None = None
     steering: SteeringReport | None = None
     events: tuple[StepEvent, ...] = ()
@@ -102,19 +102,19 @@ class TrackOutput:
 
 @dataclass(slots=True)
 class _ProgressChecker:
-    """Detects a truck that does not move although it is commanded to; needs a pose from more than its wheels."""
+    """Detector of a truck that is commanded to move but does not; needs a pose from more than its wheels."""
 
     place: tuple[float, float] = (math.inf, math.inf)
-    """Position at the last progress, m."""
+    """Position at the last progress (m)."""
     along: float = -math.inf
-    """Position along the path at the last progress, m; short moves to and fro add up there."""
+    """Position along the path at the last progress (m); short moves back and forth add up there."""
     asked: float = 0.0
-    """Distance commanded by the gate since, m."""
+    """Distance commanded by the gate since then (m)."""
     looked: int = 0
-    """Time of the last check, ns."""
+    """Time of the last check (ns)."""
 
     def stuck(self, now: int, place: tuple[float, float], along: float, gate: GateState | None) -> bool:
-        """Whether it is stuck, from then on always; ``gate`` is None while the tracker does not drive."""
+        """Whether the truck is stuck (latched); ``gate`` is None while the tracker does not drive."""
         if self.asked >= STUCK_AFTER:
             return True
         progress = 0.2  # motion, in space or along the path, that counts as progress, m
@@ -127,15 +127,15 @@ class _ProgressChecker:
 
 
 class TrackingStep:
-    """Follows the newest path with the configured tracker.
+    """Control step that follows the latest path with the configured tracker.
 
-    Arming after the end of a path starts it again; after a stop before its end the truck continues. A path that
-    ``halts`` is over once the truck is disarmed: it may be elsewhere when it is armed again. Once a path has ended or
-    is lost, or the truck is stuck, the step requests standstill, then nothing.
+    Arming after the end of a path restarts the path; after a stop before its end the truck continues. Disarming ends a
+    path that ``halts``, because the truck may be elsewhere when it is armed again. Once a path has ended or is lost, or
+    the truck is stuck, the step requests standstill, then nothing.
 
     Args:
-        setup: the tracker and the truck.
-        points: of scans, in base, if they are computed for others as well.
+        setup: settings of the tracker and the truck.
+        points: converter of scans to points in base, if shared with other users.
 
     Raises:
         InputError: the tracker cannot be built.
@@ -153,45 +153,44 @@ class TrackingStep:
         self._acceleration = BodyAcceleration()
         self._seen: tuple[LaserScan, SegmentedPath] | None = None
         self._clearance_ahead = math.inf
-        """Clearance ahead on that path in that scan, m."""
+        """Clearance ahead on that path in that scan (m)."""
         self._followed: Path | None = None
         self._path: SegmentedPath | None = None
         self._progress = PathProgress()
         self._begun: tuple[float, float, float] | None = None
-        """Pose from which the path was joined; None if it has to be joined again."""
+        """Pose at which the truck joined the path; None if it must join again."""
         self._outcome = Reason.DRIVING
         self._progress_checker = _ProgressChecker()
         self._unseen: int | None = None
-        """Since when the gate has stopped the truck before unseen ground, ns."""
+        """Time since which the gate has stopped the truck before unseen ground (ns)."""
         self._reported = Reason.DRIVING
-        """Outcome of the newest event since the path came or the truck was armed."""
+        """Outcome of the latest event since the path arrived or the truck was armed."""
         self._active = False
         self._contradicted = False
-        """The response differed from the configured one at the last step."""
+        """Whether the response differed from the configured one at the last step."""
         self._steering_report = SteeringReport("", agrees=True, axles=())
         self._compared = 0.0
-        """Metres that the report rests on."""
+        """Distance on which the report is based (m)."""
         self._differs: Severity | None = None
-        """With which the steering was reported to differ; None: it was not."""
+        """Severity of the reported steering difference; None if none was reported."""
         self._events: list[StepEvent] = []
 
     def step(self, now: int, newest: Newest) -> TrackOutput:
-        """One control step at ``now``, ns."""
+        """Run one control step at ``now`` (ns)."""
         *_, output = self.parts(now, newest)
         assert output is not None
         return output
 
     def parts(self, now: int, newest: Newest) -> Iterator[TrackOutput | None]:
-        """The same in parts, between which the event loop can run: None after each but the last, then the output.
+        """Run the step in parts so that the event loop can run in between; yield None after all but the last part.
 
-        There is more than one part only when a long path arrives.
+        The last part yields the output. There is more than one part only when a long path arrives.
         """
         pose, path, gate = newest.pose, newest.path, newest.gate
         if pose is None or path is None or gate is None or now - pose.received > ODOMETRY.fresh_for() * SECOND:
             yield TrackOutput()
             return
-        # 3 * 500: length of a path's array (3 numbers a pose) from which on it is prepared in several iterations of the
-        # event loop
+        # 3 * 500: array length (3 numbers per pose) above which a path is prepared in several event loop iterations
         long = len(path.poses) > 3 * 500
         if self._choose_path(path, pose, armed=gate.mode.active) and long:
             yield None
@@ -245,7 +244,7 @@ class TrackingStep:
         return TrackOutput(command, drive, path.frame, path.name, along, path.length, axles, steering, self._drain())
 
     def _lost(self, path: SegmentedPath, progress: PathProgress, at: tuple[float, float, float]) -> str:
-        """Where the robot and the nearest part of its path are."""
+        """Return a text with the positions of the robot and of the nearest part of its path."""
         x, y = path.runs[progress.run].at(progress.s).point
         return (
             f"path {path.name!r} is {math.dist((x, y), at[:2]):.2f} m from the robot, which is at {at[0]:.2f}, "
@@ -254,7 +253,7 @@ class TrackingStep:
         )
 
     def _before_unseen(self, now: int, gate: GateState, *, driving: bool) -> bool:
-        """Whether the gate has stopped the truck before unseen ground for some time; from then on until armed again."""
+        """Whether the gate has stopped the truck before unseen ground for some time; latched until armed again."""
         if self._outcome is Reason.UNSEEN_STOP:
             return True
         if not driving or Reason.UNSEEN_STOP not in gate.reasons:
@@ -264,7 +263,7 @@ class TrackingStep:
         return now - self._unseen >= UNSEEN_AFTER
 
     def _axles(self) -> AxleResponse:
-        """Measured response of the axles; reports a difference from the configured one."""
+        """Return the measured response of the axles; report a difference from the configured one."""
         tracker = self._path_tracker
         estimate, configured = tracker.estimator.estimate, tracker.configured
         axles = AxleResponse(
@@ -285,7 +284,7 @@ class TrackingStep:
         return axles
 
     def _steering(self) -> SteeringReport:
-        """The steering against its calibration; reports when it begins and ceases to differ, and which part does."""
+        """Compare the steering with its calibration; report when a difference begins or ends, and in which part."""
         estimator = self._path_tracker.axle_errors
         if estimator.metres == self._compared:
             return self._steering_report
@@ -302,7 +301,7 @@ class TrackingStep:
         return found
 
     def _choose_path(self, path: Path, pose: Odometry, *, armed: bool) -> bool:
-        """Join a new path, or the present one again; returns whether it did. Until armed the truck may be moved."""
+        """Join a new path, or rejoin the current one; return whether it did. Until armed the truck may be moved."""
         idle, self._active = not self._active, armed
         if armed and idle:
             self._path_tracker.reset()
@@ -338,7 +337,7 @@ class TrackingStep:
         return self._outcome is not Reason.DRIVING or (self._path is not None and self._progress == self._path.start)
 
     def _moved(self, here: tuple[float, float, float]) -> bool:
-        """Whether the truck was moved since it joined the path."""
+        """Whether the truck has been moved since it joined the path."""
         if self._begun is None:
             return True
         x, y, yaw = self._begun
@@ -347,7 +346,7 @@ class TrackingStep:
         return math.hypot(here[0] - x, here[1] - y) > 0.01 or abs(math.remainder(here[2] - yaw, math.tau)) > 0.02
 
     def _clearance(self, scan: LaserScan | None, path: SegmentedPath, pose: Odometry, now: int) -> float:
-        """Least clearance of the poses ahead on the path, in the newest scan; +inf if nothing near slows the truck."""
+        """Return the minimum clearance of the poses ahead in the latest scan; +inf if nothing near slows the truck."""
         if scan is None or now - scan.received > SCAN.fresh_for() * SECOND:
             return math.inf
         if self._seen is None or self._seen[0] is not scan or self._seen[1] is not path:
@@ -355,13 +354,13 @@ class TrackingStep:
         return self._clearance_ahead
 
     def _measure_clearance(self, scan: LaserScan, path: SegmentedPath, pose: Odometry) -> float:
-        ahead = path.ahead(self._progress, self._config.reach, 8)  # poses ahead whose clearance counts
+        ahead = path.ahead(self._progress, self._config.reach, 8)  # number of poses ahead whose clearance is checked
         poses = poses_relative(ahead, (pose.pose.x, pose.pose.y, pose.pose.yaw))
         near = points_near(self._points.of(scan), poses, self._near)
         return float(clearance_to_points(self._footprint, poses, near).min())
 
     def _terrain_at(self, attitude: Attitude | None, now: int) -> tuple[float, float]:
-        """Tilt and roughness, rad; 0 if they are not measured."""
+        """Return tilt and roughness (rad); 0 if they are not measured."""
         if attitude is None or now - attitude.received > COMPASS.fresh_for() * SECOND:
             return 0.0, 0.0
         if attitude.tilt_valid:
@@ -379,7 +378,7 @@ class TrackingStep:
 
 
 def _heading(attitude: Attitude | None, now: int) -> tuple[float, float] | None:
-    """Time (s) and heading (rad, counter-clockwise) of the newest compass reading, if it is valid and fresh."""
+    """Return time (s) and heading (rad, counter-clockwise) of the latest compass reading, if valid and fresh."""
     if attitude is None or attitude.heading_disturbed or now - attitude.received > COMPASS.fresh_for() * SECOND:
         return None
     return attitude.stamp / SECOND, -attitude.heading
@@ -387,16 +386,16 @@ def _heading(attitude: Attitude | None, now: int) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, slots=True)
 class TrackInput:
-    """Input of one control step at ``now``, ns: the messages that are new since the last step, by input."""
+    """Input of one control step at ``now`` (ns): messages received since the last step, by input."""
 
     now: int
     news: dict[str, Any]
     setup: TrackSetup | None = None
-    """In the first step, also after a restart."""
+    """Setup; present in the first step, also after a restart."""
 
 
 class TrackingWorker:
-    """The tracking step in an actor: keeps the newest messages."""
+    """Tracking step in an actor: keeps the latest messages."""
 
     def __init__(self) -> None:
         self._step: TrackingStep | None = None
@@ -417,16 +416,16 @@ class TrackingWorker:
 
 
 class TrackerService:
-    """Follows ``plan/path`` by one tracking step per period.
+    """Service that follows ``plan/path`` with one tracking step per period.
 
     Args:
-        setup: the tracker and the truck.
-        clock: time.
+        setup: settings of the tracker and the truck.
+        clock: clock.
         inputs: subscriptions by the names of ``Newest``.
-        drive: ``plan/drive``.
-        tracker: ``plan/tracker``.
-        events: where events go.
-        actor: computes the steps; None = the event loop does.
+        drive: publisher of ``plan/drive``.
+        tracker: publisher of ``plan/tracker``.
+        events: sink of events.
+        actor: actor that computes the steps; None: the event loop computes them.
         points: converter of scans to points in base, shared within the event loop.
 
     Raises:

@@ -1,8 +1,8 @@
-"""Stanley controller for any way of steering: the leading axle is pointed back to where it belongs.
+"""Stanley controller for any steering mode: steers the leading axle back to its reference position.
 
-Where it belongs is the place that axle has when the base follows the path, so curves leave no error; the controller is
-that of Hoffmann, Tomlin, Montemerlo and Thrun (ACC 2007). Backwards the rear axle leads. With both axles free each
-returns to its own place. A leading axle that cannot steer is returned by the truck's heading.
+The reference position is the axle's position while the base follows the path, so curves leave no error. The controller
+follows Hoffmann, Tomlin, Montemerlo and Thrun (ACC 2007). In reverse the rear axle leads. With both axles free each
+returns to its reference position. The truck's heading returns a leading axle that cannot steer.
 """
 
 import math
@@ -12,7 +12,7 @@ from monstertruck_planners.track.path_tracker import Angles, PathTracker, Tracki
 
 
 class Stanley(PathTracker[StanleyConfig]):
-    """See the module; errors are those of where the truck will be when the wheels have turned."""
+    """Stanley tracker; errors refer to the truck's position after the wheels have turned."""
 
     @property
     def prediction(self) -> float:
@@ -20,7 +20,7 @@ class Stanley(PathTracker[StanleyConfig]):
         return self.response.total
 
     def steer(self, state: TrackingState) -> Angles:
-        """Axle angles."""
+        """Return the axle angles."""
         if state.steering == "crab":
             bearing = state.target.slip - state.heading_error + self._back(state, 0.0)
             return bearing, bearing
@@ -38,13 +38,13 @@ class Stanley(PathTracker[StanleyConfig]):
         return self._by_heading(state, self.geometry.l_f if forward else -self.geometry.l_r)
 
     def _back(self, state: TrackingState, x: float) -> float:
-        """Angle by which the axle at ``x`` steers towards its place."""
+        """Return the angle that steers the axle at ``x`` towards its reference position."""
         config = self.config
         offset = state.lateral_error + x * math.sin(state.heading_error)
         return -state.run.direction * math.atan(config.gain * offset / (abs(state.speed) + config.softening))
 
     def _by_heading(self, state: TrackingState, x: float) -> Angles:
-        """The fixed axle at ``x`` leads: turn the truck so that it goes to its place."""
+        """Turn the truck so that the leading, fixed axle at ``x`` moves to its reference position."""
         wrong = state.heading_error - self._back(state, x)
         turn = state.target.turn - state.run.direction * self.config.heading_gain * wrong
         _, front, rear = self.geometry.steer_for_twist(1.0, -x * turn, turn)

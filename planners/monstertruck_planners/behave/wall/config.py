@@ -1,4 +1,4 @@
-"""Settings of wall following; figures are those of the coursework unless said."""
+"""Wall following settings; defaults come from the coursework unless stated otherwise."""
 
 import math
 from typing import Annotated, Literal
@@ -11,13 +11,13 @@ Metres = Annotated[float, Field(gt=0, le=5)]
 
 
 class WallConfig(BehaviourConfig):
-    """What both published methods share.
+    """Settings shared by both published methods.
 
-    Sonars are named ``l``, ``fl``, ``f``, ``fr`` and ``r``; with the wall on the right the other side's serve.
+    Sonars are named ``l``, ``fl``, ``f``, ``fr`` and ``r``; a wall on the right uses the sonars of the right side.
     """
 
     side: Literal["left", "right"] = "left"
-    """Where the wall is: left is a clockwise lap"""
+    """Side of the wall: left gives a clockwise lap"""
     distance: Metres = 0.30
     """Distance from the side sonar to the wall, m"""
     speed: Annotated[float, Field(gt=0, le=0.5)] = 0.2
@@ -27,19 +27,19 @@ class WallConfig(BehaviourConfig):
     ramp: Annotated[float, Field(gt=0, le=5)] = 0.5
     """Duration of a cubic ramp, s"""
     hold: Annotated[float, Field(ge=0, le=0.5)] = 0.25
-    """Seconds over which a sonar's last echo stands for missing ones; 0 = a missing echo is the greatest range"""
+    """Time for which a sonar's last echo replaces missing ones, s; 0: a missing echo reads as the maximum range"""
     approach_turn: Annotated[float, Field(ge=0, le=math.tau)] = 0.0
-    """Angle of the arc at the beginning, towards the wall's side, rad; the coursework set a time by hand"""
+    """Angle of the initial arc towards the wall's side, rad; the coursework set a time by hand"""
     lap_length: Annotated[float, Field(gt=0, le=1000)] = 4.0
-    """Least length of a lap, m"""
+    """Minimum length of a lap, m"""
     lap_radius: Metres = 0.6
-    """So near to a place that it passed, by odometry, a lap is complete, m; grows with the odometry's drift"""
+    """Distance from a previously passed place, by odometry, that completes a lap, m; grows with odometry drift"""
     laps: Annotated[int, Field(ge=1, le=100)] = 1
-    """Laps after which it stops"""
+    """Number of laps to drive"""
 
 
 class WallPdConfig(WallConfig):
-    """Method 1: PD control of the distance, D as the plain difference between two samples."""
+    """Method 1: PD control of the distance, with D as the plain difference between two samples."""
 
     kind: Literal["wall_pd"] = "wall_pd"
     k_p: Annotated[float, Field(ge=0)] = 12.0
@@ -47,26 +47,27 @@ class WallPdConfig(WallConfig):
     k_d: Annotated[float, Field(ge=0)] = 11.3
     """Yaw rate per change of the error from one sample to the next, rad/s/m; not divided by the period"""
     trigger: Metres = 0.29
-    """Front range at which it turns away, m; after braking from there (0.06 m) and turning on the spot the published
-    one leaves the side sonar 0.05 m too near, 0.34 about right"""
+    """Front range at which the robot turns away, m; after braking (0.06 m) and turning on the spot, the published value
+    leaves the side sonar 0.05 m too near; 0.34 is about right"""
     offset: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Distance of the diagonal sonar ahead of the side one in the angle to the wall, m: 0 as published, 0.05 exact"""
+    """Distance of the diagonal sonar ahead of the side sonar when computing the wall angle, m: 0 as published, 0.05
+    exact"""
     safety: Metres = 0.2
-    """Range of the far diagonal sonar at which it turns away as well, m: for looking into a gap; our figure, above the
-    least range of the sonars"""
+    """Range of the far diagonal sonar at which the robot also turns away, m: for when it looks into a gap; our value,
+    above the sonars' minimum range"""
     seen: Metres = 0.45
-    """Side ranges below which the wall is seen, m; our figure"""
+    """Side range below which the wall is detected, m; our value"""
     gap: Annotated[float, Field(ge=0, le=5)] = 0.0
-    """Distance over which a side sonar whose range jumped up looks into a gap and does not count, m; 0 as published:
-    the robot turns into gaps"""
+    """Distance for which a side sonar is ignored after its range jumped up, because it looks into a gap, m; 0 as
+    published: the robot turns into gaps"""
     aligned: Annotated[float, Field(ge=-1.5, le=0.5)] | None = None
-    """Heading away from the wall by side and diagonal sonar from which on turning away ends, rad; as published none:
-    the robot drives on while it still faces the wall"""
+    """Heading away from the wall, by side and diagonal sonar, that ends turning away, rad; null as published: the robot
+    continues while it still faces the wall"""
     free: Metres = 0.8
-    """Front range from which the path is free again, m; our figure"""
+    """Minimum front range of a free path, m; our value"""
     lead: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Seconds from an echo to the motion that answers it: the distance is that after so long on the present heading; 0
-    as published: a robot whose sonars, gate and drives take 0.2 s swings without end"""
+    """Latency from an echo to the resulting motion, s: the controller predicts the distance this far ahead at constant
+    heading; 0 as published: with 0.2 s in sonars, gate and drives the robot oscillates forever"""
 
 
 class WallSwitchingConfig(WallConfig):
@@ -74,52 +75,52 @@ class WallSwitchingConfig(WallConfig):
 
     kind: Literal["wall_switching"] = "wall_switching"
     obstacle: Metres = 0.30
-    """Range of any of front, diagonal and side sonar below which it turns away, m"""
+    """Range of the front, diagonal or side sonar below which the robot turns away, m"""
     beyond: Metres = 0.05
-    """Metres beyond ``distance`` from which on it turns back towards the wall"""
+    """Distance beyond ``distance`` at which the robot turns back towards the wall, m"""
 
 
 class WallLineConfig(BehaviourConfig):
-    """Method 3, our own: a line fitted to the echoes, in odom; figures are ours."""
+    """Method 3, our own: a line fitted to the echoes in odom; the values are ours."""
 
     kind: Literal["wall_line"] = "wall_line"
     rate: Annotated[float, Field(ge=10, le=50)] = 20.0
-    """Steps a second"""
+    """Steps per second"""
     side: Literal["left", "right"] = "left"
-    """Where the wall is: left is a clockwise lap"""
+    """Side of the wall: left gives a clockwise lap"""
     distance: Metres = 0.30
     """Distance from the side sonar to the wall, m"""
     speed: Annotated[float, Field(gt=0, le=0.3)] = 0.29
-    """Along the wall, m/s"""
+    """Speed along the wall, m/s"""
     creep: Annotated[float, Field(gt=0, le=0.3)] = 0.12
-    """Along a wall whose direction is not known well yet, m/s"""
+    """Speed along a wall whose direction is still uncertain, m/s"""
     turn_rate: Annotated[float, Field(gt=0, le=1)] = 0.8
-    """Greatest yaw rate of turns on the spot, rad/s"""
+    """Maximum yaw rate of turns on the spot, rad/s"""
     acceleration: Annotated[float, Field(gt=0, le=0.6)] = 0.6
-    """Greatest of a ramp, m/s^2 and rad/s^2"""
+    """Maximum acceleration of a ramp, m/s^2 and rad/s^2"""
     jerk: Annotated[float, Field(gt=0, le=4.8)] = 4.8
-    """Greatest of a ramp, m/s^3 and rad/s^3"""
+    """Maximum jerk of a ramp, m/s^3 and rad/s^3"""
     braking: Annotated[float, Field(gt=0, le=0.6)] = 0.35
-    """Greatest deceleration of a ramp to standstill before a wall, m/s^2: gentler than what the gate allows there"""
+    """Maximum deceleration of a ramp to standstill before a wall, m/s^2: gentler than the gate's limit there"""
     lead: Annotated[float, Field(ge=0, le=0.3)] = 0.08
-    """Seconds from a request to the body's motion: requests are those of a ramp so much later"""
+    """Latency from a request to the body's motion, s: requests are taken from the ramp this far ahead"""
     play: Annotated[float, Field(ge=0, le=0.3)] = 0.0
-    """The part of it by which the body follows its wheels, s: odometry by encoders is ahead of the body by so much"""
+    """Part of ``lead`` by which the body lags its wheels, s: encoder odometry is ahead of the body by this time"""
     beam: bool = False
-    """Sonars hear along their axis only; otherwise in the cone that ``sensor/sonar`` states"""
+    """Whether sonars hear along their axis only; otherwise in the cone given by ``sensor/sonar``"""
     critical_angle: Annotated[float, Field(gt=0, le=1.4)] = 0.45
-    """Greatest angle from a wall's normal at which sound comes back, rad; without ``beam``"""
+    """Maximum angle from a wall's normal at which sound returns, rad; without ``beam``"""
     window: Metres = 3.0
-    """Distance over which echoes count for the line, m: longer is steadier, and trusts the odometry longer"""
+    """Travelled distance whose echoes are used for the line, m: longer is steadier but relies longer on odometry"""
     stiffness: Annotated[float, Field(gt=0, le=2)] = 0.3
-    """Distance in which a distance error decays by the control, m; critically damped"""
+    """Distance constant with which the controller reduces a distance error, m; critically damped"""
     door: Metres = 1.3
-    """Distance without a wall that is driven straight on along the line before another wall is searched for, m"""
+    """Distance to continue straight along the line without a wall before searching for another wall, m"""
     search: Annotated[float, Field(gt=0, le=100)] = 25.0
-    """Distance without a wall after which it gives up, m"""
+    """Distance without a wall after which the robot gives up, m"""
     lap_length: Annotated[float, Field(gt=0, le=1000)] = 4.0
-    """Least length of a lap, m"""
+    """Minimum length of a lap, m"""
     lap_radius: Metres = 0.6
-    """So near to a place that it passed, by odometry, a lap is complete, m, and 1 % of the lap's length more"""
+    """Distance from a previously passed place, by odometry, that completes a lap, m; plus 1 % of the lap length"""
     laps: Annotated[int, Field(ge=1, le=100)] = 1
-    """Laps after which it stops"""
+    """Number of laps to drive"""

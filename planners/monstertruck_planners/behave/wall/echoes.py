@@ -1,8 +1,8 @@
 """Lines fitted to echoes: every echo is an arc in odom, and a wall is the line that touches the arcs.
 
-A sonar at p hears a wall whose normal is in its cone over the perpendicular, at r = d(p). A wall whose normal is beyond
-the cone's edge by the angle b is heard along the edge, at r = d(p)/cos b, as long as the sound comes back from there.
-A narrow beam is a cone without an opening.
+A sonar at p hears a wall with its normal inside the cone along the perpendicular, at r = d(p). If the normal lies
+outside the cone's edge by the angle b, the sonar hears the wall along the edge, at r = d(p)/cos b, as long as sound
+returns from there. A narrow beam is a cone with zero opening angle.
 """
 
 import math
@@ -15,55 +15,55 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array
 
 TIGHT: Final = 3.0
-"""Residual, in standard deviations, up to which a line explains an echo."""
+"""Maximum residual of an echo explained by a line, in standard deviations."""
 GUESSES: Final = 24, 5
-"""Start directions of a line fit without an earlier estimate, and the best of these that are fitted to the end."""
+"""Number of start directions of a line fit without a previous estimate, and of the best ones fitted to the end."""
 NEWTON_STEPS: Final = 4, 4, 6
 """Gauss-Newton steps: from an estimate, from all guesses, and further from the best ones."""
 FREE: Final = (math.inf, math.inf)
-"""Inertia without an estimate before."""
+"""Inertia without a previous estimate."""
 
 
 class WallEstimate(NamedTuple):
     """A wall in odom: n . p = c for its points p, with n = (cos normal, sin normal) pointing from the robot to it."""
 
     normal: float
-    """Direction, rad."""
+    """Direction of the normal (rad)."""
     offset: float
-    """c, m."""
+    """Offset c (m)."""
 
     def distance(self, x: float, y: float) -> float:
-        """From a point to the wall, m; negative beyond it."""
+        """Return the distance from a point to the wall (m); negative beyond it."""
         return self.offset - math.cos(self.normal) * x - math.sin(self.normal) * y
 
     @property
     def heading(self) -> float:
-        """Direction of travel with the wall on the left, rad."""
+        """Direction of travel with the wall on the left (rad)."""
         return math.remainder(self.normal - math.pi / 2, math.tau)
 
 
 @dataclass(frozen=True, slots=True)
 class Cone:
-    """How sonars hear.
+    """Sound cone of the sonars.
 
     Attributes:
-        half: half of the opening angle, rad; 0 = a beam.
-        critical: greatest angle from the wall's normal at which sound comes back, rad.
+        half: half of the opening angle (rad); 0 for a beam.
+        critical: maximum angle from the wall's normal for sound to return (rad).
     """
 
     half: float
     critical: float
 
     def shares(self, axis: Array, normal: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """What sonars measure of walls, as a share of their distance.
+        """Return the ranges measured to walls, as a fraction of the wall distance.
 
         Args:
-            axis: of the sonars, rad.
-            normal: of the walls, rad.
+            axis: sonar axes (rad).
+            normal: wall normals (rad).
 
         Returns:
-            Range over distance; the derivative of its logarithm by the wall's direction, 1/rad; whether sound comes
-            back.
+            Range over distance; the derivative of its logarithm by the wall's direction (1/rad); whether sound
+            returns.
         """
         off = normal - axis
         off -= math.tau * np.rint(off * (1.0 / math.tau))
@@ -78,46 +78,46 @@ class Cone:
         return np.sqrt(share, out=share), np.copysign(slope, off, out=slope), heard
 
     def hears(self, axis: float, normal: float) -> bool:
-        """Whether a sonar hears a wall of that direction."""
+        """Whether a sonar hears a wall with this normal."""
         return abs(math.remainder(normal - axis, math.tau)) - self.half <= self.critical
 
 
 ECHO: Final = ("x", "y", "axis", "range", "sonar", "travelled", "time")
-"""Columns of the echoes: place (m) and axis (rad) of the sonar in odom, range (m), its number; distance driven (m) and
-time (s) when it came."""
+"""Columns of the echoes: position (m) and axis (rad) of the sonar in odom, range (m), sonar number; distance travelled
+(m) and time (s) at reception."""
 
 
 class EstimateFit(NamedTuple):
-    """A line and how well it fits."""
+    """Line with its quality of fit."""
 
     line: WallEstimate
     explained: int
-    """Echoes within ``TIGHT``."""
+    """Number of echoes within ``TIGHT``."""
     sigma: tuple[float, float]
-    """Standard deviations of its direction, rad, and of its distance from the robot, m."""
+    """Standard deviations of direction (rad) and distance from the robot (m)."""
 
 
 def deviation(ranges: Array) -> Array:
-    """Standard deviation of ranges, m."""
+    """Return the standard deviation of ranges (m)."""
     # 0.005: standard deviation of a range, m, to which 0.01 of the range is added in quadrature
     return np.asarray(np.hypot(0.005, 0.01 * ranges))
 
 
 def residuals(echoes: Array, line: WallEstimate, cone: Cone) -> Array:
-    """(n,) measured less expected range of every echo, in standard deviations; inf where none is expected."""
+    """Return measured minus expected range of every echo (n,), in standard deviations; inf where none is expected."""
     distance = line.offset - math.cos(line.normal) * echoes[:, 0] - math.sin(line.normal) * echoes[:, 1]
     share, _, heard = cone.shares(echoes[:, 2], np.array(line.normal))
     return np.where(heard, (echoes[:, 3] - distance * share) / deviation(echoes[:, 3]), np.inf)
 
 
 def refine(echoes: Array, before: WallEstimate, at: tuple[float, float], cone: Cone) -> EstimateFit:
-    """Fit a line to echoes, from an estimate that it stays near to where echoes say little.
+    """Fit a line to echoes, starting from an estimate that also holds the fit where echoes carry little information.
 
     Args:
         echoes: (n, 7), see ``ECHO``.
-        before: estimate.
-        at: point whose distance to the line is estimated, m: the robot.
-        cone: how the sonars hear.
+        before: previous estimate.
+        at: position of the robot (m), whose distance to the line is estimated.
+        cone: sound cone of the sonars.
     """
     # (0.05, 0.03): standard deviations of the estimate before: rad, m
     normals, distances, cost, information = _fitted(
@@ -127,9 +127,9 @@ def refine(echoes: Array, before: WallEstimate, at: tuple[float, float], cone: C
 
 
 def search(echoes: Array, at: tuple[float, float], cone: Cone, before: WallEstimate | None = None) -> EstimateFit:
-    """Fit a line to at least three echoes: the best of several directions, and of a line found before.
+    """Fit a line to at least three echoes: the best of several start directions and of a previously found line.
 
-    That one does not hold the fit; but without it a search may miss the line that fits best, and find one of other
+    The previous line does not hold the fit, but without it a search may miss the best line and find a line of other
     echoes. See ``refine``.
     """
     normals = np.linspace(-math.pi, math.pi, GUESSES[0], endpoint=False)
@@ -150,7 +150,7 @@ def search(echoes: Array, at: tuple[float, float], cone: Cone, before: WallEstim
 
 
 def _distinct(normals: Array, distances: Array, cost: Array) -> list[int]:
-    """The best guesses, without those that lead to the same line as a better one."""
+    """Return the best guesses, without those that lead to the same line as a better guess."""
     found: list[tuple[float, float]] = []
     best = []
     distinct = 0.05  # least difference between these, rad or m
@@ -174,7 +174,7 @@ def _fitted(
     inertia: tuple[float, float],
     steps: int,
 ) -> tuple[Array, Array, Array, Array]:
-    """Directions, distances, costs (k,), and information (k, 3) of k fits after some steps."""
+    """Return directions, distances, costs (k,), and information (k, 3) of k fits after some steps."""
     x, y, axis, ranges = np.ascontiguousarray(echoes[:, :4].T)
     x, y = x - at[0], y - at[1]
     weight = 1.0 / deviation(ranges) ** 2

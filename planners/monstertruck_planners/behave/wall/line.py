@@ -1,10 +1,10 @@
 """Wall following by a line fitted to echoes: method 3, our own.
 
 The wall is a line in odom that touches the arcs of the echoes of the last metres. The robot drives along the line at
-its distance, and through a gap along the line as it was. A wall ahead is a second line; where both distances are kept
-the robot stands, turns on the spot until it is parallel to the new wall, and goes on. Speeds change by cubic ramps from
-the present speed and acceleration; what odometry (speed) and gyroscope (yaw rate) lack of them is made up for.
-All is written for a wall on the left; a wall on the right is the mirror image.
+the set distance; through a gap it follows the last line. A wall ahead is a second line: where both distances are met
+the robot stops, turns on the spot until it is parallel to the new wall, and continues. Speeds change by cubic ramps
+from the current speed and acceleration; the controller makes up the shortfall of measured speed (odometry) and yaw
+rate (gyroscope). The code assumes a wall on the left; a wall on the right is mirrored.
 """
 
 import math
@@ -38,29 +38,30 @@ from monstertruck_schemas.state import Odometry, Transforms
 from monstertruck_schemas.topics import IMU, ODOMETRY, SONAR, TRANSFORMS, Topic
 
 SIDE, DIAGONAL, FRONT, FAR = range(4)
-"""Sonars by number, as in ``NAMES``."""
+"""Sonar numbers, as in ``NAMES``."""
 KEPT_POSE_TIME: Final = 1.0
-"""Seconds for which poses are kept: an echo is placed where the robot was then."""
+"""Length of the pose history (s): echoes are placed at the robot's pose of their time."""
 FRONT_RANGE: Final = 1.2
-"""Front range from which on a wall ahead is estimated, m."""
+"""Maximum front range for estimating a wall ahead (m)."""
 AHEAD_DISTANCES: Final = 1.5, 0.8
-"""Distance over which echoes count for the wall ahead, m: on free ground, and along a wall, behind which the foot of
-the perpendicular on the next one may lie."""
+"""Distance over which echoes are used for the wall ahead (m): on free ground, and along a wall; behind that wall may
+lie the foot of the perpendicular to the next wall."""
 NEARER: Final = 5.0
-"""Standard deviations by which an echo of the diagonal sonar is nearer than the wall beside: of something ahead."""
+"""Standard deviations by which a diagonal echo must be nearer than the wall alongside to come from something ahead."""
 LEAST_WALL_ECHOES: Final = 6
-"""Echoes that make a wall."""
+"""Minimum number of echoes of a wall."""
 TOUCHING: Final = 0.16
-"""A range from which on the robot stops at once, m."""
+"""Range at which the robot stops immediately (m)."""
 STRAY: Final = (0.3, 0.4)
-"""Yaw rate that is not the one requested, rad/s, and the seconds after which a motor counts as stalled."""
+"""Yaw rate error (rad/s) and its duration (s) that indicate a stalled motor."""
 DISAGREES, AGREES = 0.2, 0.7
-"""Share of them on the wall below which a sonar contradicts another one, whose share is above the second figure."""
+"""Fraction of echoes on the wall below which a sonar contradicts its neighbour, and above which the neighbour is
+trusted."""
 
 STANDSTILL: Final = TimedRamp(0.0, CubicRamp(0.0, 0.0, 1.0))
 
 Fit = Literal["beside", "left", "right", "turned"]
-"""Lines that are fitted: the wall beside; one ahead by the sonars of either side; the one to which it turns."""
+"""Fitted lines: the wall alongside; walls ahead by left or right sonars; the wall that the robot turns to."""
 Phase = Literal["settle", "search", "brake", "turn", "follow", "stop"]
 
 
@@ -73,46 +74,46 @@ class SonarMount(NamedTuple):
 
     @property
     def reach(self) -> float:
-        """Of the robot's middle from what is at range 0 on the axis, along the axis, m."""
+        """Distance along the axis from the robot's centre to range 0 (m)."""
         return self.x * math.cos(self.yaw) + self.y * math.sin(self.yaw)
 
 
 class LineState(NamedTuple):
-    """Between two steps; poses with the wall on the left."""
+    """State between two steps; poses with the wall on the left."""
 
     phase: Phase = "settle"
     mounts: tuple[SonarMount, ...] = ()
     poses: tuple[tuple[int, Pose2, float], ...] = ()
-    """Poses of the last second by the odometry, with their stamps and speeds, m/s."""
+    """Odometry poses of the last second, with stamps and speeds (m/s)."""
     pose: Pose2 = (0.0, 0.0, 0.0)
-    """Where the body is."""
+    """Pose of the body."""
     heard: int = -1
-    """Stamp of the newest echoes taken in."""
+    """Stamp of the latest processed echoes."""
     echoes: Array = np.empty((0, len(ECHO)))
     monitor: SonarMonitor = SonarMonitor()
     wall: WallEstimate | None = None
-    """Along which it drives."""
+    """Wall that the robot follows."""
     sure: bool = False
     """Whether the direction of ``wall`` is known well."""
     ahead: WallEstimate | None = None
-    """To which it turns."""
+    """Wall that the robot turns to."""
     faced: tuple[WallEstimate | None, WallEstimate | None] = (None, None)
-    """Walls ahead by front and diagonal sonar, and by front and far one; along a wall the second alone."""
+    """Walls ahead by front and diagonal sonar, and by front and far sonar; along a wall only the second."""
     fits: tuple[Fit, ...] = ()
-    """Lines to be fitted to the echoes that came in."""
+    """Pending line fits."""
     v: TimedRamp = STANDSTILL
     w: TimedRamp = STANDSTILL
     lag: tuple[float, float] = (0.0, 0.0)
-    """Distance, m, and angle, rad, that the robot is behind its ramps."""
+    """Lag of the robot behind its ramps: distance (m) and angle (rad)."""
     bias: tuple[float, int] = (0.0, 0)
-    """Bias of the gyroscope, rad/s, and the number of samples of which it is the mean."""
+    """Gyroscope bias (rad/s) and the number of averaged samples."""
     before: float | None = None
-    """Time of the newest step, s."""
+    """Time of the last step (s)."""
     sent: tuple[tuple[float, float, float], ...] = ()
-    """Speed and yaw rate that the ramps had, and the time for which they were requested: of the last second."""
+    """Time, speed and yaw rate of the ramps as requested during the last second."""
     travelled: float = 0.0
     turned: float = 0.0
-    """Rad, both ways counted."""
+    """Accumulated absolute turn (rad)."""
     marks: tuple[float, float] = (0.0, 0.0)
     """``travelled`` and ``turned`` when the phase began."""
     seen: float = 0.0
@@ -120,16 +121,16 @@ class LineState(NamedTuple):
     sense: float = -1.0
     """Sense of the turn: 1 = left."""
     places: Array = np.empty((0, 4))
-    """(n, 4) ``travelled`` and pose where the lap began and every half a metre since; empty = no wall yet."""
+    """(n, 4) ``travelled`` and pose at the start of the lap and every 0.5 m since; empty before the first wall."""
     laps: int = 0
     strays: tuple[float | None, float | None] = (None, None)
-    """Since when yaw rate and speed are not those requested, s."""
+    """Times since which yaw rate and speed differ from the request (s)."""
     equal: tuple[tuple[float, int, float], ...] = ((0.0, 0, 0.0),) * 4
-    """Newest range of every sonar, how often it came in a row, and ``travelled`` when it came first."""
+    """Latest range of every sonar, its number of consecutive repeats, and ``travelled`` at the first of them."""
 
 
 class WallLine:
-    """Method 3.
+    """Wall following by method 3.
 
     Args:
         config: settings.
@@ -141,16 +142,16 @@ class WallLine:
         self._config = config
         self._names = NAMES[config.side]
         self._mirror = 1.0 if config.side == "left" else -1.0
-        # 2: lines fitted for a round of echoes: one in a step where there are as many steps: the event loop waits for
-        # them
+        # 2: lines fitted per round of echoes, spread over the steps if there are enough, because fits block the event
+        # loop
         self._fits = math.ceil(2 * (SONAR.rate or 0.0) / config.rate)
 
     def begin(self) -> LineState:
-        """Before the first step."""
+        """Return the state before the first step."""
         return LineState()
 
     def step(self, inputs: Inputs, state: LineState, t: float) -> BehaviourStep:
-        """One step; see ``Behaviour``."""
+        """Run one step; see ``Behaviour``."""
         sonars, odometry = inputs.of(SONAR), inputs.of(ODOMETRY)
         if not state.mounts:
             mounts = self._mounts(inputs.of(TRANSFORMS))
@@ -173,7 +174,7 @@ class WallLine:
             return BehaviourStep(None, state, state.phase, Reason.BEHAVIOUR_DONE, text)
         v, w = state.v.at(due), state.w.at(due)
         state = state._replace(sent=(*(entry for entry in state.sent if entry[0] > t - KEPT_POSE_TIME), (due, v, w)))
-        catch_up = 1.5  # speed by which a lag is made up for, of the lag, 1/s
+        catch_up = 1.5  # correction speed per lag, 1/s
         v, w = v + catch_up * state.lag[0], w + catch_up * state.lag[1]
         motion = RequestedMotion(min(max(v, 0.0), 0.3), w * self._mirror)  # m/s
         error = None if state.wall is None else self.error(state)
@@ -182,7 +183,7 @@ class WallLine:
     # Inputs
 
     def _mounts(self, transforms: Transforms) -> tuple[SonarMount, ...] | str:
-        """Mounts of the sonars, or what is missing."""
+        """Return the mounts of the sonars, or a message about a missing one."""
         found = {transform.child: transform for transform in transforms.transforms}
         mounts = []
         for name in self._names:
@@ -196,11 +197,11 @@ class WallLine:
 
     def _cone(self, sonars: SonarRanges) -> Cone:
         config = self._config
-        # 1.3: greatest angle from the normal at which a beam comes back, rad
+        # 1.3: maximum angle from the normal for a beam to return, rad
         return Cone(0.0, 1.3) if config.beam else Cone(sonars.field_of_view / 2, config.critical_angle)
 
     def _moved(self, state: LineState, odometry: Odometry, rate: float, t: float) -> LineState:
-        """Take in odometry and gyroscope."""
+        """Update the state from odometry and gyroscope."""
         mirror = self._mirror
         pose = odometry.pose.x, odometry.pose.y * mirror, odometry.pose.yaw * mirror
         bias, count = state.bias
@@ -216,7 +217,7 @@ class WallLine:
         dt = 0.0 if state.before is None else t - state.before
         v, w = _asked(state, t)
         behind = state.lag[0] + (v - speed) * dt, state.lag[1] + (w - (rate - bias)) * dt
-        lag = (0.05, 0.15)  # greatest lag that is made up for: distance, m, and angle, rad
+        lag = (0.05, 0.15)  # maximum corrected lag: distance, m, and angle, rad
         return state._replace(
             bias=(bias, count),
             poses=poses,
@@ -259,7 +260,7 @@ class WallLine:
     # Walls
 
     def _estimate(self, state: LineState, cone: Cone, *, heard: bool) -> LineState:
-        """Fit lines again after a round of echoes, two in each round, the longest waiting first."""
+        """Refit lines after a round of echoes, two per round, longest waiting first."""
         wanted: tuple[Fit, ...] = ("beside", "right") if state.wall is not None else ("left", "right")
         if state.phase == "turn":
             wanted = ("turned",)
@@ -280,7 +281,7 @@ class WallLine:
         return state._replace(fits=fits[self._fits :])
 
     def _beside(self, state: LineState, cone: Cone) -> LineState:
-        """With a new fit of the wall at its side."""
+        """Return the state with a new fit of the wall alongside."""
         wall, echoes = state.wall, state.echoes
         beside = echoes[echoes[:, 4] <= DIAGONAL]
         if wall is None or not len(beside):
@@ -294,22 +295,22 @@ class WallLine:
         return state._replace(seen=float(on_wall[-1, 5])) if len(on_wall) else state
 
     def _opening(self, state: LineState, wall: WallEstimate, cone: Cone) -> bool:
-        """Whether the side sonar looks through an opening: what the diagonal one hears then may be its far post."""
+        """Whether the side sonar looks through an opening: the diagonal sonar may then hear the far post."""
         if not cone.hears(state.pose[2] + state.mounts[SIDE].yaw, wall.normal):
             return False
         fresh = _fresh(state.echoes[state.echoes[:, 4] == SIDE], state)
-        # 0.3: range of the side sonar beyond the wall from which on it looks through an opening, m
+        # 0.3: minimum range of the side sonar beyond the wall in an opening, m
         return not len(fresh) or bool((residuals(fresh, wall, cone) * deviation(fresh[:, 3])).min() > 0.3)
 
     def _nearer(self, state: LineState, faced: tuple[WallEstimate | None, WallEstimate | None]) -> LineState:
-        """With the nearer one of the walls ahead by the sonars of either side."""
+        """Return the state with the nearer of the walls ahead, by left and right sonars."""
         lines = [line for line in faced if line is not None]
         return state._replace(
             faced=faced, ahead=min(lines, key=lambda line: self._distance_to(state, line), default=None)
         )
 
     def _faced(self, state: LineState, cone: Cone, group: tuple[int, int]) -> WallEstimate | None:
-        """A wall ahead by the sonars from one number to another."""
+        """Return a wall ahead, by the sonars of a range of numbers."""
         echoes, pose = state.echoes, state.pose
         own = (echoes[:, 4] >= group[0]) & (echoes[:, 4] <= group[1])
         rows = echoes[(echoes[:, 5] > state.travelled - _reach(state)) & own]
@@ -317,13 +318,13 @@ class WallLine:
         if len(rows) < LEAST_WALL_ECHOES or not len(fresh) or fresh[:, 3].min() > FRONT_RANGE:
             return None
         fit = search(rows, pose[:2], cone)
-        # 1.1: greatest angle between the direction of travel and the normal of a wall that is ahead, rad
+        # 1.1: maximum angle between the direction of travel and the normal of a wall ahead, rad
         facing = abs(math.remainder(fit.line.normal - pose[2], math.tau)) < 1.1
         present = np.count_nonzero(np.abs(residuals(fresh, fit.line, cone)) < TIGHT) > 0.5 * len(fresh)
         return fit.line if facing and present and fit.explained >= max(LEAST_WALL_ECHOES, 0.5 * len(rows)) else None
 
     def _turned_to(self, state: LineState, cone: Cone) -> EstimateFit | None:
-        """The wall that the robot turns to: of all echoes since it is near, but those of the wall it leaves."""
+        """Fit the wall that the robot turns to: all echoes since it is near, except those of the wall it leaves."""
         echoes, at = state.echoes, state.pose[:2]
         late, sides = echoes[:, 5] > state.travelled - _reach(state), echoes[:, 4] < FRONT
         turning = echoes[:, 5] >= state.marks[0]
@@ -336,41 +337,41 @@ class WallLine:
         return fit if fit.explained >= max(LEAST_WALL_ECHOES, 0.3 * len(rows)) else None
 
     def _distance_left(self, state: LineState, cone: Cone) -> float:
-        """Distance until the robot stands before the wall ahead at the distance at which it follows walls, m."""
+        """Return the distance until the robot reaches its following distance from the wall ahead (m)."""
         ahead, fresh = state.ahead, _fresh(state.echoes, state)
         left = math.inf if ahead is None else self._distance_to(state, ahead)
-        for number in (DIAGONAL, FRONT, FAR):  # as if what it hears were right before the sonar
+        for number in (DIAGONAL, FRONT, FAR):  # as if the echo came from right before the sonar
             rows = fresh[fresh[:, 4] == number][-3:]
             if number == DIAGONAL and state.wall is not None:
                 rows = rows[residuals(rows, state.wall, cone) < -NEARER]
             if len(rows) < 2:
                 continue
             range_now = median((rows[:, 3] - (state.travelled - rows[:, 5])).tolist())
-            # 0.2: range of every sonar that looks ahead at which the robot stands at the latest, m: what it hears there
-            # may not be the wall to which it drives
+            # 0.2: minimum range of every sonar that looks ahead, m: the robot stops there at the latest, because the
+            # echo may not come from the wall that it drives to
             left = min(left, range_now - 0.2)
-            if ahead is None and (number != FAR or state.wall is None):  # what is ahead makes no line
+            if ahead is None and (number != FAR or state.wall is None):  # the echoes ahead form no line
                 left = min(left, range_now + state.mounts[number].reach - self._keep(state))
         near = fresh[fresh[:, 4] >= DIAGONAL][-6:, 3]
         return min(left, 0.0) if np.count_nonzero(near < TOUCHING) >= 2 else left
 
     def _distance_to(self, state: LineState, line: WallEstimate) -> float:
-        """Distance until the robot stands at the distance at which it follows walls before one, m."""
+        """Return the distance until the robot reaches its following distance from a wall (m)."""
         x, y, yaw = state.pose
         return (line.distance(x, y) - self._keep(state)) / max(math.cos(line.normal - yaw), 0.4)
 
     def _keep(self, state: LineState) -> float:
-        """Distance of the robot's middle from walls, m."""
+        """Return the following distance of the robot's centre from walls (m)."""
         mount = state.mounts[SIDE]
         return self._config.distance + mount.y
 
     # Faults
 
     def _fault(self, state: LineState, odometry: Odometry, t: float) -> tuple[Reason, str] | None:
-        """Why it cannot go on."""
+        """Return the reason why the robot cannot continue, or None."""
         if (found := state.monitor.fault(state.turned, t)) is not None:
             return found
-        # equal echoes in a row, and the distance over which they came, m, from which on a sonar counts as stuck
+        # number of consecutive equal echoes of a stuck sonar, and the minimum distance that they span, m
         equal = 12, 0.1
         for name, (value, count, first) in zip(self._names, state.equal, strict=True):
             if count >= equal[0] and state.travelled - first >= equal[1]:
@@ -380,10 +381,10 @@ class WallLine:
         if turns is not None and t - turns > STRAY[1]:
             text = f"{state.w.at(t) * self._mirror:.2f} rad/s asked for and not turned: does a motor stall?"
             return Reason.STUCK, text
-        # 1.0: seconds without the requested motion, after which the robot counts as stuck
+        # 1.0: time without the requested motion after which the robot is considered stuck, s
         if stands is not None and t - stands > 1.0:
             return Reason.STUCK, f"{state.v.at(t):.2f} m/s asked for, {odometry.twist.vx:.2f} m/s driven"
-        if state.phase == "turn" and state.turned - state.marks[1] < 0.05:  # angle up to which a turn begins, rad
+        if state.phase == "turn" and state.turned - state.marks[1] < 0.05:  # angle up to which a turn is starting, rad
             for number in (DIAGONAL, FRONT, FAR):
                 if 0.0 < (near := state.equal[number][0]) < TOUCHING:
                     return Reason.STUCK, f"sonar {self._names[number]} measures {near:.2f} m: too near to turn away"
@@ -394,9 +395,9 @@ class WallLine:
         return None
 
     def _disagreement(self, state: LineState, wall: WallEstimate, cone: Cone) -> tuple[Reason, str] | None:
-        """A sonar that does not hear the wall that the other one hears."""
-        # (20, 1.2): least number of echoes of a sonar, over this distance along a wall, m, that tell whether it agrees
-        # with the wall: the diagonal one looks through a door, or past the end of a pillar, before the other one
+        """Return the fault of a sonar that does not hear the wall heard by its neighbour."""
+        # (20, 1.2): minimum number of echoes per sonar, and distance along the wall, m, for a verdict: the diagonal
+        # sonar looks through a door, or past the end of a pillar, before the side sonar
         least, distance = (20, 1.2)
         if state.travelled - state.marks[0] < distance:
             return None
@@ -415,11 +416,11 @@ class WallLine:
     # Phases
 
     def _advance(self, state: LineState, cone: Cone, t: float) -> LineState:
-        """Ramps and phases at ``t``, the time for which motion is requested now."""
+        """Advance ramps and phases to ``t``, the time for which motion is requested now."""
         config = self._config
         match state.phase:
             case "settle":
-                # 0.5: seconds at rest at the beginning, over which the gyroscope's bias is measured
+                # 0.5: initial time at rest for measuring the gyroscope bias, s
                 return self._to(state, "search") if t >= 0.5 else state
             case "search" | "follow":
                 return self._drive(state, cone, t)
@@ -438,12 +439,11 @@ class WallLine:
                 return self._steer(state, t)
 
     def _passed_by(self, state: LineState, wall: WallEstimate, cone: Cone, t: float) -> bool:
-        """Whether what it braked for was on the far side and has gone: front and diagonal sonar heard nothing of it.
+        """Whether the obstacle was on the far side and has gone: front and diagonal sonar did not hear it.
 
-        The echoes of those two may be the corner, although there are none from where the robot stands.
+        Echoes of those two may be the corner, although there are none from the robot's current position.
         """
-        # 0.1: distance left at standstill beside a wall, m, from which on what the robot braked for has gone: it was no
-        # corner
+        # 0.1: distance left at standstill along a wall, m, above which the obstacle has gone and was not a corner
         if self._left(state, cone, t) <= 0.1:
             return False
         lately = state.echoes[state.echoes[:, 5] > state.travelled - AHEAD_DISTANCES[1]]
@@ -452,7 +452,7 @@ class WallLine:
         return bool(np.count_nonzero(ahead) < 2)
 
     def _drive(self, state: LineState, cone: Cone, t: float) -> LineState:
-        """Along the wall, or straight on until there is one."""
+        """Drive along the wall, or straight until there is one."""
         config = self._config
         slow = state.phase == "follow" and not state.sure
         state = state._replace(v=self._ramp(state.v, config.creep if slow else config.speed, t))
@@ -470,19 +470,19 @@ class WallLine:
         brake = shortest_ramp(speed, state.v.acceleration(t), 0.0, config.braking, config.jerk)
         if left - speed / config.rate > brake.distance:
             return state
-        # 0.6: share of the distance of gentle braking that is left, below which it brakes as hard as a ramp may
+        # 0.6: remaining fraction of the gentle braking distance below which the robot brakes as hard as a ramp may
         if left < 0.6 * brake.distance:
             brake = shortest_ramp(speed, state.v.acceleration(t), 0.0, config.acceleration, config.jerk)
         return self._to(state._replace(v=self._stopping(TimedRamp(t, brake), left, t)), "brake")
 
     def _left(self, state: LineState, cone: Cone, t: float) -> float:
-        """``_distance_left`` of where the robot is at ``t`` by its ramp, m."""
+        """Return ``_distance_left`` at the position that the ramp reaches at ``t`` (m)."""
         return self._distance_left(state, cone) - state.lag[0] - state.v.at(t) * self._config.lead
 
     def _stopping(self, ramp: TimedRamp, left: float, t: float) -> TimedRamp:
-        """A ramp to standstill, computed again so that it covers what is left, if that is within the limits."""
+        """Return a ramp to standstill, recomputed to cover the remaining distance if the limits allow."""
         config, speed, change = self._config, ramp.at(t), ramp.acceleration(t)
-        if not 0.0 < speed * left < math.inf:  # nothing is heard ahead any more: the ramp that runs stands
+        if not 0.0 < speed * left < math.inf:  # no echo ahead any more: keep the active ramp
             return ramp
         shape = CubicRamp.to_rest(speed, left, change)
         acceleration, jerk = shape.peaks
@@ -490,7 +490,7 @@ class WallLine:
         return TimedRamp(t, shape) if kept else ramp
 
     def _turn(self, state: LineState, cone: Cone, t: float) -> LineState:
-        """On the spot, until it is parallel to the new wall."""
+        """Turn on the spot until the robot is parallel to the new wall."""
         config, yaw = self._config, state.pose[2]
         if state.w.shape.v1 == 0.0 and state.w.over(t):
             return self._follow(state, cone)
@@ -508,14 +508,14 @@ class WallLine:
         return state._replace(w=self._stopping(TimedRamp(t, brake), sense * left, t))
 
     def _follow(self, state: LineState, cone: Cone) -> LineState:
-        """Go on along the wall that the robot has turned to."""
+        """Follow the wall that the robot has turned to."""
         wall = state.ahead
         if wall is None:
             return state
         kept = state.echoes[np.abs(residuals(state.echoes, wall, cone)) < TIGHT].copy()
-        # -1: number of an echo of another sonar that came from the wall beside, when that was ahead
+        # -1: number for echoes of other sonars from this wall, received while it was ahead
         kept[:, 4] = np.where(kept[:, 4] <= DIAGONAL, kept[:, 4], -1)
-        # 0.5: a lap does not begin where the robot followed a wall for less, m
+        # 0.5: minimum distance along a wall for a lap to begin there, m
         if not len(state.places) or state.travelled - state.places[0, 0] < 0.5:
             state = state._replace(places=np.array([[state.travelled, *state.pose]]))
         return self._to(state, "follow")._replace(
@@ -523,7 +523,7 @@ class WallLine:
         )
 
     def _steer(self, state: LineState, t: float) -> LineState:
-        """Yaw rate by which the distance error decays; 0 without a wall."""
+        """Set the yaw rate that reduces the distance error; 0 without a wall."""
         config, wall = self._config, state.wall
         target = 0.0
         if wall is not None:
@@ -531,11 +531,11 @@ class WallLine:
             away = math.remainder(state.pose[2] - wall.heading, math.tau)
             stiff = config.stiffness
             target = state.v.at(t) * (max(min(error, stiff), -stiff) / stiff**2 - 2.0 * away / stiff)
-        turns = 0.5  # greatest yaw rate along the wall, rad/s
+        turns = 0.5  # maximum yaw rate along the wall, rad/s
         return state._replace(w=self._ramp(state.w, clip(target, -turns, turns), t))
 
     def error(self, state: LineState) -> float:
-        """Distance of the side sonar from the wall less the one wanted, m; of a state with a wall."""
+        """Return the side sonar's distance from the wall minus the set distance (m); the state must have a wall."""
         assert state.wall is not None
         x, y, yaw = state.pose
         mount = state.mounts[SIDE]
@@ -543,15 +543,15 @@ class WallLine:
         return state.wall.distance(x + c * mount.x - s * mount.y, y + s * mount.x + c * mount.y) - self._config.distance
 
     def _sense(self, state: LineState) -> float:
-        """-1 to turn right: always from one wall to the next, from free ground the shorter way."""
+        """Return the turn direction, -1 for right: always right between walls, the shorter turn from free ground."""
         if state.wall is not None or state.ahead is None:
             return -1.0
         return math.copysign(1.0, math.remainder(state.ahead.heading - state.pose[2], math.tau))
 
     def _lap(self, state: LineState) -> LineState:
-        """Count laps by odometry: one is complete where the robot comes back to any place that it drove past.
+        """Count laps by odometry: a lap is complete when the robot returns to any place that it drove past.
 
-        Where it began need not be such a place: a robot that begins along a door post leaves it for the wall.
+        The start need not be such a place: a robot that begins along a door post leaves it for the wall.
         """
         config, (x, y, yaw), places = self._config, state.pose, state.places
         if state.travelled - places[-1, 0] >= 0.5:  # distance between two places at which a lap may be complete, m
@@ -572,7 +572,7 @@ class WallLine:
         return state._replace(phase=phase, marks=(state.travelled, state.turned))
 
     def _ramp(self, ramp: TimedRamp, target: float, t: float) -> TimedRamp:
-        """The ramp that runs if it ends at ``target``, else a new one from the present speed and acceleration."""
+        """Return the active ramp if it ends at ``target``, else a new one from the current speed and acceleration."""
         config = self._config
         if abs(ramp.shape.v1 - target) < 1e-9:
             return ramp
@@ -583,16 +583,16 @@ class WallLine:
 def _strays(
     before: tuple[float | None, float | None], asked: tuple[float, float], measured: tuple[float, float], t: float
 ) -> tuple[float | None, float | None]:
-    """Since when yaw rate and speed are not those requested."""
+    """Return the times since which yaw rate and speed differ from the request (s)."""
     (v, w), (speed, rate) = asked, measured
-    slow = 0.2  # share of the requested speed below which the robot does not move
+    slow = 0.2  # fraction of the requested speed below which the robot does not move
     stray = abs(w - rate) > STRAY[0], (v > 0.05 and speed < slow * v) or (abs(w) > 0.2 and abs(rate) < slow * abs(w))
     turns, stands = ((t if since is None else since) if now else None for now, since in zip(stray, before, strict=True))
     return turns, stands
 
 
 def _asked(state: LineState, t: float) -> tuple[float, float]:
-    """Speed and yaw rate requested over a time."""
+    """Return the speed and yaw rate requested for a time."""
     if not state.sent:
         return 0.0, 0.0
     times, speeds, rates = zip(*state.sent, strict=True)
@@ -600,24 +600,24 @@ def _asked(state: LineState, t: float) -> tuple[float, float]:
 
 
 def _reach(state: LineState) -> float:
-    """Distance over which echoes count for the wall ahead, m."""
+    """Return the distance over which echoes are used for the wall ahead (m)."""
     return AHEAD_DISTANCES[0] if state.wall is None else AHEAD_DISTANCES[1]
 
 
 def _fresh(echoes: Array, state: LineState) -> Array:
-    """The echoes that came lately."""
-    # 0.35: seconds for which an echo shows what is before the robot
+    """Return the recent echoes."""
+    # 0.35: time for which an echo represents the space before the robot, s
     return echoes[echoes[:, 6] > (state.before or 0.0) - 0.35]
 
 
 def _at(poses: tuple[tuple[int, Pose2, float], ...], stamp: int, play: float) -> tuple[Pose2, float]:
-    """Pose and speed of the body at a time: its place and speed are those of the odometry ``play`` earlier."""
+    """Return pose and speed of the body at a time: position and speed come from the odometry ``play`` s earlier."""
     (x, y, _), speed = _between(poses, stamp - round(play * SECOND))
     return (x, y, _between(poses, stamp)[0][2]), speed
 
 
 def _between(poses: tuple[tuple[int, Pose2, float], ...], stamp: int) -> tuple[Pose2, float]:
-    """Pose and speed at a time, between two that are known; the newest or oldest ones outside them."""
+    """Interpolate pose and speed at a time; clamp to the latest or oldest entry."""
     if stamp >= poses[-1][0]:
         return poses[-1][1:]
     for (before, a, slow), (after, b, fast) in pairwise(poses):

@@ -1,4 +1,4 @@
-"""Which sonars a wall follower uses, and what shows that one of them does not measure."""
+"""Sonars of a wall follower, and detection of a sonar that does not measure."""
 
 import math
 from dataclasses import dataclass, field
@@ -8,22 +8,22 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import SonarRanges
 
 NAMES: Final = {"left": ("l", "fl", "f", "fr"), "right": ("r", "fr", "f", "fl")}
-"""Side, diagonal, front and far diagonal sonar by the side where the wall is."""
+"""Side, diagonal, front and far diagonal sonar, by side of the wall."""
 
 
 @dataclass(frozen=True, slots=True)
 class SonarMonitor:
-    """Notices sonars that are silent, and ranges that do not change although the robot turns."""
+    """Detector of silent sonars, and of ranges that do not change while the robot turns."""
 
     answered: dict[str, float] = field(default_factory=dict)
-    """When each answered last, s."""
+    """Time of each sonar's last answer (s)."""
     echoes: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Newest range of each, m, and when it came, s."""
+    """Latest range of each sonar (m) and its time (s)."""
     changed: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Range of each when it changed last, m, and how far the robot had turned then, rad."""
+    """Range of each sonar at its last change (m), and the robot's accumulated turn at that time (rad)."""
 
     def observe(self, sonars: SonarRanges, names: tuple[str, ...], turned: float, t: float) -> "SonarMonitor":
-        """After a message at t, with ``turned`` rad turned so far, left and right both counted."""
+        """Return the monitor after a message at t; ``turned`` is the absolute turn so far (rad), left plus right."""
         answered, echoes, changed = dict(self.answered), dict(self.echoes), dict(self.changed)
         for name in names:
             echo = sonars.echo(name)
@@ -40,12 +40,12 @@ class SonarMonitor:
         return SonarMonitor(answered, echoes, changed)
 
     def fault(self, turned: float, t: float) -> tuple[Reason, str] | None:
-        """What is wrong with the sonars at t."""
+        """Return the fault of the sonars at t, or None."""
         for name, at in self.answered.items():
-            if t - at >= 0.5:  # seconds without any answer of a sonar after which it counts as dead
+            if t - at >= 0.5:  # time without any answer after which a sonar is considered dead, s
                 return Reason.INPUT_STALE, f"sonar {name} has not answered for {t - at:.1f} s"
         for name, (value, at) in self.changed.items():
-            if turned - at > 0.6:  # angle, rad, over which a sonar's range cannot stay the same to the last digit
+            if turned - at > 0.6:  # turn during which a sonar's range cannot stay exactly constant, rad
                 degrees = math.degrees(turned - at)
                 return (
                     Reason.INPUT_CONTRADICTORY,
@@ -54,6 +54,6 @@ class SonarMonitor:
         return None
 
     def range(self, name: str, hold: float, furthest: float, t: float) -> float:
-        """The newest echo if it is not older than ``hold``, else the greatest range, m."""
+        """Return the latest echo if it is not older than ``hold``, else ``furthest`` (m)."""
         value, at = self.echoes.get(name, (furthest, -math.inf))
         return value if t - at <= hold else furthest
