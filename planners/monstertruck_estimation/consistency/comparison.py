@@ -1,7 +1,7 @@
-"""Measures of one motion compared in pairs, in units of the errors that each of them states; the odd one out.
+"""Pairwise comparison of motion measures, relative to their stated errors, to find the odd one out.
 
-Every measure states the greatest error that it makes while it works: a share of the distance or turn and a constant.
-Two disagree if they differ by more than both errors together and what a tolerated delay explains.
+Every measure states its maximum error while it works: a share of the distance or turn, and a constant.
+Two measures disagree if they differ by more than the sum of both errors and the effect of a tolerated delay.
 """
 
 import math
@@ -36,28 +36,28 @@ class Quantity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Greatest errors of a measure that works."""
+    """Maximum errors of a working measure."""
 
     way: tuple[float, float] | None
-    """Of the distance: share of the greater one, and constant (m); None = it does not measure ways."""
+    """Distance error: share of the greater distance, and constant (m); None if it does not measure distance."""
     turn: tuple[float, float]
-    """Of the turn: share of the greater one, and constant (rad)."""
+    """Turn error: share of the greater turn, and constant (rad)."""
     less: float | None = None
-    """The share of the distance where it is this measure that shows less; None = the same."""
+    """Share of the distance that applies if this measure shows less; None for the same share."""
     aside: float = 0.0
-    """Sideways, as a share of the distance."""
+    """Sideways error, as a share of the distance."""
     bend: float = 0.0
-    """Turn per metre, rad."""
+    """Turn error per metre (rad)."""
     drift: float = 0.0
-    """Turn per second, rad."""
+    """Turn error per second (rad)."""
 
 
 def errors_of(config: ConsistencyConfig) -> dict[Measure, Errors]:
-    """Errors that each measure states.
+    """Return the errors that each measure states.
 
-    Wheels slip, and their steering angles are those that were commanded. Scan odometry errs by the noise of ranges. A
+    Wheels slip, and their steering angles are the commanded ones. Scan odometry errs by the noise of ranges. A
     gyroscope's bias changes by less than 0.01 rad/s between two rests. A compass deviates near iron by some tenths.
-    Cameras over a table see a robot's tag within some millimetres; exposures and clocks of two computers differ.
+    Cameras over a table locate a robot's tag within some millimetres; exposures and clocks of two computers differ.
     """
     slip = config.slip
     return {
@@ -71,35 +71,35 @@ def errors_of(config: ConsistencyConfig) -> dict[Measure, Errors]:
 
 
 class Motions(NamedTuple):
-    """What all measures say of the motion between two instants."""
+    """Motion between two instants by all measures."""
 
     since: int
-    """Ns."""
+    """Start of the motion (ns)."""
     stamp: int
-    """Ns."""
+    """End of the motion (ns)."""
     motions: Mapping[Measure, Pose2]
-    """Base at ``stamp`` in base at ``since``; only the yaw counts of those that measure turns alone."""
+    """Base at ``stamp`` in base at ``since``; only the yaw is valid for measures of turns alone."""
     slack: tuple[float, float]
-    """What tolerated delays and errors of the stamps explain, m and rad."""
+    """Difference that tolerated delays and stamp errors explain (m, rad)."""
 
 
 class Disagreement(NamedTuple):
-    """Two measures differ by more than their errors explain."""
+    """Two measures that differ by more than their errors explain."""
 
     quantity: Quantity
     one: Measure
     other: Measure
     by_one: float
-    """Distance (m) or turn (rad)."""
+    """Distance (m) or turn (rad) by ``one``."""
     by_other: float
     difference: float
-    """Between both motions, m or rad."""
+    """Difference between both motions (m or rad)."""
     limit: float
-    """What their errors and the tolerated delay explain, m or rad."""
+    """Difference that their errors and the tolerated delay explain (m or rad)."""
 
     @property
     def text(self) -> str:
-        """In words."""
+        """Description in words."""
         unit, word = ("m", "moved") if self.quantity is Quantity.WAY else ("rad", "turned")
         form = ".2f" if self.quantity is Quantity.WAY else "+.2f"
         return (
@@ -111,7 +111,7 @@ class Disagreement(NamedTuple):
 def turn_difference(
     motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors]
 ) -> tuple[float, float]:
-    """Disagreement of two turns and what errors and delay explain of it, rad."""
+    """Return the difference of two turns, and the part that errors and delay explain (rad)."""
     greatest = max(abs(motions.motions[measure][2]) for measure in (one, other))
     seconds, way = (motions.stamp - motions.since) / SECOND, _way(motions)
     limit = math.fsum(
@@ -124,9 +124,10 @@ def turn_difference(
 def way_difference(
     motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors]
 ) -> tuple[float, float, float]:
-    """How far two measures are apart (m), and what errors and delay explain of it, in the less likely direction.
+    """Return the difference of two measures and its limit in the less likely direction, and the whole difference (m).
 
-    Along the way it is a difference of lengths, across it one of directions.
+    Errors and delay explain a difference up to the limit. Along the path the difference is one of lengths, across it
+    one of directions.
     """
     (x1, y1, _), (x2, y2, _) = motions.motions[one], motions.motions[other]
     longest, mean = max(math.hypot(x1, y1), math.hypot(x2, y2)), (x1 + x2, y1 + y2)
@@ -148,7 +149,7 @@ def way_difference(
 
 
 def way_limit(motions: Motions, one: Measure, other: Measure, errors: Mapping[Measure, Errors]) -> float:
-    """What errors and delay explain of a difference of lengths, m."""
+    """Return the difference of lengths that errors and delay explain (m)."""
     lengths = {measure: math.hypot(*motions.motions[measure][:2]) for measure in (one, other)}
     longest, limit = max(lengths.values()), motions.slack[0]
     for measure, length in lengths.items():
@@ -162,7 +163,7 @@ def way_limit(motions: Motions, one: Measure, other: Measure, errors: Mapping[Me
 def differences(
     motions: Motions, errors: Mapping[Measure, Errors]
 ) -> tuple[list[Disagreement], dict[Quantity, set[frozenset[Measure]]]]:
-    """Pairs that differ by more than they may, and those that agree, by quantity."""
+    """Return the pairs that disagree, and by quantity those that agree."""
     found: list[Disagreement] = []
     agreeing: dict[Quantity, set[frozenset[Measure]]] = {Quantity.WAY: set(), Quantity.TURN: set()}
     for one, other in combinations(motions.motions, 2):
@@ -186,9 +187,10 @@ def differences(
 def suspects(
     found: Iterable[Disagreement], agreeing: Mapping[Quantity, Iterable[frozenset[Measure]]]
 ) -> dict[Measure, Disagreement]:
-    """Measures that may lie, each with its greatest difference.
+    """Return the measures that may be wrong, each with its largest difference.
 
-    A measure that agrees with another one does not. Of those that remain, what the turns say decides about the ways.
+    A measure that agrees with a second one is not suspected. Among the rest, suspects by turn narrow down those by
+    distance.
     """
     found = list(found)
     by_quantity: dict[Quantity, dict[Measure, Disagreement]] = {}
@@ -197,7 +199,7 @@ def suspects(
         rows = [row for row in found if row.quantity is quantity]
         doubtful = {measure for row in rows for measure in (row.one, row.other)} - partnered
         if Measure.COMPASS in doubtful and len(doubtful) > 1:
-            # Iron nearby turns a needle further than its error: it accuses no other measure alone.
+            # Iron nearby turns a needle further than its error: a compass alone accuses no other measure.
             rows = [row for row in rows if Measure.COMPASS not in (row.one, row.other)]
             doubtful &= {measure for row in rows for measure in (row.one, row.other)}
         by_quantity[quantity] = {

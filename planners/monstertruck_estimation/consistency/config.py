@@ -8,27 +8,27 @@ from monstertruck_schemas.base import Positive, Schema
 
 Share = Annotated[float, Field(ge=0, lt=1)]
 SCAN_LIBRARIES: Final = ("numba", "scipy")
-"""Packages without which the motion by scans is not measured."""
+"""Packages that scan odometry requires."""
 MAX_SPEED: Final = 5.0
-"""A drive position that would need more than this, m/s, is a new origin, not a motion."""
+"""A drive position that would need a higher speed (m/s) is a new origin, not a motion."""
 
 
 class ConsistencyConfig(Schema):
     """Comparison of the robot's independent measures of motion."""
 
     scans: Literal["kiss", "own"] | None = "kiss"
-    """Scan odometry: kiss-icp (`own` where it is not installed), or this repository's own, with three quarters of its
-    processor time; null = the motion by scans is not measured"""
+    """Scan odometry: kiss-icp (`own` if it is not installed), or this repository's own, with three quarters of its
+    processor time; null to measure no motion by scans"""
     slip: Share = 0.3
-    """Tolerated slip: share of the wheels' distance or turn by which the robot moves less"""
+    """Tolerated slip: missing motion of the robot, as a share of the wheels' distance or turn"""
     slide: Share = 0.2
-    """Tolerated share of the robot's distance by which the wheels show less: they slide, or are greater than
+    """Tolerated shortfall of the wheels, as a share of the robot's distance: they slide, or are larger than
     configured"""
     delay: Positive = 0.2
-    """Tolerated delay of one sensor's content against another's, s"""
+    """Tolerated delay of one sensor's content against the others (s)"""
     window: Annotated[float, Field(ge=1, le=8)] = 5.0
-    """Longest time over which motions are compared, s"""
+    """Maximum time window for comparing motions (s)"""
     latency: Annotated[float, Field(gt=0, le=1)] = 0.02
-    """Seconds after which a step of the worker counts on the virtual clock"""
+    """Latency of a worker step on the virtual clock (s)"""
     deadline: Annotated[float, Field(gt=0, le=60)] = 5.0
-    """Seconds after which a silent worker is killed"""
+    """Maximum silence of the worker before it is killed (s)"""

@@ -1,11 +1,11 @@
-"""How much the content of the scans lags behind the robot's motion: a likelihood for every lag.
+"""Lag of the scans' content behind the robot's motion: a likelihood for every lag.
 
 The places by the scans (distance and yaw since the first one) are compared with those by another measure some time
-earlier. What both may be wrong by is the covariance of their difference: ``Errors`` give the scale, slip that changes
-along the way, each place, a constant bend and drift; the registration gives its deviations; the offset is unknown.
-So only motion that changes tells lags apart, as much as its change stands out of these errors. A lag is found where
-the best one beyond the tolerated explains the scans so much better than all tolerated ones, and than the longest that
-is tried, that chance does not: the scans have shown the change, and late.
+earlier. The covariance of their difference covers the errors of both: ``Errors`` give the scale, slip that changes
+along the path, each place, a constant bend and drift; the registration gives its deviations; the offset is unknown.
+So only changes of motion tell lags apart, as far as they exceed these errors. A lag is found if the best lag beyond the
+tolerated ones explains the scans so much better than all tolerated ones, and than the longest lag tried, that chance
+cannot: the scans have shown the change, and late.
 """
 
 import math
@@ -20,57 +20,57 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 
 SHIFT: Final = SECOND // 10
-"""Step of the lags that are tried, ns."""
+"""Step between the lags tried (ns)."""
 LONGEST: Final = 16
-"""Greatest lag that is tried, in ``SHIFT``; only shorter ones are found."""
+"""Maximum lag tried, in ``SHIFT``; only shorter ones are found."""
 SIGMAS: Final = 5.0
-"""Significance of a finding, in standard deviations: a false alarm in 3 million looks. Here it rejects all tolerated
+"""Significance of a finding, in standard deviations: a false alarm in 3 million checks. Here it rejects all tolerated
 lags and the longest."""
 GREATEST: Final = 2.0
-"""Greatest errors of a measure that works, in standard deviations."""
+"""Maximum errors of a working measure, in standard deviations."""
 FEWEST: Final = 12
-"""Places that are compared at least."""
+"""Minimum number of places that are compared."""
 
 
 class ScanStep(NamedTuple):
     """Motion between two scans."""
 
     since: int
-    """Ns."""
+    """Stamp of the first scan (ns)."""
     stamp: int
-    """Ns."""
+    """Stamp of the second scan (ns)."""
     moved: tuple[float, float]
     """Distance ahead (m) and turn (rad)."""
     deviations: tuple[float, float]
-    """Of the place at ``stamp``, see ``StepOutput.deviations``."""
+    """Standard deviations of the place at ``stamp``, see ``StepOutput.deviations``."""
 
 
 @dataclass(frozen=True, slots=True)
 class LagQuestion:
-    """Motion by the scans and by other measures, of which the lag is to be found; light enough for the event loop."""
+    """Motion by the scans and by other measures, to find the lag; cheap enough for the event loop."""
 
     tolerated: int
-    """Greatest tolerated lag, in ``SHIFT``."""
+    """Maximum tolerated lag, in ``SHIFT``."""
     others: tuple[tuple[Errors, tuple[ScanStep, ...], Array], ...]
-    """Of every other measure its errors, the n steps of the scans whose time it covers, one after the other, and its
-    motion during them, shape (lags, n, 3), each lag earlier than the one before."""
+    """For every other measure: its errors, the n consecutive scan steps whose time it covers, and its motion during
+    them, shape (lags, n, 3), each lag earlier than the previous one."""
 
 
 class Delay(NamedTuple):
-    """A lag of the scans."""
+    """Lag of the scans."""
 
     seconds: float
     sigmas: float
-    """By which all tolerated lags and the longest are rejected."""
+    """Significance with which all tolerated lags and the longest are rejected."""
 
 
 def lag_question(steps: list[ScanStep], others: list[tuple[Errors, MotionTrack]], tolerated: float) -> LagQuestion:
-    """Collect the motions by which ``scan_delay`` finds the lag.
+    """Collect the motions from which ``scan_delay`` finds the lag.
 
     Args:
-        steps: of the scans, one after the other, at least one.
+        steps: consecutive steps of the scans, at least one.
         others: other measures of the same motion.
-        tolerated: greatest tolerated lag, s.
+        tolerated: maximum tolerated lag (s).
     """
     shifts = SHIFT * np.arange(LONGEST + 1)[:, None]
     known = []
@@ -83,7 +83,7 @@ def lag_question(steps: list[ScanStep], others: list[tuple[Errors, MotionTrack]]
 
 
 def scan_delay(question: LagQuestion) -> Delay | None:
-    """Lag of the scans behind all other measures, where it is more than tolerated beyond chance."""
+    """Return the lag of the scans behind all other measures, or None unless it exceeds the tolerance beyond chance."""
     cost, squares, places = np.zeros(LONGEST + 1), np.zeros(LONGEST + 1), 0
     for errors, steps, moved in question.others:
         for axis in _axes(errors):
@@ -94,26 +94,26 @@ def scan_delay(question: LagQuestion) -> Delay | None:
     best, allowed = int(np.argmin(cost)), question.tolerated + 1
     if not places or best < allowed:
         return None
-    # Errors that are greater than stated everywhere make every difference less certain.
+    # Errors that exceed the stated ones everywhere make every difference less certain.
     inflation = max(1.0, float(squares[best]) / places)
-    # What the scans have not shown up to the longest lag, they may never show: the other measure may be wrong.
+    # A change that the scans have not shown up to the longest lag may never show: the other measure may be wrong.
     rejected = min(cost[:allowed].min(), cost[LONGEST]) - cost[best]
     sigmas = math.sqrt(float(rejected) / inflation)
     return Delay(best * SHIFT / SECOND, sigmas) if sigmas >= SIGMAS else None
 
 
 class _Axis(NamedTuple):
-    """Greatest errors of the distance ahead or of the turn."""
+    """Maximum errors of the distance ahead or of the turn."""
 
     place: int
-    """0 = distance, 1 = turn."""
+    """0 for distance, 1 for turn."""
     share: float
     constant: float
-    """m or rad."""
+    """Constant error (m or rad)."""
     bend: float = 0.0
-    """rad/m."""
+    """Bend (rad/m)."""
     drift: float = 0.0
-    """rad/s."""
+    """Drift (rad/s)."""
 
 
 def _axes(errors: Errors) -> list[_Axis]:
@@ -122,7 +122,7 @@ def _axes(errors: Errors) -> list[_Axis]:
 
 
 def _fit(steps: tuple[ScanStep, ...], moved: Array, axis: _Axis) -> tuple[Array, Array]:
-    """For every lag, (k,): squared Mahalanobis distance of the places by both measures, and log determinant."""
+    """Return, for every lag, (k,), the squared Mahalanobis distance of the places by both, and the log determinant."""
     shown = np.cumsum([step.moved[axis.place] for step in steps])
     seen = np.square([step.deviations[axis.place] for step in steps])
     seconds = np.array([(step.stamp - steps[0].since) / SECOND for step in steps])
@@ -134,7 +134,7 @@ def _fit(steps: tuple[ScanStep, ...], moved: Array, axis: _Axis) -> tuple[Array,
     greatest = np.square(axis.share) * (_outer(places) + slip)
     greatest += np.square(axis.bend) * _outer(ways) + np.square(axis.drift) * _outer(seconds[None])
     greatest += np.square(axis.constant) * np.eye(len(steps))
-    offset = 1.0  # standard deviation of the place at the beginning, m or rad: it is not known
+    offset = 1.0  # standard deviation of the unknown place at the start, m or rad
     root = np.linalg.cholesky(greatest / GREATEST**2 + np.square(offset) + np.diag(seen))
     white = np.linalg.solve(root, (shown - places)[..., None])[..., 0]
     volume = 2.0 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)), axis=1)

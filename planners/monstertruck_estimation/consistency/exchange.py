@@ -10,44 +10,44 @@ from monstertruck_kinematics.se2 import Pose2
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """A motion that another measure claims, to be judged by the scans at both of its ends."""
+    """Motion claimed by another measure, to be judged by the scans at both of its ends."""
 
     since: int
-    """Stamp of the earlier scan, ns."""
+    """Stamp of the earlier scan (ns)."""
     way: tuple[float, float] | None
-    """Place of base at the newest scan in base at the earlier one, m; None = as by the scans."""
+    """Place of base at the latest scan in base at the earlier one (m); None to use the scans' own."""
     turn: float
-    """Turn, rad."""
+    """Turn (rad)."""
     errors: tuple[float, float]
-    """How far, m and rad, the true motion may be from it if the measure works."""
+    """Maximum difference of the true motion from the claim if the measure works (m, rad)."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepInput:
-    """One scan."""
+    """Input of one scan."""
 
     scan: ScanInput
     front: str
     """Scan odometry, see ``ConsistencyConfig.scans``."""
     anew: bool = False
-    """Forget the scans before."""
+    """Forget the earlier scans."""
     claim: Claim | None = None
     lag: LagQuestion | None = None
     rest: Claim | None = None
-    """That the robot stands, as far as its wheels do."""
+    """Claim that the robot stands, as far as its wheels do."""
     rolled: Pose2 | None = None
-    """Motion by the wheels since the scan before; None = not known."""
+    """Motion by the wheels since the previous scan; None if unknown."""
 
 
 REFUTING: Final = 12
-"""Points that fit the scans' own motion alone with which a claim is refuted at least."""
+"""Minimum number of points that fit only the scans' own motion to refute a claim."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScanVerdict:
-    """How a claimed motion and the scans' own explain the newest scan: points that fit one of them alone.
+    """Fit of a claimed motion and of the scans' own to the latest scan: points that fit only one of them.
 
-    Both are refined, the claimed one within its errors: what counts is whether any motion near it fits.
+    Both motions are refined, the claimed one within its errors: the question is whether any motion near it fits.
     """
 
     claimed: int
@@ -59,19 +59,19 @@ class ScanVerdict:
     def refuted(self) -> bool:
         """Whether the scans contradict the claim.
 
-        Where nothing constrains the motion (a corridor, an open field), no point fits one alone. Among people who walk,
-        some fit either, and many neither.
+        Where nothing constrains the motion (a corridor, an open field), no point fits only one. Among people who walk,
+        some points fit either, and many fit neither.
         """
-        outweighed = 4  # their number for every point that fits the claim alone
+        outweighed = 4  # required points for the scans' own motion per point that fits only the claim
         return self.own >= max(REFUTING + outweighed * self.claimed, self.misfits)
 
 
 @dataclass(frozen=True, slots=True)
 class RestEvidence:
-    """Motion of the body that its wheels do not show."""
+    """Evidence of a body motion that the wheels do not show."""
 
     motion: Pose2 = (0.0, 0.0, 0.0)
-    """Pose of base at the newest scan, relative to the claimed pose, m and rad."""
+    """Pose of base at the latest scan, relative to the claimed pose (m, rad)."""
     sigmas: float = 0.0
     """Significance against standstill, in standard deviations of a normal distribution."""
 
@@ -86,30 +86,30 @@ class StepOutput:
     """Result of one scan."""
 
     stamp: int
-    """Ns."""
+    """Stamp of the scan (ns)."""
     since: int | None
-    """Stamp of the scan before; None = there is a gap: the motion since then is not known."""
+    """Stamp of the previous scan; None after a gap: the motion since then is unknown."""
     motion: Pose2 = (0.0, 0.0, 0.0)
     """Base at ``stamp`` in base at ``since``."""
     deviations: tuple[float, float] = (1.0, 1.0)
     """Standard deviations of the place ahead (m) and of the yaw (rad) at ``stamp``, against a scan that is kept for
-    some steps: errors of one step are those of the next one with the other sign."""
+    some steps: the errors of one step recur in the next one with the opposite sign."""
     scatter: tuple[float, float] = (0.0, 0.0)
-    """The same by how much the newest motions differ from each other: no robot goes to and fro from scan to scan."""
+    """The same from the differences between the latest motions: no robot moves to and fro from scan to scan."""
     overlap: float = 0.0
-    """Share of the points that fit the scan before."""
+    """Share of the points that fit the previous scan."""
     verdict: ScanVerdict | None = None
-    """Of the claim; None without one, and where the earlier scan is not known any more."""
+    """Verdict on the claim; None without a claim, and if the earlier scan is no longer known."""
     rest: RestEvidence | None = None
     """Evidence against the claim of standstill; None like ``verdict``."""
     scale: float | None = None
-    """Change of scale since an earlier revolution, as a factor on the ranges; None = no change."""
+    """Change of scale since an earlier revolution, as a factor on the ranges; None without a change."""
     front: str = ""
-    """Scan odometry that is used."""
+    """Scan odometry in use."""
     delay: Delay | None = None
-    """Answer to the question for the lag."""
+    """Answer to the question about the lag."""
 
     @property
     def errors(self) -> tuple[float, float]:
-        """Standard deviations of the place ahead (m) and of the yaw (rad): as stated or as they scatter."""
+        """Standard deviations of the place ahead (m) and of the yaw (rad): the larger of stated and scattered."""
         return max(self.deviations[0], self.scatter[0]), max(self.deviations[1], self.scatter[1])

@@ -1,9 +1,10 @@
-"""The pure core of the consistency check: takes what the sensors say, and names those that cannot be right.
+"""Pure core of the consistency check: takes the sensors' readings and finds those that cannot be right.
 
-Motions are compared at every scan, over windows of half a second to some seconds; without a lidar at every reading of
-the wheels. A difference must last for two comparisons, and where the scans take part in it, they must refute the other
-motion: see ``ScanVerdict``. A finding about motion lasts until the robot is armed again, for a robot that stands shows
-nothing; one about a repeated value ends with the repetition, one about a changed scale when it has changed back.
+Motions are compared at every scan, over windows from half a second to some seconds; without a lidar, at every reading
+of the wheels. A difference must last for two comparisons. If the scans take part in it, they must refute the other
+motion: see ``ScanVerdict``. A finding about motion lasts until the robot is armed again, because a standing robot
+shows nothing. A finding about a repeated value ends with the repetition, one about a changed scale when it has changed
+back.
 """
 
 import math
@@ -35,31 +36,31 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import Doubt, DoubtKind, UnshownMotion
 
 WINDOWS: Final = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
-"""Times over which motions are compared, s, up to the configured one."""
+"""Times over which motions are compared, up to the configured one (s)."""
 WITNESSES: Final = (Measure.WHEELS, Measure.GYRO, Measure.ENCODERS, Measure.STAND)
-"""Measures that show at what time the motion changes."""
+"""Measures that show when the motion changes."""
 GAP: Final = SECOND // 2
-"""Headings and rates further apart are not joined, ns."""
+"""Maximum time between joined headings or rates (ns)."""
 IN_USE: Final = 2 * SECOND
-"""A measure without a sample for so long is not in use, ns."""
+"""Time without a sample after which a measure is not in use (ns)."""
 
 
 class _OpenDisagreement(NamedTuple):
-    """A difference that the scans are to judge."""
+    """Difference that the scans must judge."""
 
     since: int
     found: dict[Measure, Disagreement]
     claimant: Measure
     errors: tuple[float, float]
-    """That the claimant states over the window, m and rad."""
+    """Errors that the claimant states over the window (m, rad)."""
 
 
 class ConsistencyMonitor:
-    """Collects the measures of one robot.
+    """Consistency monitor of one robot's measures.
 
     Args:
-        config: what is tolerated.
-        sensors: which sensor each of the robot's measures is of.
+        config: tolerances.
+        sensors: sensor of each of the robot's measures.
     """
 
     def __init__(self, config: ConsistencyConfig, sensors: dict[Measure, str]) -> None:
@@ -69,23 +70,23 @@ class ConsistencyMonitor:
         self._witnesses = [measure for measure in WITNESSES if measure in sensors]
         self._sampled: dict[Measure, int] = {}
         self._seen: tuple[int, Pose2] | None = None
-        """By the stand."""
+        """Stamp (ns) and pose as last seen by the stand."""
         self._heading: tuple[int, float] | None = None
         self._rate: tuple[int, float] | None = None
         self._bias: float | None = None
         self._rest: list[float] = []
         self._rest_since: int | None = None
         self._scans: deque[int] = deque(maxlen=256)
-        """Stamps of scans whose motion is known."""
-        self._intervals: deque[float] = deque([0.0], maxlen=10)  # intervals between scans of which the longest counts
-        """Between the newest scans, s."""
+        """Stamps of scans with known motion."""
+        self._intervals: deque[float] = deque([0.0], maxlen=10)  # only the longest of these is used
+        """Intervals between the latest scans (s)."""
         self._steps: deque[ScanStep] = deque()
         self._scatter = 0.0, 0.0
-        """Of the newest motions by the scans, m and rad."""
+        """Scatter of the latest motions by scans (m, rad)."""
         self._delayed_at = 0
         self._active_since: int | None = None
         self._doubted: frozenset[Measure] = frozenset()
-        """At the comparison before."""
+        """Measures in doubt at the previous comparison."""
         self._resting: RestWatch | None = None
         if {Measure.WHEELS, Measure.SCANS} <= sensors.keys():
             self._resting = RestWatch(self._tracks[Measure.WHEELS], config.slip)
@@ -93,14 +94,14 @@ class ConsistencyMonitor:
         self._asked = 0
         self._found: dict[str, Doubt] = {}
         self._scale = 1.0
-        """Factor by which the lidar's ranges are longer than at first."""
+        """Factor from the lidar's first ranges to the current ones."""
         self._scaled: Doubt | None = None
         self._values: dict[str, dict[str, RepeatDetector]] = {}
         self._wholes: dict[str, WholeRepeats] = {}
         self._whole_moved: dict[str, int] = {}
         self._frozen: dict[str, Doubt] = {}
 
-    # What the sensors say
+    # Readings of the sensors
 
     def observe_wheels(self, roll: WheelIncrement) -> None:
         """Take the motion of the wheels between two readings."""
@@ -117,12 +118,12 @@ class ConsistencyMonitor:
             self._compare(roll.stamp)
 
     def observe_encoders(self, stamp: int, motion: Pose2) -> None:
-        """Take the motion of free wheels since their reading before, m and rad; ``stamp`` in ns."""
+        """Take the motion of free wheels since their previous reading (m, rad); ``stamp`` in ns."""
         self._sampled[Measure.ENCODERS] = stamp
         self._tracks[Measure.ENCODERS].add(stamp, motion)
 
     def observe_stand(self, stamp: int, pose: Pose2D) -> None:
-        """Take the robot's pose as cameras over it see it; ``stamp`` in ns."""
+        """Take the robot's pose from the overhead cameras; ``stamp`` in ns."""
         seen = pose.x, pose.y, pose.yaw
         before, self._seen = self._seen, (stamp, seen)
         self._sampled[Measure.STAND] = stamp
@@ -134,7 +135,7 @@ class ConsistencyMonitor:
             track.add(stamp, (x, y, float(wrap_angle(turn))))
 
     def observe_heading(self, stamp: int, yaw: float | None) -> None:
-        """Take a heading, counter-clockwise, rad; None = the compass says itself that it is disturbed."""
+        """Take a counter-clockwise heading (rad); None if the compass reports a disturbance."""
         before, self._heading = self._heading, None if yaw is None else (stamp, yaw)
         self._sampled[Measure.COMPASS] = stamp
         track = self._tracks[Measure.COMPASS]
@@ -144,7 +145,7 @@ class ConsistencyMonitor:
             track.add(stamp, (0.0, 0.0, float(wrap_angle(yaw - before[1]))))
 
     def observe_rate(self, stamp: int, rate: float) -> None:
-        """Take a yaw rate, rad/s; its bias is learned while the wheels stand."""
+        """Take a yaw rate (rad/s); its bias is learned while the wheels stand."""
         before, self._rate = self._rate, (stamp, rate)
         self._sampled[Measure.GYRO] = stamp
         self._learn_bias(stamp, rate)
@@ -156,7 +157,7 @@ class ConsistencyMonitor:
             track.add(stamp, (0.0, 0.0, turn * (stamp - before[0]) / SECOND))
 
     def observe_scan(self, output: StepOutput) -> None:
-        """Take the motion between two scans, and what the scans say of a claim."""
+        """Take the motion between two scans and the scans' verdict on a claim."""
         before = self._sampled.get(Measure.SCANS, output.stamp)
         self._intervals.append((output.stamp - before) / SECOND)
         self._sampled[Measure.SCANS] = output.stamp
@@ -175,7 +176,7 @@ class ConsistencyMonitor:
             moved = output.motion[0], output.motion[2]
             self._scatter = output.scatter
             self._steps.append(ScanStep(output.since, output.stamp, moved, output.errors))
-            delay_over = 4 * SECOND  # time over which it is determined, ns
+            delay_over = 4 * SECOND  # time over which the delay is determined, ns
             while output.stamp - self._steps[0].since > delay_over:
                 self._steps.popleft()
         self._scans.append(output.stamp)
@@ -190,13 +191,13 @@ class ConsistencyMonitor:
         self._compare(output.stamp)
 
     def observe_value(self, sensor: str, field: str, stamp: int, value: float) -> None:
-        """Take a number that a sensor has measured; ``stamp`` in ns."""
+        """Take a number measured by a sensor; ``stamp`` in ns."""
         repeats = self._values.setdefault(sensor, {}).setdefault(field, RepeatDetector())
         repeats.observe(value, still=self.still(stamp))
         self._note_frozen(sensor, field, stamp, repeats.row, frozen=repeats.frozen)
 
     def observe_whole(self, sensor: str, stamp: int, whole: bytes | None) -> None:
-        """Take all that a sensor saw at once, as bytes; None = too little to be compared."""
+        """Take a whole scan or image as bytes; None if it has too little content to be compared."""
         repeats = self._wholes.setdefault(sensor, WholeRepeats())
         before, self._whole_moved[sensor] = self._whole_moved.get(sensor, stamp), stamp
         if whole is None:
@@ -205,10 +206,10 @@ class ConsistencyMonitor:
             repeats.observe(whole, moved=self._moved(before, stamp))
         self._note_frozen(sensor, "content", stamp, repeats.row, frozen=repeats.frozen)
 
-    # What follows from it
+    # Conclusions
 
     def activate(self, now: int | None) -> None:
-        """The robot was armed at ``now`` (ns): findings about motion end. None: disarmed, nothing is compared."""
+        """Drop the findings about motion, armed at ``now`` (ns); None: disarmed, nothing is compared."""
         self._active_since = now
         self._pending, self._doubted = None, frozenset()
         self._steps.clear()
@@ -216,7 +217,7 @@ class ConsistencyMonitor:
             self._found.clear()
 
     def claim(self, stamp: int) -> Claim | None:
-        """The motion up to the next scan, at ``stamp`` (ns), that the scans are to judge."""
+        """Return the motion up to the next scan, at ``stamp`` (ns), that the scans must judge."""
         pending = self._pending
         if pending is None:
             return None
@@ -228,34 +229,34 @@ class ConsistencyMonitor:
         return Claim(pending.since, motion[:2] if ways else None, motion[2], pending.errors)
 
     def rolled(self, stamp: int) -> Pose2 | None:
-        """Return the motion by the wheels from the newest scan to the next one, at ``stamp`` (ns)."""
+        """Return the motion by the wheels from the latest scan to the next one, at ``stamp`` (ns)."""
         track, before = self._tracks.get(Measure.WHEELS), self._sampled.get(Measure.SCANS)
         return None if track is None or before is None else track.motion(before, stamp)
 
     def rest_claim(self, stamp: int, end: int) -> Claim | None:
-        """That the robot stands as its wheels do, up to the next scan: from its first to its last beam, ns."""
+        """Return the claim that the robot stands like its wheels up to the next scan, from first to last beam (ns)."""
         return None if self._resting is None else self._resting.claim(stamp, end)
 
     @property
     def unshown(self) -> UnshownMotion | None:
-        """Motion of the body that its wheels do not show, at the newest scan."""
+        """Motion of the body that its wheels do not show, at the latest scan."""
         return None if self._resting is None else self._resting.motion
 
     def findings(self) -> tuple[Doubt, ...]:
-        """What is wrong at present."""
+        """Return the current findings."""
         scaled = () if self._scaled is None else (self._scaled,)
         return (*self._found.values(), *scaled, *self._frozen.values())
 
     def in_use(self, now: int) -> tuple[Measure, ...]:
-        """Measures with samples of late."""
+        """Return the measures with recent samples."""
         return tuple(one for one in self._sensors if now - self._sampled.get(one, -IN_USE) < IN_USE)
 
     def measures_way(self, measure: Measure) -> bool:
-        """Whether a measure is one of distances, too."""
+        """Whether a measure includes distance."""
         return self._errors[measure].way is not None
 
     def still(self, stamp: int) -> bool:
-        """Whether the wheels stood shortly before ``stamp``, ns."""
+        """Whether the wheels stood shortly before ``stamp`` (ns)."""
         track = self._tracks.get(Measure.WHEELS)
         if track is None or track.newest is None:
             return False
@@ -263,7 +264,7 @@ class ConsistencyMonitor:
         return speed < STILL[0] and rate < STILL[1]
 
     def _moved(self, since: int, stamp: int) -> float:
-        """Distance or turn by the wheels, m or rad: whichever is more; 0 while they stand."""
+        """Return the larger of distance (m) and turn (rad) by the wheels; 0 while they stand."""
         track = self._tracks.get(Measure.WHEELS)
         if track is None or track.newest is None or self.still(stamp):
             return 0.0
@@ -279,11 +280,11 @@ class ConsistencyMonitor:
         rest = SECOND // 2  # time at rest after which the bias of a gyroscope is known, ns
         if stamp - self._rest_since >= rest:
             mean = math.fsum(self._rest) / len(self._rest)
-            self._bias = mean if abs(mean) <= 0.1 else self._bias  # a mean rate at rest above this is no bias, rad/s
+            self._bias = mean if abs(mean) <= 0.1 else self._bias  # maximum bias: a higher mean rate is none, rad/s
             self._rest, self._rest_since = [], None
 
     def _compare(self, stamp: int) -> None:
-        """Compare all measures over all windows that end at ``stamp``, ns."""
+        """Compare all measures over all windows that end at ``stamp`` (ns)."""
         if self._active_since is None:
             return
         worst: dict[Measure, Disagreement] = {}
@@ -302,16 +303,16 @@ class ConsistencyMonitor:
         if not lasting:
             return
         claimant = _claimant(lasting)
-        again = SECOND // 5  # least time between two motions that the scans are asked about, ns
+        again = SECOND // 5  # minimum time between two claims that the scans judge, ns
         if claimant is None:
             self._accuse(stamp, lasting)
         elif self._pending is None and stamp - self._asked >= again:
             self._pending, self._asked = _OpenDisagreement(begun, lasting, claimant, errors), stamp
 
     def _slack(self, motions: Collection[Measure], since: int, stamp: int) -> tuple[float, float]:
-        """What delays and errors of the stamps explain of a difference, m and rad.
+        """Return the difference that delays and stamp errors explain (m, rad).
 
-        A constant delay costs what the speed has changed; an error of a stamp, the distance travelled meanwhile. Stamps
+        A constant delay costs the change of the speed; a stamp error costs the distance travelled meanwhile. Stamps
         of sparse scans, or of scans in bursts, are no better than the interval between them. Scans whose motions
         scatter more than they state are that uncertain.
         """
@@ -324,24 +325,24 @@ class ConsistencyMonitor:
         )
         if Measure.SCANS not in motions:
             return way, turn
-        # Among people who walk with the robot the registration jumps from one to the next.
+        # Among people who walk with the robot, the registration jumps from one person to the next.
         errors, scatter = self._errors[Measure.SCANS], [GREATEST * math.sqrt(2.0) * one for one in self._scatter]
         stated = 0.0 if errors.way is None else errors.way[1]
         return way + max(0.0, scatter[0] - stated), turn + max(0.0, scatter[1] - errors.turn[1])
 
     def _tolerated(self, window: Motions, found: Disagreement) -> tuple[float, float]:
-        """How far the true motion may be from the claimed one, m and rad."""
+        """Return the maximum difference of the true motion from the claimed one (m, rad)."""
         claimant = _claimant({found.one: found})
         if claimant is None:
             return 0.0, 0.0
         pair = Measure.SCANS, claimant
         _, turn = turn_difference(window, *pair, self._errors)
         if self._errors[claimant].way is None:
-            return 0.15, turn  # how far the way may change with a claimed turn, m
+            return 0.15, turn  # maximum change of the distance with a claimed turn, m
         return way_limit(window, *pair, self._errors), turn
 
     def _starts(self, stamp: int) -> Iterator[int]:
-        """Beginnings of the windows that end at ``stamp``, ns: at scans, if there are any."""
+        """Yield the starts of the windows that end at ``stamp`` (ns): at scans, if there are any."""
         assert self._active_since is not None
         windows = [round(window * SECOND) for window in WINDOWS if window <= self._config.window]
         if Measure.SCANS not in self._sensors:
@@ -356,10 +357,10 @@ class ConsistencyMonitor:
             yield scans[at]
 
     def lag(self) -> LagQuestion | None:
-        """The motion of the newest scans, and of other measures before, that tells how much the scans lag behind."""
+        """Return the latest motion by scans and the earlier one by other measures, to find the lag of the scans."""
         if not self._steps or self._active_since is None:
             return None
-        delay_period = SECOND // 4  # time between two looks at the delay of the scans, ns
+        delay_period = SECOND // 4  # time between two checks of the scans' delay, ns
         if self._steps[-1].stamp - self._delayed_at < delay_period:
             return None
         self._delayed_at = self._steps[-1].stamp
@@ -434,7 +435,7 @@ class ConsistencyMonitor:
 
 
 def _claimant(found: dict[Measure, Disagreement]) -> Measure | None:
-    """The measure whose motion the scans are to judge; None where they are in no difference."""
+    """Return the measure whose motion the scans must judge; None if they are in no difference."""
     for difference in found.values():
         if Measure.SCANS in (difference.one, difference.other):
             return difference.other if difference.one is Measure.SCANS else difference.one

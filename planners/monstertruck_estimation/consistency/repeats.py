@@ -1,8 +1,8 @@
-"""Values that repeat to the digit for longer than their noise allows.
+"""Detect values that repeat to the digit for longer than their noise allows.
 
 A sensor whose noise has a standard deviation of at least 0.6 digits gives its most frequent value with a
-probability of at most 0.6 (normal distribution): 40 equal values in a row happen once in 10^9. How much noise a value
-has is learned while the robot stands; one without noise, which may stay the same for hours, is never accused.
+probability of at most 0.6 (normal distribution): 40 equal values in a row happen once in 10^9. The detector learns a
+value's noise while the robot stands. A value without noise may stay the same for hours; it is never accused.
 """
 
 import math
@@ -10,13 +10,13 @@ from collections import deque
 from typing import Final
 
 LEAST_ROW: Final = 40
-"""Equal values in a row that such noise does not give."""
+"""Minimum number of equal values in a row that such noise does not produce."""
 NOISE_READINGS: Final = 20
-"""Values over which the noise is measured."""
+"""Number of values over which the noise is measured."""
 
 
 class RepeatDetector:
-    """One number of a sensor."""
+    """Repeat detector for one value of a sensor."""
 
     def __init__(self) -> None:
         self._last: float | None = None
@@ -25,20 +25,20 @@ class RepeatDetector:
         self._digit = math.inf
         self._still: deque[float] = deque(maxlen=NOISE_READINGS)
         self._noise = math.inf
-        """Of the quietest window."""
+        """Standard deviation of the quietest window."""
         self._windows = 0
 
     @property
     def frozen(self) -> bool:
-        """Whether the value repeats longer than its noise allows."""
-        enough = 0.6  # least standard deviation of a value's noise, in digits, with which it is judged
-        known = self._windows >= 2 and self._noise >= enough * self._digit  # windows after which it is known
-        longer = 8  # factor on the longest row seen before: quantisation and filters make rows of their own
+        """Whether the value has repeated for longer than its noise allows."""
+        enough = 0.6  # minimum standard deviation of the noise, in digits, for a value to be judged
+        known = self._windows >= 2 and self._noise >= enough * self._digit  # the noise is known after two windows
+        longer = 8  # factor on the longest earlier row: quantisation and filters produce rows, too
         return known and self._row >= max(LEAST_ROW, longer * self._longest)
 
     @property
     def row(self) -> int:
-        """Equal values in a row."""
+        """Current number of equal values in a row."""
         return self._row
 
     def observe(self, value: float, *, still: bool) -> None:
@@ -51,7 +51,7 @@ class RepeatDetector:
                 if not self.frozen:
                     self._longest = max(self._longest, self._row)
             self._last, self._row = value, 1
-        if not still or self._row > 10:  # a longer row may be that of a frozen value, and says nothing about the noise
+        if not still or self._row > 10:  # a longer row may come from a frozen value and does not show the noise
             self._still.clear()
             return
         self._still.append(value)
@@ -63,13 +63,13 @@ class RepeatDetector:
 
 
 MOVED: Final = 0.15
-"""Distance (m) or turn (rad) after which equal ones are no chance without noise either."""
+"""Motion (m or rad) after which repeats are no coincidence, even without noise."""
 
 
 class WholeRepeats:
-    """A scan or a picture: hundreds of values.
+    """Repeat detector for a scan or an image: hundreds of values.
 
-    They are never all the same twice, unless nothing moves and nothing is noisy, as in a simulation.
+    Two of them are never identical, unless nothing moves and nothing is noisy, as in a simulation.
     """
 
     def __init__(self) -> None:
@@ -82,24 +82,24 @@ class WholeRepeats:
 
     @property
     def row(self) -> int:
-        """Equal ones in a row."""
+        """Current number of equal scans or images in a row."""
         return self._row
 
     def observe(self, whole: bytes, *, moved: float) -> None:
-        """Take a whole, and how far the robot has moved by another measure since the one before, m or rad."""
+        """Take a scan or image, and the robot's motion since the previous one by another measure (m or rad)."""
         before, self._last = self._last, whole
         if whole != before:
             self._row, self._moved, self.frozen = 1, 0.0, False
             self._different = self._different + 1 if moved == 0.0 and before is not None else 0
-            proof = 10  # different ones in a row while the robot stands after which noise is known to change each
+            proof = 10  # different ones in a row at standstill that prove that noise changes each of them
             self._noisy |= self._different >= proof
             return
         self._row += 1
         self._different = 0
         self._moved += moved
-        equal = 3  # equal ones in a row that are no chance then
+        equal = 3  # equal ones in a row that are then no coincidence
         self.frozen |= self._row >= equal and (self._noisy or self._moved >= MOVED)
 
     def pause(self) -> None:
-        """The next whole does not follow the last one, or says too little to be compared."""
+        """Start a new row: the next one does not follow the last, or has too little content to be compared."""
         self._last, self._row, self._moved, self.frozen = None, 1, 0.0, False

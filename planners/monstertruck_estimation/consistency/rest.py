@@ -1,6 +1,6 @@
-"""Detects motion of the body by scans while the wheels show standstill.
+"""Detect motion of the body by scans while the wheels show standstill.
 
-The newest scan is compared with the first one since the wheels stopped, or one ``OVER`` earlier.
+The latest scan is compared with the first one since the wheels stopped, or with the one ``OVER`` earlier.
 """
 
 import math
@@ -13,11 +13,11 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.state import UnshownMotion
 
 OVER: Final = 4 * SECOND
-"""Maximum time between the two scans that are compared, ns."""
+"""Maximum time between the two compared scans (ns)."""
 
 
 class RestWatch:
-    """Compares the newest scan with an earlier one since the wheels stopped.
+    """Compare the latest scan with an earlier one since the wheels stopped.
 
     Args:
         wheels: motion that the wheels show.
@@ -27,13 +27,13 @@ class RestWatch:
     def __init__(self, wheels: MotionTrack, slip: float) -> None:
         self._wheels, self._slip = wheels, slip
         self._rest: deque[int] = deque()
-        """Stamps of the scans since the wheels stopped, ns."""
+        """Stamps of the scans since the wheels stopped (ns)."""
         self._asked: Claim | None = None
         self.motion: UnshownMotion | None = None
-        """Motion of the body that the newest scan proves, or None."""
+        """Motion of the body that the latest scan proves, or None."""
 
     def observe(self, output: StepOutput) -> None:
-        """Take the newest scan, and its evidence against the claim."""
+        """Take the latest scan and its evidence against the claim."""
         asked, self._asked = self._asked, None
         self.motion = None
         still = self._wheels.rests(output.stamp)
@@ -49,16 +49,17 @@ class RestWatch:
         x, y, turn = output.rest.motion
         distance = max(0.0, math.hypot(x, y) - self._slip * math.hypot(*asked.way))
         self.motion = UnshownMotion(since=asked.since, stamp=output.stamp, distance=distance, turn=turn)
-        self._rest = deque([output.stamp])  # what is proven next is new motion
+        # the next proof is of new motion
+        self._rest = deque([output.stamp])
 
     def claim(self, stamp: int, end: int) -> Claim | None:
         """Return the claim that the body moves no more than its wheels up to a scan.
 
-        None if they turn before its last beam: a robot that sets off distorts the scan.
+        None if they turn before its last beam: a robot that starts moving distorts the scan.
 
         Args:
-            stamp: of its first beam, ns.
-            end: of its last beam, ns.
+            stamp: stamp of its first beam (ns).
+            end: stamp of its last beam (ns).
         """
         if not self._rest or not self._wheels.rests(stamp) or not self._wheels.rests(end):
             return None

@@ -1,6 +1,6 @@
-"""Evidence that a body has moved although its wheels stand: the motion between two scans and how sure it is.
+"""Evidence that a body has moved although its wheels stand: the motion between two scans and its significance.
 
-The newest scan is registered to an earlier one of the robot at rest. The jackknife over sectors of the view (Efron
+The latest scan is registered to an earlier one of the robot at rest. The jackknife over sectors of the view (Efron
 1982) gives the significance of that motion: a person, door or curtain that moves in one sector contradicts the other
 sectors and proves no motion. The stated range noise, an upper bound of the true one, must be an unlikely explanation.
 Scan odometry over the scans in between must also be nearer to the registered motion than to standstill.
@@ -19,9 +19,9 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between
 
 SECTOR: Final = math.radians(15)
-"""Angle of view that one person at a distance of 2 m covers, rad."""
+"""Angle of view that one person at a distance of 2 m covers (rad)."""
 DIMENSIONS: Final = 3
-"""Of a planar motion."""
+"""Number of dimensions of a planar motion."""
 LEAST: Final = np.finfo(float).tiny
 """Lower bound of a p-value before its conversion to standard deviations."""
 
@@ -39,11 +39,11 @@ def rest_evidence(scan: Scan, earlier: Scan, own: Array, claim: Claim, origin: t
     """Return the motion since an earlier scan relative to a claimed motion.
 
     Args:
-        scan: newest scan.
-        earlier: scan at the beginning of the claim.
-        own: motion between both by scan odometry, shape (3,): where the registration begins.
+        scan: latest scan.
+        earlier: scan at the start of the claim.
+        own: motion between both by scan odometry, shape (3,), at which the registration begins.
         claim: motion by the wheels.
-        origin: place of the sensor in base, m.
+        origin: position of the sensor in base (m).
     """
     cloud, claimed = Cloud.of(earlier), np.array((*(claim.way or (0.0, 0.0)), claim.turn))
     fit = register(scan, cloud, own)
@@ -51,7 +51,7 @@ def rest_evidence(scan: Scan, earlier: Scan, own: Array, claim: Claim, origin: t
         return RestEvidence()
     x, y, turn = between(claimed, fit.pose).tolist()
     sectors, moved = _sectors(scan, cloud, fit.pose, origin), fit.pose - claimed
-    unlikely = 1e-3  # largest p-value of a motion under the stated range noise that the jackknife judges
+    unlikely = 1e-3  # maximum p-value of a motion under the stated range noise that the jackknife judges
     if _by_noise(sectors, moved) > unlikely:
         return RestEvidence((x, y, turn))
     return RestEvidence((x, y, turn), -float(ndtri(max(_by_sectors(sectors, moved), LEAST))))

@@ -1,7 +1,7 @@
 """Detects a change of the lidar's scale between two revolutions: one factor on all ranges.
 
-Motion of the robot changes every range by a different factor. The points decide between motion and scale by which of
-them fit one explanation alone, see ``ScanVerdict``.
+Motion of the robot changes every range by a different factor. The points that fit only one of the two explanations
+decide between motion and scale, see ``ScanVerdict``.
 """
 
 import math
@@ -19,21 +19,21 @@ class Revolution(NamedTuple):
     """A scan with its ranges."""
 
     ranges: Array
-    """Shape (n,), m; not finite where there is none."""
+    """Ranges, shape (n,) (m); not finite for beams without a range."""
     scan: Scan
-    """In base."""
+    """Scan in base."""
     origin: tuple[float, float]
-    """Place of the sensor in base, m."""
+    """Position of the sensor in base (m)."""
 
 
 def scale_change(newest: Revolution, earlier: Revolution, motions: list[Array]) -> float | None:
-    """Return the factor from the earlier ranges to the newest ones, or None if motion explains the newest scan.
+    """Return the factor from the earlier ranges to the latest ones, or None if motion explains the latest scan.
 
     Args:
-        newest: newest revolution.
+        newest: latest revolution.
         earlier: reference revolution.
-        motions: initial guesses of the registration, the most likely one first, at least one, each of shape (3,), m
-            and rad.
+        motions: initial guesses of the registration, at least one, the most likely one first, each of shape (3,) (m,
+            rad).
     """
     cloud = Cloud.of(earlier.scan)
     fits = []
@@ -49,7 +49,7 @@ def scale_change(newest: Revolution, earlier: Revolution, motions: list[Array]) 
         return None
     rescaled = _rescaled(newest.scan, newest.origin, 1.0 / factor)
     scaled = max((_fits(rescaled, cloud, motion) for motion in motions), key=np.count_nonzero)
-    # Nothing else changes with the scale: every point that does not fit the rescaled revolution speaks for motion.
+    # Nothing else changes with the scale: every point that does not fit the rescaled revolution is evidence of motion.
     alone, misfits = int(np.count_nonzero(scaled & ~moved)), int(np.count_nonzero(~scaled))
     return factor if ScanVerdict(claimed=misfits, own=alone, misfits=misfits).refuted else None
 

@@ -1,8 +1,8 @@
-"""Worker of the consistency check: scan odometry, which knows no wheels, no compass and no map of the robot's.
+"""Worker of the consistency check: scan odometry, independent of the robot's wheels, compass and map.
 
 ``monstertruck_estimation.consistency.scan_odometry:warmed``; a step's input is a ``StepInput``, its output a
-``StepOutput``. kiss-icp (Vizzo et al. 2023) registers each scan to its own voxel map, starting at the motion before;
-our registration to the last scan that was kept refines its pose, and does without it where it is not installed.
+``StepOutput``. kiss-icp (Vizzo et al. 2023) registers each scan to its own voxel map, starting at the previous motion.
+Our registration to the last scan that was kept refines its pose, and replaces it if kiss-icp is not installed.
 """
 
 import math
@@ -26,7 +26,7 @@ from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 
 GAP: Final = 1.5
-"""Scans further apart in time are not compared, s."""
+"""Maximum time between scans that are compared (s)."""
 
 
 class KissFront:
@@ -38,21 +38,21 @@ class KissFront:
         self._map = KissMap()
 
     def begin(self, scan: Scan, pose: Array) -> None:
-        """Forget everything, and begin with ``scan`` at ``pose``, shape (3,)."""
+        """Forget everything, and start with ``scan`` at ``pose``, shape (3,)."""
         self._map.clear()
         self.keep(scan, pose)
 
     def match(self, scan: Scan, guess: Array) -> Array:
-        """Pose of the next scan, shape (3,), from a guess."""
+        """Return the pose of the next scan, shape (3,), from a guess."""
         return self._map.align(scan.points, guess)
 
     def keep(self, scan: Scan, pose: Array) -> None:
-        """Take the scan, whose pose is accepted, into the map."""
+        """Add a scan with an accepted pose to the map."""
         self._map.update(scan.points, pose)
 
 
 def front_of(kind: str) -> tuple[str, KissFront | None]:
-    """The scan odometry of this name, or ours where kiss-icp is not installed, with its name."""
+    """Return the scan odometry of this name, or ours if kiss-icp is not installed, with its name."""
     if kind == "kiss" and find_spec("kiss_icp") is not None:
         return "kiss", KissFront()
     return "own", None
@@ -70,15 +70,15 @@ class ScanMotionStep:
         averaged = 2
         self._motions: deque[tuple[Array, float]] = deque(maxlen=averaged)
         """Latest motions with their durations (s)."""
-        scattered = 20  # newest changes of the motion whose scatter is measured
+        scattered = 20  # number of the latest changes of the motion whose scatter is measured
         self._changes: deque[tuple[float, float]] = deque(maxlen=scattered)
-        """From one motion to the next, m^2 and rad^2."""
+        """Changes from one motion to the next (m^2, rad^2)."""
         self._last: tuple[int, Cloud] | None = None
         self._revolution: Revolution | None = None
-        """Newest revolution, the reference of the next one's scale."""
+        """Latest revolution, the reference of the next one's scale."""
         self._reference: tuple[Cloud, Array] | None = None
-        """The scan that others are registered to, and its pose."""
-        self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=128)  # scans kept for claims
+        """Scan to which others are registered, and its pose."""
+        self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=128)  # number of scans kept for claims
         """Stamp, scan and its pose."""
 
     def step(self, inputs: StepInput) -> StepOutput:
@@ -103,7 +103,7 @@ class ScanMotionStep:
         thinned = 0.06  # about one point per square of this edge is registered, m
         most_points = 300
         scan = whole.downsampled(thinned, most_points)
-        if len(whole) < 30:  # a scan with fewer points says nothing of the motion
+        if len(whole) < 30:  # minimum number of points of a scan that measures the motion
             self._last = self._revolution = None
             return StepOutput(stamp, None, front=name)
         found = None
@@ -157,10 +157,10 @@ class ScanMotionStep:
     def _found(
         self, front: KissFront | None, scan: Scan, whole: Scan, before: Cloud, lasting: Array
     ) -> tuple[Array, float, tuple[float, float]] | None:
-        """Motion since the scan before, its overlap and deviations; None where no motion fits.
+        """Return the motion since the previous scan, its overlap and deviations; None if no motion fits.
 
-        kiss-icp's pairs of points on walls along the way hold the robot back by up to 0.1 m while it starts: its pose
-        is where the registration to the reference begins, whose pairs slide along surfaces.
+        kiss-icp's pairs of points on walls along the path hold the robot back by up to 0.1 m while it starts moving:
+        its pose is only the start of the registration to the reference, whose pairs slide along surfaces.
         """
         assert self._reference is not None
         cloud, origin = self._reference
@@ -168,13 +168,13 @@ class ScanMotionStep:
         if front is not None:
             guess = front.match(scan, guess)
         fit = register(scan, cloud, between(origin, guess)) if np.isfinite(guess).all() else None
-        fits = 0.5  # least overlap with the scan before of a motion that counts
+        fits = 0.5  # minimum overlap of a valid motion with the previous scan
         if fit is not None and np.isfinite(fit.pose).all():
             motion = between(self._pose, compose(origin, fit.pose))
             overlap = measure(whole, before, motion).overlap
             if overlap >= fits:
                 return motion, overlap, deviations_of(fit)
-        # The velocity did not last, or the map holds what is no longer there.
+        # The velocity has changed, or the map holds objects that have gone.
         tries = [register(whole, before, start) for start in (np.zeros(3), lasting)]
         best = max(tries, key=lambda fit: fit.overlap)
         if best.overlap < fits:
@@ -198,7 +198,7 @@ class ScanMotionStep:
         cloud = Cloud.of(earlier[1])
         own = between(earlier[2], self._pose)
         claimed = np.array((*(own[:2] if claim.way is None else claim.way), claim.turn))
-        steps = 10  # steps by which a motion over a window is refined: scan odometry drifts
+        steps = 10  # number of steps that refine a motion over a window: scan odometry drifts
         refined = [register(scan, cloud, start, iterations=steps).pose for start in (own, claimed)]
         fits_own = fitting(scan, cloud, refined[0])
         near = [pose for pose in refined if _is_near(pose, claimed, claim.errors)]
@@ -216,7 +216,7 @@ def warmed() -> ScanMotionStep:
 
 
 def deviations_of(fit: Fit) -> tuple[float, float]:
-    """Standard deviations of a registered pose ahead (m) and of its yaw (rad); 1 where nothing constrains it."""
+    """Return standard deviations of a registered pose ahead (m) and of its yaw (rad); 1 where unconstrained."""
     covariance = np.linalg.inv(fit.information + np.eye(3))
     c, s = math.cos(fit.pose[2]), math.sin(fit.pose[2])
     ahead = c * c * covariance[0, 0] + 2 * c * s * covariance[0, 1] + s * s * covariance[1, 1]
@@ -224,7 +224,7 @@ def deviations_of(fit: Fit) -> tuple[float, float]:
 
 
 def scatter_of(changes: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Standard deviations (m, rad) of places whose second differences have these squares; 6 variances each."""
+    """Return standard deviations (m, rad) of places whose second differences have these squares; 6 variances each."""
     if not changes:
         return 0.0, 0.0
     ahead, turn = (math.sqrt(math.fsum(squares) / len(changes) / 6) for squares in zip(*changes, strict=True))

@@ -1,4 +1,4 @@
-"""Compares the robot's sensors with each other and publishes which of them cannot be right."""
+"""Compare the robot's sensors with each other and publish those that cannot be right."""
 
 import asyncio
 import math
@@ -40,14 +40,14 @@ from monstertruck_schemas.state import Consistency, Doubt, DoubtKind, GateState
 
 TARGET: Final = "monstertruck_estimation.consistency.scan_odometry:warmed"
 START_TIMEOUT: Final = 180.0
-"""Real seconds the worker may take to start: numba compiles at the first start."""
+"""Time that the worker may take to start (real seconds): numba compiles at the first start."""
 PERIOD: Final = SECOND
-"""``state/consistency`` is published on every change and at least this often, ns."""
+"""Maximum interval between messages on ``state/consistency`` (ns); every change is published, too."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConsistencyInputs:
-    """Topics that are compared; None = the robot has no such sensor."""
+    """Topics that are compared; None for a sensor that the robot does not have."""
 
     drives: Sequence[Subscription[DriveFeedback]]
     steering: Subscription[SteeringFeedback] | None
@@ -59,33 +59,33 @@ class ConsistencyInputs:
     battery: Mailbox[Battery] | None
     camera: Mailbox[CompressedImage] | None
     stand: Mailbox[StandPose] | None = None
-    """Cameras over the robot; a simulated world's truth is no measure."""
+    """Cameras over the robot; the ground truth of a simulated world is not a measure."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScanSetup:
-    """What scans are compared with."""
+    """Setup for comparing scans."""
 
     actor: Actor
-    """Takes the steps of ``ScanMotionStep``."""
+    """Actor that takes the steps of ``ScanMotionStep``."""
     mount: Mount
-    """Of the lidar."""
+    """Mount of the lidar."""
     angles: ScanAngles | None
-    """Of body and mount at the time of scans; None = no compass."""
+    """Angles of body and mount at the time of scans; None without a compass."""
 
 
 class ConsistencyService:
     """Feeds a ``ConsistencyMonitor``.
 
     Args:
-        config: what is tolerated.
-        chassis: of the robot.
+        config: tolerances.
+        chassis: chassis of the robot.
         clock: time.
         inputs: sensors.
-        scans: scan odometry; None = the robot has no lidar, or it is switched off.
-        inertial: axes of the IMU; None = the robot has none.
+        scans: scan odometry; None if the robot has no lidar, or it is switched off.
+        inertial: axes of the IMU; None if the robot has none.
         out: ``state/consistency``.
-        events: where findings are reported.
+        events: receives the findings.
     """
 
     name = ServiceName.CONSISTENCY.value
@@ -122,7 +122,7 @@ class ConsistencyService:
         """Stamp (ns) and positions (m) of the free wheels."""
         self._active = False
         self._anew = False
-        """The scan odometry is to forget what was before."""
+        """Whether the scan odometry must forget its past."""
         self._front: str | None = None
         self._published: tuple[object, ...] = ()
         self._published_at = 0
@@ -149,7 +149,7 @@ class ConsistencyService:
             raise failed.exceptions[0] from None
 
     def take(self) -> None:
-        """Pass new messages on, and publish what follows."""
+        """Forward new messages and publish the result."""
         self._take_gate()
         self._take_wheels()
         self._take_others()
@@ -200,7 +200,7 @@ class ConsistencyService:
             monitor.observe_whole(DeviceRole.CAMERA, image.stamp, image.data)
 
     def _roll(self, reading: WheelEncoders) -> None:
-        """Motion of a tricycle by its free rear wheels."""
+        """Take the motion of a tricycle by its free rear wheels."""
         if not isinstance(self._chassis, TricycleChassis):
             return
         radius = self._chassis.drivetrain.wheel_radius
@@ -219,7 +219,7 @@ class ConsistencyService:
             await actor.start()
             async for scan in scans:
                 seen = int((scan.codes == VALID_BEAM).sum())
-                fewest_beams = 20  # beams with a range of a scan that is compared with the one before
+                fewest_beams = 20  # minimum number of beams with a range for comparing a scan with the previous one
                 whole = scan.ranges.tobytes() if seen >= fewest_beams else None
                 self.monitor.observe_whole(DeviceRole.LIDAR, scan.stamp, whole)
                 work = self._work(setup, scan)
@@ -232,7 +232,7 @@ class ConsistencyService:
                 self._publish()
 
     def _work(self, setup: ScanSetup, scan: LaserScan) -> StepInput | None:
-        """What the worker is to do with a scan; None = its plane is tilted."""
+        """Return the worker's task for a scan; None if its plane is tilted."""
         angles = None if setup.angles is None else setup.angles.at(scan)
         max_tilt = 0.1  # scans whose plane was tilted more than this are left out, rad: they show the ground
         if scan.tilt is not None and scan.tilt > max_tilt:
@@ -251,7 +251,7 @@ class ConsistencyService:
         rolled = monitor.rolled(scan.stamp)
         return StepInput(inputs, front, claim=claim, lag=monitor.lag(), rest=rest, rolled=rolled)
 
-    # What follows
+    # Publishing
 
     def _publish(self) -> None:
         now, doubts = self._clock.now(), self.monitor.findings()

@@ -1,4 +1,4 @@
-"""Motion by one measure, kept for some seconds and read between any two instants."""
+"""Motion by one measure, kept for some seconds, between any two instants."""
 
 from bisect import bisect_left
 from math import cos, sin
@@ -12,27 +12,27 @@ from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.clock import SECOND
 
 KEPT: Final = 9 * SECOND
-"""Time for which motion is kept at least, ns; half as long again at most."""
+"""Minimum time for which motion is kept (ns); the maximum is half as long again."""
 STILL: Final = 0.02, 0.02
-"""Speed (m/s) and turn rate (rad/s) up to which the robot stands."""
+"""Maximum speed (m/s) and turn rate (rad/s) of a standing robot."""
 
 
 def between(origin: Pose2, target: Pose2) -> Pose2:
-    """Pose ``target`` in the frame of ``origin``; the yaw is not wrapped."""
+    """Return pose ``target`` in the frame of ``origin``; the yaw is not wrapped."""
     c, s = cos(origin[2]), sin(origin[2])
     dx, dy = target[0] - origin[0], target[1] - origin[1]
     return c * dx + s * dy, c * dy - s * dx, target[2] - origin[2]
 
 
 class MotionTrack:
-    """Poses by one measure in a frame of its own, without a gap."""
+    """Gapless poses by one measure in a separate frame."""
 
     def __init__(self) -> None:
         self._stamps: list[int] = []
         self._poses: list[Pose2] = []
 
     def begin(self, stamp: int) -> None:
-        """Forget what was before ``stamp``, ns: there is a gap."""
+        """Start a new track after a gap: forget everything before ``stamp`` (ns)."""
         self._stamps, self._poses = [stamp], [(0.0, 0.0, 0.0)]
 
     def clear(self) -> None:
@@ -40,7 +40,7 @@ class MotionTrack:
         self._stamps, self._poses = [], []
 
     def add(self, stamp: int, motion: Pose2) -> None:
-        """Take the motion since the newest sample, in the base frame of that; not later than it: passed over."""
+        """Take the motion since the latest sample, in its base frame; ignore it unless it is later."""
         if not self._stamps:
             self.begin(stamp)
         if stamp <= self._stamps[-1]:
@@ -55,21 +55,22 @@ class MotionTrack:
 
     @property
     def newest(self) -> int | None:
-        """Stamp of the newest sample, ns."""
+        """Stamp of the latest sample (ns)."""
         return self._stamps[-1] if self._stamps else None
 
     def covers(self, since: int, stamp: int) -> bool:
-        """Whether the motion between two instants, ns, is known."""
+        """Whether the motion between two instants (ns) is known."""
         stamps = self._stamps
-        ahead = SECOND // 10  # a motion may be read so far beyond the newest sample, ns; the robot is taken to go on
+        # maximum time (ns) beyond the latest sample at which a motion may be read; the robot is assumed to keep moving
+        ahead = SECOND // 10
         return len(stamps) > 1 and stamps[0] <= since and stamp <= stamps[-1] + ahead
 
     def motion(self, since: int, stamp: int) -> Pose2 | None:
-        """Pose of base at ``stamp`` in base at ``since``, both ns; None where it is not known."""
+        """Return the pose of base at ``stamp`` in base at ``since``, both in ns; None if unknown."""
         return between(self._at(since), self._at(stamp)) if self.covers(since, stamp) else None
 
     def motions(self, since: NDArray[np.int64], stamps: NDArray[np.int64]) -> Array:
-        """Motions between many pairs of covered instants, ns, of any shape; that shape with a last axis of 3."""
+        """Return the motions between many pairs of covered instants (ns) of any shape, with a last axis of 3 added."""
         known, zero = np.array(self._stamps), self._stamps[0]
         poses = np.array(self._poses)
         begin, end = (
@@ -81,10 +82,10 @@ class MotionTrack:
         return np.stack((c * dx + s * dy, c * dy - s * dx, turn), axis=-1)
 
     def pace(self, at: int) -> tuple[float, float]:
-        """Speed (m/s) and turn rate (rad/s), neither negative, before the instant ``at``, ns; 0 where not known."""
+        """Return speed (m/s) and turn rate (rad/s), neither negative, before the instant ``at`` (ns); 0 if unknown."""
         if not self._stamps:
             return 0.0, 0.0
-        pace = SECOND // 4  # time over which a speed is taken, ns
+        pace = SECOND // 4  # time over which the speed is averaged, ns
         since = max(at - pace, self._stamps[0])
         motion = self.motion(since, at)
         if motion is None or at <= since:
@@ -93,7 +94,7 @@ class MotionTrack:
         return (motion[0] ** 2 + motion[1] ** 2) ** 0.5 / seconds, abs(motion[2]) / seconds
 
     def rests(self, at: int) -> bool:
-        """Whether the samples on both sides of the instant ``at``, ns, or the newest two, show no motion."""
+        """Whether the samples on both sides of the instant ``at`` (ns), or the latest two, show no motion."""
         if len(self._stamps) < 2 or not self.covers(at, at):
             return False
         after = min(max(bisect_left(self._stamps, at), 1), len(self._stamps) - 1)

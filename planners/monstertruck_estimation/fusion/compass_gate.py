@@ -1,4 +1,4 @@
-"""Accepts or rejects headings of the compass: by the device's flag, the field strength, and the innovation."""
+"""Accept or reject compass headings by the device's flag, the field strength, and the innovation."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,14 +10,14 @@ from monstertruck_runtime.clock import SECOND
 
 
 class HeadingUse(StrEnum):
-    """How a heading is used."""
+    """Use of a heading."""
 
     USED = "used"
     LEFT_OUT = "left out"
     ANCHORED = "anchored"
-    """North is set from it: at the start, or after it was steadily off for long."""
+    """The heading sets north: at the start, or after a long steady deviation."""
     HOME = "home"
-    """It agrees with an earlier north again."""
+    """The heading agrees with an earlier north again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,40 +26,40 @@ class CompassGate:
 
     anchored: bool = False
     disturbed: bool = False
-    """Headings are left out at present."""
+    """Headings are currently left out."""
     good: int = 0
-    """Good ones in a row while disturbed."""
+    """Number of good headings in a row while disturbed."""
     good_since: int = 0
-    """ns."""
+    """Stamp of the first of them (ns)."""
     good_from: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where that was, m and rad in odom."""
+    """Pose in odom at the first of them (m, rad)."""
     good_residual: float = 0.0
-    """Residual of the first of them, rad."""
+    """Residual of the first of them (rad)."""
     home_good: int = 0
     steady_since: int = 0
-    """ns."""
+    """Start of the steady deviation (ns)."""
     last: float = 0.0
-    """Last residual, rad."""
+    """Last residual (rad)."""
     home: tuple[float, float] | None = None
-    """North, rad, and its variance before the disturbance."""
+    """North and its variance before the disturbance (rad, rad^2)."""
     field: float = 0.0
-    """Mean strength at the start, or the one that has replaced it."""
+    """Mean field strength at the start, or the one that has replaced it."""
     fields: int = 0
-    """Readings it was taken from."""
+    """Number of readings in that mean."""
     other_field: float = 0.0
-    """Another strength, which holds at present."""
+    """Different field strength that currently holds."""
     other_since: int = 0
-    """ns."""
+    """Start of that field strength (ns)."""
     other_from: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where that began, m and rad in odom."""
+    """Pose in odom at its start (m, rad)."""
     rejected: int = 0
-    """Headings left out since the start."""
+    """Number of headings left out since the start."""
     jump: float = 0.0
-    """By how much the headings jumped, and the robot did not turn, when the present disturbance began, rad; 0 = not."""
+    """Jump of the headings, without a turn of the robot, that began the current disturbance (rad); 0 without one."""
     level: float = 0.0
-    """Mean residual since, rad, over about 1 m and rad."""
+    """Mean residual since the jump (rad), over about 1 m and rad."""
     level_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Pose in odom at the last heading, m and rad."""
+    """Pose in odom at the last heading (m, rad)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,45 +68,49 @@ class HeadingInnovation:
 
     stamp: int
     place: tuple[float, float, float]
-    """Pose in odom, m and rad."""
+    """Pose in odom (m, rad)."""
     residual: float
-    """Against the present north, rad."""
+    """Residual against the current north (rad)."""
     variance: float
-    """Of the residual, without the heading's own noise."""
+    """Variance of the residual, without the heading's own noise."""
     yaw_variance: float
     north: tuple[float, float]
-    """Present north, rad, and its variance."""
+    """Current north and its variance (rad, rad^2)."""
     local: float
-    """Estimated local deviation, rad."""
+    """Estimated local deviation (rad)."""
     flagged: bool
-    """Flagged as disturbed by the device."""
+    """The device flags the heading as disturbed."""
     taken_back: bool
-    """A disturbance was detected soon after."""
+    """A disturbance was detected soon after this heading."""
     field: float | None
     jump: float | None = None
-    """By how much the headings have jumped at this one, rad, 0 if that may have been the robot; None = not known:
-    whether its residual is a jump shows by ``turn_known``."""
+    """Jump of the headings at this one (rad); 0 if the robot may have turned. None if unknown: ``turn_known`` then
+    shows whether the residual is a jump."""
     turn_known: float = 0.0
-    """Greatest residual, rad, that may be the robot's own turn, and not the compass's."""
+    """Maximum residual that the robot's own turn may explain, rather than the compass (rad)."""
 
 
 def gate_heading(
     gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust
 ) -> tuple[HeadingUse, CompassGate]:
-    """How a heading is used, and the next state of the gate.
+    """Return the use of a heading and the next state of the gate.
 
-    A heading is off if its innovation exceeds ``config.gate`` standard deviations (chi-square gating),
-    disturbed if the device says so, the field's strength is not that of the start, or the local deviation has crept
-    further than that. Neither locks the compass out:
-    ``config.recover`` good ones over ``config.regain`` let it in again (next to a magnet, too, there is a place where
-    the heading is right), and so does one that is steadily off for ``config.steady_time``, as a
-    new north, for the odometry is the better judge of a turn, the compass of nothing but the field around it. A
-    disturbance that began with a jump that was no turn of the robot ends when they jump back, or as a new north.
+    A heading is off if its innovation exceeds ``config.gate`` standard deviations (chi-square gating). It is
+    disturbed if the device flags it, if the field strength differs from the one at the start, or if the local
+    deviation has crept further than that. Neither locks the compass out:
+
+    - ``config.recover`` good headings over ``config.regain`` let it in again; next to a magnet, too, there is a place
+      where the heading is right.
+    - A heading that is steadily off for ``config.steady_time`` becomes a new north: odometry is the better judge of
+      a turn, and the compass only judges the field around it.
+
+    A disturbance that began with a jump without a turn of the robot ends when the headings jump back, or as a new
+    north.
     """
     gate, disturbed = _field(gate, innovation, config)
     gate = _jumped(gate, innovation)
     crept = not gate.disturbed and abs(innovation.local) > config.gate * config.local
-    # The first heading stays, or there would be no north to come back to.
+    # The first heading is kept: without it there would be no north to return to.
     if disturbed or crept or (innovation.taken_back and gate.anchored):
         return HeadingUse.LEFT_OUT, _off(gate, innovation, steady=False)
     if not gate.anchored:
@@ -123,13 +127,14 @@ def gate_heading(
 
 
 def _jumped(gate: CompassGate, innovation: HeadingInnovation) -> CompassGate:
-    """The gate with a jump that began or ended at this heading.
+    """Return the gate with a jump that began or ended at this heading.
 
-    It ends when the headings go back by more than half of it over a distance on which reckoning does not. Residuals
-    alone do not tell: without headings the yaw soon is so uncertain that a lasting jump might as well be the robot's.
+    A jump ends when the headings return by more than half of it over a distance in which reckoning does not.
+    Residuals alone cannot show this: without headings, the yaw soon becomes so uncertain that the robot might as well
+    have caused a lasting jump.
     """
     if innovation.jump is not None:
-        # Where headings were taken back, the disturbance before this one may not have ended yet.
+        # Where headings were taken back, the previous disturbance may not have ended yet.
         jump = gate.jump + innovation.jump
         jump = 0.0 if abs(jump) < abs(innovation.jump) / 2 else jump
         return replace(gate, jump=jump, level=innovation.residual, level_at=innovation.place)
@@ -139,22 +144,23 @@ def _jumped(gate: CompassGate, innovation: HeadingInnovation) -> CompassGate:
     change = wrap_angle(innovation.residual - gate.level)
     if change * gate.jump < 0 and abs(change) > abs(gate.jump) / 2:
         return replace(gate, jump=0.0)
-    # 1.0: distance, m, and turn, rad, over which reckoning drifts less than a jump
+    # 1.0: distance (m) and turn (rad) over which reckoning drifts less than a jump
     share = 1.0 - math.exp(-(math.hypot(x - x0, y - y0) + abs(wrap_angle(yaw - yaw0))) / 1.0)
     return replace(gate, level=wrap_angle(gate.level + share * change), level_at=innovation.place)
 
 
 def _field(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust) -> tuple[CompassGate, bool]:
-    """The gate with the field learned, and whether the reading is disturbed.
+    """Return the gate with the field learned, and whether the reading is disturbed.
 
-    A robot may be started near iron: a strength that holds for ``config.steady_time`` and ``config.regain`` metres is
-    that of the place, and replaces the one of the start.
+    A robot may be started near iron: a strength that holds for ``config.steady_time`` and ``config.regain`` metres
+    belongs to the place, and replaces the one from the start.
     """
     if innovation.flagged:
         return gate, True
     if innovation.field is None:
         return gate, False
-    if gate.fields >= 20:  # headings from which the undisturbed strength of the field is taken
+    # 20: number of headings that determine the undisturbed field strength
+    if gate.fields >= 20:
         if abs(innovation.field - gate.field) <= config.field * gate.field:
             return replace(gate, other_field=0.0), False
         if abs(innovation.field - gate.other_field) > config.field * gate.other_field:
@@ -170,7 +176,7 @@ def _field(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrus
 
 
 def _good(gate: CompassGate, innovation: HeadingInnovation, config: HeadingTrust) -> tuple[CompassGate, bool]:
-    """The gate after a good heading while disturbed, and whether there were enough that agree."""
+    """Return the gate after a good heading while disturbed, and whether enough headings agree."""
     if not gate.good or abs(wrap_angle(innovation.residual - gate.good_residual)) > 2 * config.local:
         gate = replace(
             gate,

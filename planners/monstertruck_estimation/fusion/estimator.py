@@ -45,13 +45,13 @@ Advance = Callable[[FilterState, Measurement], FilterState]
 class MeasurementHistory:
     """Measurements of the last seconds in the order of their stamps, each with the state after it.
 
-    After a late measurement is inserted, those that follow are recomputed by ``catch_up``, a bounded number per call.
-    Until all are, ``newest`` continues from the state as it was, with every measurement that is in time.
+    After a late measurement is inserted, ``catch_up`` recomputes those that follow, a bounded number per call.
+    Until all are recomputed, ``newest`` continues from the earlier state with every measurement that is in time.
 
     Args:
         start: the initial state.
         advance: applies a measurement.
-        horizon: ns for which measurements are kept.
+        horizon: time for which measurements are kept (ns).
     """
 
     def __init__(self, start: FilterState, advance: Advance, horizon: int) -> None:
@@ -62,11 +62,11 @@ class MeasurementHistory:
         self._done = 0
         """Number of leading rows whose states are current."""
         self.newest = start
-        """The state after all measurements in time and all recomputed late ones."""
+        """State after all measurements in time and all recomputed late ones."""
 
     @property
     def waiting(self) -> int:
-        """Measurements to be recomputed."""
+        """Number of measurements to recompute."""
         return len(self._rows) - self._done
 
     def reaches(self, stamp: int) -> bool:
@@ -74,14 +74,14 @@ class MeasurementHistory:
         return stamp >= self._floor.stamp
 
     def scan_before(self, stamp: int) -> int | None:
-        """Stamp of the last scan that is not later than ``stamp``, ns; None if there was none."""
+        """Return the stamp of the last scan not later than ``stamp`` (ns); None without one."""
         for measurement, _ in reversed(self._rows[: self._place(stamp)]):
             if isinstance(measurement, ScanClone | ScanMeasurement):
                 return measurement.stamp
         return self._floor.scan
 
     def insert(self, measurement: Measurement) -> bool:
-        """Insert a measurement; False if it is older than the horizon."""
+        """Insert a measurement; return False if it is older than the horizon."""
         if not self.reaches(measurement.stamp):
             return False
         row = self._place(measurement.stamp)
@@ -95,7 +95,7 @@ class MeasurementHistory:
         return True
 
     def rewrite(self, since: int, change: Callable[[Measurement], Measurement]) -> None:
-        """Replace the measurements later than ``since``, ns; they are to be recomputed."""
+        """Replace the measurements later than ``since`` (ns); they must be recomputed."""
         first = self._place(since)
         self._rows[first:] = [(change(measurement), state) for measurement, state in self._rows[first:]]
         self._done = min(self._done, first)
@@ -128,7 +128,7 @@ class MeasurementHistory:
 
 
 MAX_RECOMPUTED: Final = 6
-"""Most measurements that one estimate recomputes, about a millisecond."""
+"""Maximum number of measurements that one estimate recomputes, about a millisecond."""
 NAMES: Final = ("drive", "steering", "compass", "imu", "tilt", "lidar")
 
 
@@ -137,19 +137,19 @@ class FusionStatus:
     """State of the sensors."""
 
     slipping: bool
-    """The wheels slip."""
+    """Whether the wheels slip."""
     doubt: str | None
-    """Why the compass is rejected; None while it is used."""
+    """Reason why the compass is rejected; None while it is used."""
     north: float | None
-    """Yaw in odom of the compass's zero, rad; None until it was found."""
+    """Yaw in odom of the compass's zero (rad); None until it is found."""
     trim: float
-    """Estimated error of the wheels' curvature, rad/m."""
+    """Estimated error of the wheels' curvature (rad/m)."""
     left_out: dict[str, int]
-    """Readings that could not be used, by sensor and reason."""
+    """Number of readings that could not be used, by sensor and reason."""
 
     @property
     def disturbed(self) -> bool:
-        """The compass is rejected."""
+        """Whether the compass is rejected."""
         return self.doubt is not None
 
 
@@ -158,7 +158,7 @@ class Fusion:
 
     Args:
         config: noise and limits.
-        chassis: from motors and servos to the body's motion; None = no wheels.
+        chassis: maps motors and servos to the body's motion; None without wheels.
         inertial: an IMU, if there is one.
     """
 
@@ -178,9 +178,9 @@ class Fusion:
         self._changes: deque[SlipChange] = deque()
         self._was_disturbed = False
         self._jump = 0.0
-        """Jump of the headings at the onset of the last disturbance, rad; 0 = none."""
+        """Jump of the headings at the onset of the last disturbance (rad); 0 without a jump."""
 
-    # What comes in
+    # Inputs
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
         """Take the servo angles being sent, unless the servo controller marks them untrusted."""
@@ -271,16 +271,16 @@ class Fusion:
         if not self._insert(measured):
             self._left_out["lidar: too late"] += 1
 
-    # What comes out
+    # Outputs
 
     def changes(self) -> list[SlipChange]:
-        """Onsets and ends of slip since the last call."""
+        """Return the onsets and ends of slip since the last call."""
         changes = list(self._changes)
         self._changes.clear()
         return changes
 
     def status(self) -> FusionStatus:
-        """State of the sensors."""
+        """Return the state of the sensors."""
         state = None if self._history is None else self._history.newest
         gate = None if state is None else state.gate
         return FusionStatus(
@@ -302,23 +302,23 @@ class Fusion:
 
     @property
     def state(self) -> FilterState | None:
-        """State of the filter at its newest measurement."""
+        """State of the filter at its latest measurement."""
         return None if self._history is None else self._history.newest
 
     @property
     def waiting(self) -> int:
-        """Measurements to be recomputed: late ones, and those after them."""
+        """Number of measurements to recompute: late ones, and those after them."""
         return 0 if self._history is None else self._history.waiting
 
     def sources(self, now: int) -> tuple[str, ...]:
-        """Sensors of the last second, at ``now`` (ns)."""
+        """Return the sensors used in the last second, at ``now`` (ns)."""
         used = {} if self._history is None else dict(self._history.newest.used)
         if self._wheels is not None and self._wheels.steered is not None and "drive" in used:
             used["steering"] = self._wheels.steered
         return tuple(name for name in NAMES if name in used and now - used[name] <= SOURCE_TIMEOUT)
 
     def estimate(self, now: int) -> OdometryEstimate | None:
-        """Pose at ``now`` (ns), continuous over corrections; None before the first reading.
+        """Return the pose at ``now`` (ns), continuous over corrections; None before the first reading.
 
         Every call recomputes at most ``MAX_RECOMPUTED`` measurements.
         """
@@ -345,7 +345,7 @@ class Fusion:
         )
 
     def _continuous(self, ahead: FilterState, now: int) -> Array:
-        """The published pose: integrated from the twist, corrected to the state at a limited rate."""
+        """Return the published pose: integrated from the twist, corrected to the state at a limited rate."""
         target = ahead.mean[POSE].copy()
         if self._shown is None:
             self._shown = (now, target)
@@ -387,7 +387,7 @@ class Fusion:
         return self._history is not None and self._history.newest.gate.disturbed
 
     def _look_for_disturbance(self) -> None:
-        """Undo headings shortly before a detected disturbance: a magnet has an effect before it is detected."""
+        """Undo headings shortly before a detected disturbance: a magnet takes effect before it is detected."""
         if self._disturbed and not self._was_disturbed and self._history is not None:
             gate = self._history.newest.gate
             self._jump = gate.jump
@@ -412,7 +412,7 @@ class Fusion:
         return WheelMeasurement(roll.since, roll.stamp, delta, noise)
 
     def _felt(self, roll: WheelIncrement, measured: WheelMeasurement) -> WheelMeasurement:
-        """The motion of the wheels with turn and tilt by the IMU."""
+        """Return the motion of the wheels with turn and tilt by the IMU."""
         inertial, trust = self._inertial, self._config.imu
         if inertial is None or trust is None:
             return measured
@@ -442,7 +442,7 @@ def _without_turn(measurement: Measurement) -> Measurement:
 
 
 def _taken_back(measurement: Measurement, jump: float, at: int) -> Measurement:
-    """Mark a heading before the disturbance that began ``at``, ns, with a ``jump``, rad, as rejected."""
+    """Mark a heading before the disturbance that began ``at`` (ns) with a ``jump`` (rad) as rejected."""
     if not isinstance(measurement, HeadingMeasurement):
         return measurement
     return replace(measurement, taken_back=True, jump=jump if measurement.stamp == at else measurement.jump)

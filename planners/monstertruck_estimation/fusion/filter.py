@@ -1,4 +1,4 @@
-"""An error-state extended Kalman filter with stochastic clones, as pure functions of a frozen state."""
+"""Error-state extended Kalman filter with stochastic clones, as pure functions of a frozen state."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -21,15 +21,15 @@ class WheelMeasurement:
     since: int
     stamp: int
     delta: Array
-    """Shape (3,), m and rad, as if on level ground."""
+    """Motion, shape (3,) (m, rad), as if on level ground."""
     covariance: Array
-    """Shape (3, 3)."""
+    """Covariance of the motion, shape (3, 3)."""
     slipping: bool = False
-    """Measured while the wheels slip."""
+    """Whether the wheels slipped during the measurement."""
     turn: tuple[float, float] | None = None
-    """By a gyroscope in the same time, rad, and its variance, rad^2."""
+    """Turn by a gyroscope in the same time (rad), and its variance (rad^2)."""
     tilt: tuple[float, float] | None = None
-    """Roll and pitch by an IMU, rad."""
+    """Roll and pitch by an IMU (rad)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +39,10 @@ class ScanMeasurement:
     since: int
     stamp: int
     delta: Array
-    """Shape (3,), m and rad."""
+    """Motion, shape (3,) (m, rad)."""
     covariance: Array
-    """Shape (3, 3), of the later scan's place on the map both are matched to, in base's axes; huge along a corridor."""
+    """Covariance, shape (3, 3), of the later scan's place on the map both are matched to, in base's axes; huge along a
+    corridor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,26 +51,26 @@ class ScanClone:
 
     stamp: int
     covariance: Array
-    """Shape (3, 3), of its place, as in ``ScanMeasurement``."""
+    """Covariance of its place, shape (3, 3), as in ``ScanMeasurement``."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeadingMeasurement:
-    """A reading of the compass."""
+    """Reading of the compass."""
 
     stamp: int
     yaw: float
-    """Counter-clockwise from magnetic north, rad."""
+    """Yaw, counter-clockwise from magnetic north (rad)."""
     disturbed: bool = False
-    """Flagged by the device."""
+    """Whether the device flags the reading as disturbed."""
     taken_back: bool = False
-    """A disturbance was detected soon after it."""
+    """Whether a disturbance was detected soon after the reading."""
     field: float | None = None
     """Strength of the magnetic field, in the device's unit."""
     tilt: tuple[float, float] | None = None
-    """Roll and pitch, rad, if valid."""
+    """Roll and pitch (rad), if valid."""
     jump: float | None = None
-    """By how much the headings jumped here, rad, as was found when it came; None before."""
+    """Jump of the headings at this reading (rad), as found on its arrival; None before."""
 
 
 Measurement = WheelMeasurement | ScanMeasurement | ScanClone | HeadingMeasurement
@@ -89,9 +90,9 @@ LARGER: Final = np.eye(STATE_SIZE + 3)
 MOVED_BY: Final = ("drive", "lidar")
 """Sensors that measure motion."""
 TURNED_BY: Final = ("imu", "lidar")
-"""Sensors that measure turns, and slip with no wheel."""
+"""Sensors that measure turns without wheel slip."""
 TILT_VALID: Final = SECOND // 2
-"""Tilt is used for this long, ns."""
+"""Time for which a tilt is used (ns)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +110,7 @@ class FilterState:
     """Stamp of the clone at the last wheel reading."""
     gate: CompassGate = field(default_factory=CompassGate)
     tilt: tuple[int, float, float] | None = None
-    """Stamp, roll, pitch."""
+    """Stamp (ns), roll, pitch."""
     used: dict[str, int] = field(default_factory=dict)
     """Stamp at which every sensor was last used."""
     nis: float = 0.0
@@ -118,7 +119,7 @@ class FilterState:
     def estimated(
         self, mean: Array, covariance: Array, stamp: int | None = None, nis: float | None = None
     ) -> "FilterState":
-        """The same with another estimate: what ``dataclasses.replace`` does, in a tenth of its time."""
+        """Return the state with a different estimate: ``dataclasses.replace`` in a tenth of its time."""
         return FilterState(
             self.stamp if stamp is None else stamp,
             mean,
@@ -133,7 +134,7 @@ class FilterState:
 
 
 def initial_state(stamp: int, config: FusionConfig) -> FilterState:
-    """At the start the pose is known by definition and the truck stands."""
+    """Return the state at the start: the pose is known by definition, and the truck stands."""
     mean = np.zeros(STATE_SIZE)
     mean[POSE] = config.start.x, config.start.y, config.start.yaw
     trim = config.wheels.trim if config.wheels is not None else 0.0
@@ -145,13 +146,13 @@ def initial_state(stamp: int, config: FusionConfig) -> FilterState:
 
 
 def predict(state: FilterState, stamp: int, config: FusionConfig) -> FilterState:
-    """The state at a later instant (ns): the velocity dies away (Gauss-Markov), the pose follows the arc."""
+    """Return the state at a later instant (ns): the velocity decays (Gauss-Markov), the pose follows the arc."""
     dt = (stamp - state.stamp) / SECOND
     if dt <= 0:
         return state
     moved = max((state.used[name] for name in MOVED_BY if name in state.used), default=stamp)
     blind = stamp - moved > config.max_prediction * SECOND
-    # 0.1: time constant with which the velocity dies away when all of them are silent, s
+    # 0.1: time constant with which the velocity decays when all sensors are silent, s
     lasting = 0.1 if blind else config.persistence
     keep = math.exp(-dt / lasting)
     span = lasting * (1.0 - keep)
@@ -200,9 +201,9 @@ def kalman_update(state: FilterState, residual: Array, by_state: Array, noise: A
 
     Args:
         state: prior.
-        residual: shape (m,), measured minus expected.
-        by_state: shape (m, n), derivative of the expected by the state.
-        noise: shape (m, m), covariance of the measurement.
+        residual: measured minus expected, shape (m,).
+        by_state: derivative of the expected by the state, shape (m, n).
+        noise: covariance of the measurement, shape (m, m).
     """
     spread = by_state @ state.covariance
     innovation = spread @ by_state.T + noise
@@ -215,7 +216,7 @@ def kalman_update(state: FilterState, residual: Array, by_state: Array, noise: A
 
 
 def _motion_residual(state: FilterState, clone: slice, delta: Array) -> tuple[Array, Array]:
-    """Residual, shape (3,), and derivative, (3, 15), of a motion since a clone."""
+    """Return residual, shape (3,), and derivative, (3, 15), of a motion since a clone."""
     then, now = state.mean[clone], state.mean[POSE]
     residual = delta - between(then, now)
     residual[2] = wrap_angle(float(residual[2]))
@@ -255,7 +256,7 @@ def _wheels(state: FilterState, measured: WheelMeasurement, config: FusionConfig
 
 
 def _level(state: FilterState, felt: tuple[float, float] | None) -> tuple[float, float]:
-    """Horizontal share of a motion along x and along y; by the compass before the tilt ``felt`` by an IMU."""
+    """Return the horizontal share of a motion along x and y; the compass has priority over the IMU's tilt ``felt``."""
     if state.tilt is not None and state.stamp - state.tilt[0] <= TILT_VALID:
         felt = state.tilt[1:]
     if felt is None:
@@ -293,7 +294,7 @@ def _scan(state: FilterState, measured: ScanMeasurement, config: FusionConfig) -
 
 
 def _turned(covariance: Array, yaw: float) -> Array:
-    """A covariance given in base's axes, in those of odom."""
+    """Return a covariance in odom's axes, given in base's axes."""
     turn = np.eye(3)
     turn[:2, :2] = rotation(yaw)
     result: Array = turn @ covariance @ turn.T
@@ -308,7 +309,7 @@ def _marked(state: FilterState, stamp: int, noise: Array) -> FilterState:
 
 
 def _cloned(state: FilterState, clone: slice) -> tuple[Array, Array]:
-    """Mean and covariance with the clone replaced by the present pose."""
+    """Return mean and covariance with the clone replaced by the current pose."""
     mean, covariance = state.mean.copy(), state.covariance.copy()
     mean[clone] = mean[POSE]
     covariance[clone, :] = covariance[POSE, :]
@@ -359,7 +360,7 @@ def _heading(state: FilterState, heading: HeadingMeasurement, config: FusionConf
 
 
 def _own_turn(state: FilterState, stamp: int, config: FusionConfig) -> float:
-    """Greatest turn since the last heading used, rad, that wheels which slip may have missed; 0 where others saw it."""
+    """Return the maximum turn (rad) since the last used heading that slipping wheels may miss; 0 if others saw it."""
     if any(stamp - state.used[name] <= TILT_VALID for name in TURNED_BY if name in state.used):
         return 0.0
     return config.max_turn * (stamp - state.used.get("compass", stamp)) / SECOND

@@ -1,8 +1,8 @@
-"""Wheel slip: the motion of the wheels compared with that between scans, or their yaw with the compass.
+"""Wheel slip: compares the wheels' motion with the motion between scans, or their yaw with the compass.
 
-Scans are evidence against the wheels only while matched without a gap. After a gap, or where one direction was
-unconstrained, what they match may move along with the robot (the ground ahead on a slope), so they first have to agree
-with the wheels for a while; scans that do not are rejected themselves.
+Scans are evidence against the wheels only while matched without a gap. After a gap, or after an unconstrained
+direction, the matched surfaces may move along with the robot (the ground ahead on a slope), so the scans first have to
+agree with the wheels for a while; scans that do not are rejected themselves.
 """
 
 import math
@@ -20,18 +20,18 @@ from monstertruck_kinematics.se2 import between, compose, compose_jacobians, int
 from monstertruck_runtime.clock import SECOND
 
 BLIND: Final = SECOND
-"""Without scans for so long, wheels are compared with the compass, ns."""
+"""Time without scans after which wheels are compared with the compass (ns)."""
 SPAN: Final = SECOND
-"""Wheels and compass are compared over this long, ns."""
+"""Time over which wheels and compass are compared (ns)."""
 
 
 @dataclass(frozen=True, slots=True)
 class SlipChange:
-    """Begin or end of wheel slip."""
+    """Start or end of wheel slip."""
 
     slipping: bool
     since: int
-    """ns from which the wheels are not to be trusted."""
+    """Time from which the wheels are not to be trusted (ns)."""
     text: str
     """Description of the disagreement."""
 
@@ -41,29 +41,29 @@ class SlipDetector:
 
     Args:
         config: thresholds.
-        deviation: standard deviation of the local deviation of the compass, rad.
+        deviation: standard deviation of the local deviation of the compass (rad).
     """
 
     def __init__(self, config: SlipConfig, deviation: float) -> None:
         self._config = config
         self._deviation = deviation
         self._trail: deque[tuple[int, Array, Array]] = deque()
-        """Stamp, pose, and the sum of the motions' covariances: the window is too short for their rotation to count."""
+        """Stamp, pose, and sum of the motions' covariances: the window is too short for their rotation to matter."""
         self._motions: deque[ScanMeasurement] = deque()
         self._headings: deque[tuple[int, float]] = deque()
         self._suspicious = 0
         self._calm = 0
         self._scanned: int | None = None
         self._compared_at = 0
-        """Stamp of the last comparison, ns."""
+        """Stamp of the last comparison (ns)."""
         self._unproven = 0
-        """Scans that must agree with the wheels before they are used."""
+        """Number of scans that must agree with the wheels before scans are used."""
         self.slipping = False
         self.doubted = False
-        """The last scan is rejected."""
+        """Whether the last scan is rejected."""
 
     def wheels(self, measured: WheelMeasurement) -> SlipChange | None:
-        """Take the motion of the wheels; returns the end of a slip that nothing can confirm any longer."""
+        """Take the motion of the wheels; return the end of a slip that nothing can confirm any longer."""
         if not self._trail or self._trail[-1][0] != measured.since:
             self._trail.clear()
             self._trail.append((measured.since, np.zeros(3), np.zeros((3, 3))))
@@ -71,8 +71,8 @@ class SlipDetector:
         self._trail.append((measured.stamp, compose(pose, measured.delta), spread + measured.covariance))
         while self._trail[0][0] < measured.stamp - 3 * SECOND:  # wheel motion is remembered for this long, ns
             self._trail.popleft()
-        # slip that nothing has confirmed for so long, ns, is over: the scans have ended, and the wheels are all there
-        # is
+        # Slip that nothing has confirmed for this time (ns) is over: the scans have ended, and only the wheels are
+        # left.
         expires = 10 * SECOND
         if not self.slipping or measured.stamp - self._compared_at < expires:
             return None
@@ -81,16 +81,16 @@ class SlipDetector:
         return SlipChange(slipping=False, since=measured.stamp, text=text)
 
     def scans(self, measured: ScanMeasurement) -> SlipChange | None:
-        """Take the motion between two scans; returns a change of the result."""
+        """Take the motion between two scans; return a change of the result."""
         self._scanned, self.doubted = measured.stamp, False
         if self._motions and self._motions[-1].stamp != measured.since:
             self._motions.clear()
             self._unproven = self._config.calm
-        # 1.0: a direction in which the standard deviation of a scan is greater is unconstrained, m
+        # 1.0: minimum standard deviation of a scan in an unconstrained direction, m
         if float(np.linalg.eigvalsh(measured.covariance[:2, :2])[-1]) > 1.0**2:
             self._unproven = self._config.calm
         self._motions.append(measured)
-        # 2: windows over which wheels and scans are compared as well
+        # 2: number of windows over which wheels and scans are also compared
         while len(self._motions) > 1 and measured.stamp - self._motions[1].since >= 2 * self._window:
             self._motions.popleft()
         recent = sum(1 for one in self._motions if measured.stamp - one.stamp < self._window)
@@ -101,7 +101,7 @@ class SlipDetector:
         if self._unproven and not self.slipping:
             self._prove(near[0])
             return None
-        # Slip adds up, noise evens out: what is doubtful over one window is clear over two.
+        # Slip adds up, noise averages out: a doubtful difference over one window is clear over two.
         far = None if self.slipping else self._compared(len(self._motions))
         change = self._judged(*(near if far is None or far[0] < near[0] else far))
         if change is not None and not change.slipping:
@@ -118,7 +118,7 @@ class SlipDetector:
             self._motions.popleft()
 
     def _compared(self, count: int) -> tuple[float, int, str] | None:
-        """Wheels against the last ``count`` motions: distance in deviations, since when (ns), and in words."""
+        """Compare wheels with the last ``count`` motions: return distance in deviations, start (ns), and words."""
         motions = list(self._motions)[-count:]
         since, stamp = motions[0].since, motions[-1].stamp
         wheels_moved = self._wheel_motion(since, stamp)
@@ -128,7 +128,7 @@ class SlipDetector:
         for one in motions:
             moved = compose(moved, one.delta)
         _, by_later = compose_jacobians(moved, np.zeros(3))
-        # The places of the first and the last scan err; what was in between has cancelled.
+        # Only the places of the first and the last scan err: the errors in between have cancelled.
         spread = motions[0].covariance + by_later @ motions[-1].covariance @ by_later.T
         delta, noise = wheels_moved
         off = delta - moved
@@ -139,13 +139,13 @@ class SlipDetector:
         return distance, since, text
 
     def heading(self, stamp: int, yaw: float) -> SlipChange | None:
-        """Take an undisturbed heading (counter-clockwise, rad); it is used where there are no scans."""
-        jitter = 0.01  # standard deviation of a compass heading against one a second before, rad
+        """Take an undisturbed heading (counter-clockwise, rad); it is used if there are no scans."""
+        jitter = 0.01  # standard deviation of a compass heading against the one a second before, rad
         if self._headings:
             last, before = self._headings[-1]
-            # 3.0: no robot turns faster than this, rad/s
+            # 3.0: maximum turn rate of a robot, rad/s
             if abs(wrap_angle(yaw - before)) > jitter * 4 + 3.0 * (stamp - last) / SECOND:
-                # The field has changed, nothing turns so fast.
+                # The field has changed: nothing turns so fast.
                 self._headings.clear()
         self._headings.append((stamp, yaw))
         while len(self._headings) > 1 and stamp - self._headings[1][0] >= SPAN:
@@ -168,13 +168,13 @@ class SlipDetector:
         return self._judged(distance, since, text)
 
     def forget_headings(self) -> None:
-        """The compass was disturbed: what comes next is not to be compared with what was."""
+        """Forget the headings after a disturbance of the compass: later ones are not compared with them."""
         self._headings.clear()
 
     def _wheel_motion(self, since: int, stamp: int) -> tuple[Array, Array] | None:
-        """Motion of the wheels between two instants and its covariance, (3,) and (3, 3); None if it is not known."""
+        """Return the motion of the wheels between two instants and its covariance, (3,) and (3, 3); None if unknown."""
         trail = self._trail
-        # (SECOND // 8): a scan may be so much newer than the wheels, ns; they are taken to go on
+        # (SECOND // 8): maximum lead of a scan over the wheels, ns; the wheels are assumed to keep moving
         if len(trail) < 2 or since < trail[0][0] or stamp > trail[-1][0] + (SECOND // 8):
             return None
         stamps = np.array([row[0] - since for row in trail], dtype=np.float64)

@@ -1,14 +1,14 @@
-"""Settings of the ground's grid; light."""
+"""Settings of the ground grid; light."""
 
 from monstertruck_schemas.base import Positive, Schema
 
 
 class GroundConfig(Schema):
-    """What the ground is like, for route planners."""
+    """Ground properties for route planners."""
 
     period: Positive = 2.0
-    """Seconds between two messages, if something has changed"""
+    """Time between two messages, if something has changed (s)"""
     slip_roughness: Positive = 0.05
-    """Ground on which the wheels slip counts as this rough, m"""
+    """Roughness assumed for ground with wheel slip (m)"""
     save_period: Positive = 60.0
-    """Seconds between two saves, where the map is saved"""
+    """Time between two saves, where the map is saved (s)"""

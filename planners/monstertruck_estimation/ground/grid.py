@@ -1,4 +1,4 @@
-"""Tilt and roughness of the ground by cells, from what the robot felt driving over it and what tilted scans hit."""
+"""Tilt and roughness of the ground by cells, from the motion of the robot over it and from hits of tilted scans."""
 
 import io
 from pathlib import Path
@@ -15,28 +15,28 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import GROUND_UNKNOWN, ROUGHNESS_STEP, TILT_STEP, Ground
 
 FILE: Final = "ground.npz"
-"""Name of the file in the folder of a saved map."""
+"""File name in the folder of a saved map."""
 GROUND_RESOLUTION: Final = 0.1
-"""m."""
+"""Edge of a cell (m)."""
 LARGEST: Final = 2000
-"""Cells a side at most; what lies outside is left out."""
+"""Maximum number of cells per side; cells outside are left out."""
 KEY: Final = 1 << 24
-"""Makes one number of two of a cell or square."""
+"""Factor that combines the two indices of a cell or square into one number."""
 
 Cells = NDArray[np.int64]
 
 
 class GroundGrid:
-    """Grows with what is observed; axes are those of the frame."""
+    """Grid that grows with the observations; its axes are the frame's axes."""
 
     def __init__(self) -> None:
         self._corner: Cells = np.zeros(2, np.int64)
         """Column and row of the lower left cell, counted from the frame's origin."""
         self._counts: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
         self._layers: NDArray[np.float32] = np.zeros((2, 0, 0), np.float32)
-        """Tilt, rad, and roughness, m; shape (2, rows, columns)."""
+        """Tilt (rad) and roughness (m); shape (2, rows, columns)."""
         self._quantised: NDArray[np.uint8] = np.zeros((2, 0, 0), np.uint8)
-        """The same as published: quantised where it was observed, for all of a large map takes milliseconds."""
+        """The layers as published: quantised only where observed, as a whole large map takes milliseconds."""
 
     @property
     def empty(self) -> bool:
@@ -44,12 +44,12 @@ class GroundGrid:
         return not self._counts.any()
 
     def observe(self, points: Array, tilt: ArrayLike, roughness: ArrayLike) -> None:
-        """Count an observation of the cells of ``points``, (n, 2), m.
+        """Add an observation to the cells of ``points``, (n, 2) (m).
 
         Args:
-            points: one or more in each cell that is observed; the first one counts.
-            tilt: of the ground, rad; one value or n.
-            roughness: standard deviation of its height, m; one value or n.
+            points: at least one in each observed cell; the first one is used.
+            tilt: tilt of the ground (rad); one value or n.
+            roughness: standard deviation of its height (m); one value or n.
         """
         cells = np.floor(points / GROUND_RESOLUTION).astype(np.int64)
         _, first = np.unique(cells[:, 0] * KEY + cells[:, 1], return_index=True)
@@ -57,14 +57,14 @@ class GroundGrid:
         if not len(cells) or not self._grow(cells.min(axis=0), cells.max(axis=0)):
             return
         columns, rows = (cells - self._corner).T
-        # 20: values a cell is the mean of; a later one counts as if there had been so many
+        # 20: maximum number of values in a cell's mean; later values are weighted as if there had been so many
         count = self._counts[rows, columns] = np.minimum(self._counts[rows, columns] + 1, 20)
         values = np.stack([np.broadcast_to(value, len(points))[first] for value in (tilt, roughness)])
         self._layers[:, rows, columns] += (values - self._layers[:, rows, columns]) / count
         self._quantised[:, rows, columns] = quantised(self._layers[:, rows, columns])
 
     def message(self, stamp: int, seq: int, frame: str) -> Ground:
-        """The layers as published; of an empty grid there is none."""
+        """Return the layers as a message; not defined for an empty grid."""
         rows, columns = self._counts.shape
         x, y = (self._corner * GROUND_RESOLUTION).tolist()
         return Ground(
@@ -93,7 +93,7 @@ class GroundGrid:
 
     @classmethod
     def load(cls, folder: Path) -> "GroundGrid":
-        """Read what ``save`` wrote; an empty grid if the map has none.
+        """Read the file written by ``save``; return an empty grid if the map has none.
 
         Raises:
             InputError: the file is damaged.
@@ -121,7 +121,7 @@ class GroundGrid:
         size = np.array(self._counts.shape[::-1])
         if not size.all():
             self._corner, size = low.copy(), np.zeros(2, np.int64)
-        margin = 20  # cells added when the grid has to grow
+        margin = 20  # number of cells added when the grid grows
         before = np.where(low < self._corner, self._corner - low + margin, 0)
         behind = np.where(high >= self._corner + size, high + 1 - self._corner - size + margin, 0)
         if not (before.any() or behind.any()):
@@ -137,7 +137,7 @@ class GroundGrid:
 
 
 def quantised(layers: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Tilt, rad, and roughness, m, shape (2, ...), in the units of the message."""
+    """Return tilt (rad) and roughness (m), shape (2, ...), in the units of the message."""
     steps = np.array((TILT_STEP, ROUGHNESS_STEP), np.float32)
     steps = steps.reshape(2, *(1 for _ in layers.shape[1:]))
     values: NDArray[np.uint8] = np.minimum(np.rint(layers / steps), GROUND_UNKNOWN - 1).astype(np.uint8)
@@ -145,14 +145,14 @@ def quantised(layers: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def planes(points: Array) -> tuple[Array, Array, Array]:
-    """Planes through points on the ground, square by square.
+    """Fit planes to points on the ground, square by square.
 
     Args:
-        points: shape (n, 3), m.
+        points: shape (n, 3) (m).
 
     Returns:
-        The points in squares with enough of them, (k, 2), with the tilt of their square's plane, (k,), rad, and the
-        standard deviation of the heights about it, (k,), m.
+        The points in squares with enough of them, (k, 2), with the tilt of their square's plane, (k,) (rad), and the
+        standard deviation of the heights about it, (k,) (m).
     """
     x, y = np.floor(points[:, :2] / 0.3).astype(np.int64).T  # side of the squares a plane is fitted to, m
     _, which, counts = np.unique(x * KEY + y, return_inverse=True, return_counts=True)
@@ -163,8 +163,8 @@ def planes(points: Array) -> tuple[Array, Array, Array]:
     dx, dy, dz = (values - mean(values)[which] for values in points.T)
     xx, xy, yy, xz, yz, zz = (mean(a * b) for a, b in ((dx, dx), (dx, dy), (dy, dy), (dx, dz), (dy, dz), (dz, dz)))
     least = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
-    # 8: points of such a plane
-    # 0.05: standard deviation they need in every direction, m
+    # 8: minimum number of points for a plane
+    # 0.05: their minimum standard deviation in every direction, m
     good = (counts >= 8) & (least >= 0.05**2)
     determinant = np.where(good, xx * yy - xy**2, 1.0)
     along, across = (yy * xz - xy * yz) / determinant, (xx * yz - xy * xz) / determinant

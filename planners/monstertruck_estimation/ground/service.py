@@ -1,4 +1,4 @@
-"""The ground as a service: compass, scans and slip into a grid of tilt and roughness, published and saved."""
+"""Ground service: combines compass, scans and slip into a grid of tilt and roughness, publishes and saves it."""
 
 import math
 from collections import deque
@@ -29,28 +29,28 @@ from monstertruck_schemas.state import Ground, Odometry
 from monstertruck_schemas.topics import FUSION, ODOMETRY
 
 FIT_EVERY: Final = SECOND
-"""Time between two fits of planes to the points, ns."""
+"""Time between two fits of planes to the points (ns)."""
 
 
 class GroundService:
-    """Publishes what was felt and seen of the ground.
+    """Publish the ground as felt and seen by the robot.
 
     Args:
         config: periods.
         clock: time.
-        footprint: length and width of the robot, m.
-        wheelbase: m.
-        mount: of the lidar; None = there is none.
+        footprint: length and width of the robot (m).
+        wheelbase: wheelbase (m).
+        mount: mount of the lidar; None without a lidar.
         compass: tilt of the body.
-        angles: body and mount at the time of scans; None = there is no lidar.
-        pose: in the frame of the routes.
-        scan: points on the ground; None = there is no lidar.
-        slip: what the odometry says of it.
+        angles: body and mount at the time of scans; None without a lidar.
+        pose: pose in the frame of the routes.
+        scan: points on the ground; None without a lidar.
+        slip: slip by the odometry.
         out: ``state/ground``.
-        events: where failures to load or save are reported.
-        offload: where files are read and written.
-        load: folder of the map that is known at the start; None = there is none.
-        save: folder the grid is saved to, and the run that makes the map; None = nowhere.
+        events: receives failures to load or save.
+        offload: runs the reading and writing of files.
+        load: folder of the map known at the start; None without one.
+        save: folder in which the grid is saved, and the run that makes the map; None to save nothing.
     """
 
     name = ServiceName.GROUND.value
@@ -84,7 +84,7 @@ class GroundService:
         self._felt: Tilt | None = None
         self._marked: Array | None = None
         self._travelled: tuple[float, float] | None = None
-        """Where the robot's height was integrated to: x and y, m."""
+        """Position up to which the robot's height is integrated: x and y (m)."""
         self._height = 0.0
         self._hits: deque[tuple[int, Array]] = deque()
         self._changed = False
@@ -168,12 +168,12 @@ class GroundService:
         sx, sy = plane_slopes(*angles, yaw=mount.yaw)
         bearings = scan.start_angle + scan.angle_increment * np.arange(len(scan.ranges))
         rise = np.cos(bearings) * sx + np.sin(bearings) * sy
-        valid = np.isfinite(scan.ranges) & (rise < -0.03)  # metres a metre they have to fall
+        valid = np.isfinite(scan.ranges) & (rise < -0.03)  # minimum fall, in metres per metre
         ranges, rise, bearings = scan.ranges[valid], rise[valid], bearings[valid]
         heights = mount.z + ranges * rise
-        # 0.10: beams that go down and end this near to the robot's own level hit the ground, m
+        # 0.10: beams that point down and end this close to the robot's own level hit the ground, m
         hit = np.flatnonzero(abs(heights) < 0.10)
-        # 60: points of one scan at most: the fit of planes stays well below a millisecond
+        # 60: maximum number of points per scan: the fit of planes stays well below a millisecond
         hit = hit[:: max(math.ceil(len(hit) / 60), 1)]
         level = ranges[hit] * np.sqrt(1.0 - rise[hit] ** 2)
         local = np.column_stack((level * np.cos(bearings[hit]), level * np.sin(bearings[hit])))
@@ -181,7 +181,7 @@ class GroundService:
         self._hits.append((scan.stamp, np.column_stack((in_frame, heights[hit] + self._height))))
 
     def _fit(self, now: int) -> None:
-        # 3 * SECOND: such points are put together for so long, ns: the robot's own height is integrated from its pitch
+        # 3 * SECOND: time over which such points are combined, ns: the robot's own height is integrated from its pitch
         # and drifts
         while self._hits and self._hits[0][0] < now - 3 * SECOND:
             self._hits.popleft()
@@ -207,13 +207,13 @@ class GroundService:
 
 
 def _spread(length: float, width: float) -> Array:
-    """Points over a rectangle round the origin, at least one in each cell, (n, 2)."""
+    """Return points over a rectangle around the origin, at least one in each cell, (n, 2)."""
     xs, ys = (np.linspace(-v / 2, v / 2, math.ceil(2 * v / GROUND_RESOLUTION) + 1) for v in (length, width))
     grid: Any = np.meshgrid(xs, ys)
     return np.asarray(np.stack(grid, axis=-1).reshape(-1, 2))
 
 
 def _placed(points: Array, pose: Array) -> Array:
-    """Points (n, 2) of the frame at ``pose``, (3,), in the frame of the pose."""
+    """Transform points (n, 2) from the frame at ``pose``, (3,), into the frame of the pose."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return np.asarray(points @ np.array(((c, s), (-s, c))) + pose[:2])

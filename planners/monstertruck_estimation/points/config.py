@@ -12,31 +12,31 @@ Size = Annotated[float, Field(gt=0.005, le=2)]
 
 
 class PointsConfig(Schema):
-    """What is taken for a tag in the camera's pictures; the camera's lens and mount are its device's."""
+    """Tag detection in the camera's images; the camera's device has the settings of lens and mount."""
 
     family: TagFamily = "36h11"
-    """Family of the tags: of AprilTag, or a dictionary of ArUco"""
+    """Tag family: AprilTag, or an ArUco dictionary"""
     size: Size = 0.1
-    """Side of the tags' black square, m"""
+    """Side of the tags' black square (m)"""
     sizes: dict[Annotated[int, Field(ge=0, le=1023)], Size] = Field(default_factory=dict)
-    """Sizes of other tags by number, m"""
+    """Sizes of other tags by number (m)"""
     rate: Annotated[float, Field(gt=0, le=30)] = 5.0
-    """Pictures read a second, at most; of a robot that stands two at a place"""
+    """Maximum rate of images read (1/s); a standing robot reads two per place"""
     reach: Positive = 2.0
-    """Tags farther away are not used, m: at 3 m a tag of 10 cm has 2 pixels a cell"""
+    """Maximum distance of a tag (m): at 3 m a tag of 10 cm has 2 pixels per cell"""
     angle: Annotated[float, Field(gt=0, lt=1.57)] = radians(60.0)
-    """Nor are those seen more obliquely, from their normal, rad"""
+    """Maximum viewing angle from a tag's normal (rad)"""
     margin: Annotated[float, Field(ge=0, lt=1)] = 0.15
-    """Least contrast of every cell, as a share of the difference from grey to its colour; less is no tag"""
+    """Minimum contrast of every cell of a tag, as a share of the difference from grey to its colour"""
     sightings: Annotated[int, Field(ge=1, le=20)] = 2
-    """Pictures that have to agree before a tag is an object of the map"""
+    """Minimum number of images that agree before a tag is an object of the map"""
     agree: Positive = 0.15
-    """How near to each other they have to put it, m; more where they are less certain"""
+    """Maximum distance between the places in these images (m); more if they are less certain"""
     tilt: Annotated[float, Field(gt=0, le=0.5)] = 0.1
-    """Pictures taken while the robot was tilted more than this are not used, rad"""
+    """Maximum tilt of the robot for images that are used (rad)"""
     most: Annotated[int, Field(ge=1, le=2000)] = 500
     """Points of interest"""
     latency: Annotated[float, Field(gt=0, le=1)] = 0.06
-    """Seconds after which a picture that was read counts on the virtual clock"""
+    """Latency of an image reading on the virtual clock (s)"""
     deadline: Annotated[float, Field(gt=0, le=60)] = 10.0
-    """Seconds after which a silent worker is killed"""
+    """Maximum silence of the worker before it is killed (s)"""

@@ -1,4 +1,4 @@
-"""What the reader of pictures is given, and what it answers; light, as the daemon's loop imports it."""
+"""Inputs and outputs of the image reader; light, as the daemon's loop imports it."""
 
 from dataclasses import dataclass, field
 from typing import Any, Self
@@ -11,24 +11,24 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class ReadTask:
-    """A picture to be read."""
+    """Image to read."""
 
     jpeg: bytes
     lens: LensConfig
     size: float
-    """Side of tags, m."""
+    """Side of the tags (m)."""
     sizes: dict[int, float] = field(default_factory=dict)
     """Sizes of other tags, by number."""
     reach: float = 2.0
-    """m."""
+    """Maximum distance of a tag (m)."""
     angle: float = 1.0
-    """rad."""
+    """Maximum viewing angle from a tag's normal (rad)."""
     margin: float = 0.15
     family: TagFamily = "36h11"
 
     @classmethod
     def of(cls, jpeg: bytes, lens: LensConfig, config: Any) -> Self:
-        """By a ``PointsConfig``."""
+        """Return the task for an image by a ``PointsConfig``."""
         return cls(
             jpeg, lens, config.size, dict(config.sizes), config.reach, config.angle, config.margin, config.family
         )
@@ -36,31 +36,31 @@ class ReadTask:
 
 @dataclass(frozen=True, slots=True)
 class TagReading:
-    """A tag as a picture shows it, in the camera's axes: right, down, ahead."""
+    """Tag as seen in an image, in the camera's axes: right, down, ahead."""
 
     tag: int
     middle: Triple
-    """m."""
+    """Centre (m)."""
     normal: Triple
-    """Unit vector, out of its front."""
+    """Unit vector out of the tag's front."""
     other_normal: Triple
-    """Normal by the second pose that fits the outline."""
+    """Normal of the second pose that fits the outline."""
     doubt: float
-    """How well the second one fits, 0 (not at all) to 1 (as well): the heading means nothing then."""
+    """Fit of the second pose, from 0 (does not fit) to 1 (fits equally well, and the heading is meaningless)."""
     pixels: float
-    """Mean side of its black square."""
+    """Mean side of the black square (pixels)."""
     margin: float
     """Contrast of the worst cell."""
     angle: float
-    """Angle from its normal to the camera, rad."""
+    """Angle from the tag's normal to the camera (rad)."""
     picture: bytes = b""
-    """Picture of the tag and its surroundings, JPEG."""
+    """JPEG of the tag and its surroundings."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReadAnswer:
-    """What a picture shows."""
+    """Result of reading an image."""
 
     readings: tuple[TagReading, ...] = ()
     unreadable: bool = False
-    """The picture is none."""
+    """The data are not an image."""

@@ -1,4 +1,4 @@
-"""Points of interest of a saved map: ``points.json``, and a picture of each."""
+"""Points of interest of a saved map: ``points.json``, and an image of each point."""
 
 from pathlib import Path
 from typing import Final
@@ -17,22 +17,22 @@ from monstertruck_schemas.points import PointOfInterest
 FILE: Final = "points.json"
 LARGEST_POINTS_FILE: Final = 5_000_000
 VARIANCES: Final = (1e-12, 1e12)
-"""The least and the greatest one of any direction that is taken from a file, m^2 or rad^2."""
+"""Minimum and maximum variance of any direction that is accepted from a file (m^2 or rad^2)."""
 _POINTS: Final = TypeAdapter(list[PointOfInterest])
 
 
 def picture_name(point: str) -> str:
-    """File of a point's picture."""
+    """Return the file name of a point's image."""
     return f"point-{point}.jpg"
 
 
 def save(folder: Path, points: list[tuple[PointOfInterest, bytes]], run: str | None = None) -> None:
-    """Save points and pictures with a map; where neither were saved before, no points write nothing.
+    """Save points and images with a map; write nothing if there are no points and none were saved before.
 
     Args:
-        folder: of the map.
-        points: with their pictures, JPEG; empty = none.
-        run: that makes the map; None = they belong to the map that is there.
+        folder: folder of the map.
+        points: points with their images (JPEG); may be empty.
+        run: run that makes the map; None if they belong to the existing map.
 
     Raises:
         OSError: a file could not be written.
@@ -44,10 +44,10 @@ def save(folder: Path, points: list[tuple[PointOfInterest, bytes]], run: str | N
 
 
 def load(folder: Path) -> list[tuple[PointOfInterest, bytes]]:
-    """Points of a saved map, with their pictures; none if it has none.
+    """Return the points of a saved map with their images; empty if it has no points.
 
     Raises:
-        InputError: the file is not what it should be.
+        InputError: the file is invalid.
     """
     with opened(folder) as found:
         file = found.file(FILE)

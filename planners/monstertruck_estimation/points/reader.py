@@ -1,8 +1,8 @@
-"""The reading step: a picture in, tags with their places before the camera out. For workers; loads OpenCV.
+"""Reading step for workers: takes an image, returns tags with their places relative to the camera. Loads OpenCV.
 
-The pose of a tag is that of its square (Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014;
-in OpenCV ``SOLVEPNP_IPPE_SQUARE``). It has two solutions: a small square seen from afar looks alike turned to either
-side.
+The pose of a tag is its square's (Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014;
+in OpenCV ``SOLVEPNP_IPPE_SQUARE``). It has two solutions: from afar, a small square turned to either side looks the
+same.
 """
 
 import cv2
@@ -16,14 +16,14 @@ from monstertruck_schemas.board import TagFamily
 
 
 class ReadingStep:
-    """Reads pictures one by one; keeps the reader of the last family."""
+    """Read images one by one; keeps the reader of the last family."""
 
     def __init__(self) -> None:
         self._family: TagFamily = "36h11"
         self._reader = TagReader(everywhere=1, corners="edges")
 
     def step(self, task: ReadTask) -> ReadAnswer:
-        """Read one picture."""
+        """Read one image."""
         data = np.frombuffer(task.jpeg, np.uint8)
         colour = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
         if colour is None:
@@ -44,9 +44,9 @@ class ReadingStep:
 
 
 def decode_margin(grey: Picture, sighting: Sighting, family: TagFamily = "36h11") -> float:
-    """How clear the least clear cell is: 1 = black or white, 0 = grey, below 0 = the other one."""
+    """Return the contrast of the worst cell: 1 for black or white, 0 for grey, negative for the opposite colour."""
     count = cells(family)
-    samples = 6  # pixels of a cell that is looked at
+    samples = 6  # pixels sampled per cell
     side = count * samples
     square = np.array(((0, 0), (side, 0), (side, side), (0, side)), np.float32) - 0.5
     turned = cv2.getPerspectiveTransform(sighting.corners.astype(np.float32), square.astype(np.float32))
@@ -55,14 +55,14 @@ def decode_margin(grey: Picture, sighting: Sighting, family: TagFamily = "36h11"
     means = np.asarray(flat, dtype=np.float64).reshape(count, samples, count, samples)[:, core, :, core].mean((1, 3))
     white = drawn(sighting.tag, count, family) > 127
     bright, dark = float(means[white].mean()), float(means[~white].mean())
-    if bright - dark < 25.0:  # least difference of white and black, of 255
+    if bright - dark < 25.0:  # minimum difference of white and black, out of 255
         return -1.0
     share = (means - (bright + dark) / 2) / ((bright - dark) / 2)
     return float(np.where(white, share, -share).min())
 
 
 def placed(sighting: Sighting, size: float, lens: Lens, margin: float) -> TagReading | None:
-    """A tag before the camera; None if no pose fits."""
+    """Return a tag relative to the camera; None if no pose fits."""
     half = size / 2
     square = np.array(((-half, half, 0), (half, half, 0), (half, -half, 0), (-half, -half, 0)))
     count, rotations, places, errors = cv2.solvePnPGeneric(
@@ -91,12 +91,12 @@ def placed(sighting: Sighting, size: float, lens: Lens, margin: float) -> TagRea
 
 
 def _with_picture(reading: TagReading, colour: Array, sighting: Sighting) -> TagReading:
-    margin = 0.6 * sighting.size  # margin of a tag's picture on each side, in sides of the tag
+    margin = 0.6 * sighting.size  # margin of a tag's image on each side, in sides of the tag
     low, high = sighting.corners.min(axis=0) - margin, sighting.corners.max(axis=0) + margin
     x0, y0 = np.maximum(low, 0).astype(int)
     x1, y1 = np.minimum(np.ceil(high), (colour.shape[1], colour.shape[0])).astype(int)
     part = colour[y0:y1, x0:x1]
-    scale = 160 / max(part.shape[:2])  # pixels of a tag's picture at most
+    scale = 160 / max(part.shape[:2])  # maximum size of a tag's image, pixels
     if scale < 1.0:
         part = np.asarray(cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
     _, data = cv2.imencode(".jpg", part, (cv2.IMWRITE_JPEG_QUALITY, 80))

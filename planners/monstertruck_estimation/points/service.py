@@ -1,4 +1,4 @@
-"""Points of interest as a service: pictures to the worker that reads them, readings to objects of the map."""
+"""Points of interest service: passes images to the reading worker, and turns readings into objects of the map."""
 
 import asyncio
 import base64
@@ -37,13 +37,13 @@ from monstertruck_schemas.topics import POSE
 
 TARGET: Final = "monstertruck_estimation.points.reader:ReadingStep"
 READER_START_TIMEOUT: Final = 60.0
-"""Real seconds the worker may take to start."""
+"""Time that the worker may take to start (real seconds)."""
 OLDEST: Final = SECOND
-"""Older pictures are not read, ns."""
+"""Maximum age of an image that is read (ns)."""
 PERIOD: Final = SECOND
-"""Time between two messages, ns."""
+"""Time between two messages (ns)."""
 OTHERS_PAUSE: Final = 0.02
-"""Seconds that others run then."""
+"""Pause in which other tasks run (s)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +51,9 @@ class PointInputs:
     """Topics read."""
 
     camera: Mailbox[CompressedImage] | None
-    """None = places are marked only."""
+    """Camera images; None if places are only marked."""
     pose: Mailbox[Odometry]
-    """Poses in map; all of them."""
+    """All poses in map."""
     slam: Subscription[SlamHealth] | None
     attitude: Subscription[Attitude] | None
     gate: Subscription[GateState]
@@ -61,13 +61,13 @@ class PointInputs:
 
 @dataclass(frozen=True, slots=True)
 class PointFolders:
-    """Where points are kept."""
+    """Folders of the points."""
 
     load: Path | None = None
-    """Folder of the map that is known at the start."""
+    """Folder of the map known at the start."""
     save: Path | None = None
     run: str | None = None
-    """Run that makes the map; None = it is known."""
+    """Run that makes the map; None if the map is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,20 +79,20 @@ class _Placed:
 
 
 class PointService:
-    """Finds tags in the camera's pictures, and keeps them and what operators mark in the map.
+    """Find tags in the camera's images, and keep them and the operators' marks in the map.
 
     Args:
         config: gates and rates.
-        camera: mount and lens; None = there is none.
+        camera: mount and lens; None without a camera.
         clock: time.
-        actor: where pictures are read.
+        actor: reads the images.
         inputs: topics read.
-        ask: where the robot was; None = the map does not move.
+        ask: returns the robot's past poses; None if the map does not move.
         out: ``state/points``.
-        events: what was found, and what fails.
-        folders: of the map.
-        save_map: has the map of this run saved as soon as possible; None = it is known.
-        offload: where files are read and written.
+        events: receives finds and failures.
+        folders: folders of the map.
+        save_map: requests that this run's map is saved as soon as possible; None if the map is known.
+        offload: runs the reading and writing of files.
         max_age: see ``GateConfig.max_request_age``.
     """
 
@@ -129,11 +129,11 @@ class PointService:
         self._dirty: dict[str, None] = {}
         self._published = self._unsaved = False
         self._looked: tuple[Pose2, int] | None = None
-        """Where pictures were read last, and how many."""
+        """Place of the last images read, and their number."""
         self._unreadable = False
         self._writing = asyncio.Lock()
         self._unanchored: dict[str, int] = {}
-        """Marks whose place in the map is known, but not yet where the robot was then by the map of today: instants."""
+        """Instants of marks whose place in the map is known, but not yet the robot's pose then in the current map."""
 
     async def run(self, ready: Ready) -> None:
         """Serve until cancelled, then save."""
@@ -149,7 +149,7 @@ class PointService:
                 self._map.refresh(name, self._bases)
             await self._save()
 
-    # Pictures
+    # Images
 
     async def _look(self, actor: Actor, camera: Mailbox[CompressedImage]) -> None:
         schedule, newest = Schedule(self._clock, self._config.rate), 0
@@ -166,7 +166,7 @@ class PointService:
                 answer: ReadAnswer = await actor.step(ReadTask.of(picture.data, self._lens, self._config))
             except WorkerError as error:
                 self._events(error.reason, Severity.ERROR, self.name, str(error))
-                await self._clock.sleep(2.0)  # seconds after which a worker that failed is tried again
+                await self._clock.sleep(2.0)  # seconds after which a failed worker is retried
                 continue
             self._take(answer, placed)
 
@@ -187,8 +187,8 @@ class PointService:
             self._stamps = self._map.stamps()
 
     async def _placed(self, stamp: int) -> _Placed | None:
-        """Where the robot was at an instant; None if that is not known."""
-        limit = self._clock.now() + (SECOND // 10)  # a picture waits for a pose that is as new for so long, ns
+        """Return the robot's pose at an instant; None if unknown."""
+        limit = self._clock.now() + (SECOND // 10)  # maximum wait of an image for a pose as recent, ns
         self._gather()
         while (not self._history or self._history[-1].stamp < stamp) and self._clock.now() < limit:
             await self._clock.sleep(OTHERS_PAUSE)
@@ -227,22 +227,22 @@ class PointService:
         ) <= self._config.tilt  # fmt: skip
 
     def _worth(self, pose: Pose2) -> bool:
-        """Whether the robot has moved since the last pictures, or has looked here once only."""
-        # a robot that has moved and turned less, m and rad, is still at the place of the last picture
+        """Whether the robot has moved since the last images, or has looked here only once."""
+        # a robot that has moved and turned less (m, rad) is still at the place of the last image
         standing = (0.02, 0.02)
         if self._looked is not None:
             before, looks = self._looked
             turned = abs(math.remainder(pose[2] - before[2], math.tau))
             if math.dist(before[:2], pose[:2]) < standing[0] and turned < standing[1]:
                 self._looked = before, looks + 1
-                return looks < 2  # pictures read at one place
+                return looks < 2  # images read at one place
         self._looked = pose, 1
         return True
 
-    # What is kept
+    # Storage
 
     async def _keep(self) -> None:
-        schedule = Schedule(self._clock, 2.0)  # checks per second at what has changed
+        schedule = Schedule(self._clock, 2.0)  # checks for changes per second
         now = self._clock.now()
         published, saved = now - PERIOD, now
         while True:
@@ -260,7 +260,7 @@ class PointService:
                     self._unsaved = True
 
     def _correct(self) -> None:
-        """What the mapper has moved since moves its points."""
+        """Move the points by the mapper's corrections."""
         if self._ask is None or not self._stamps:
             return
         bases = self._ask(self._stamps)
@@ -278,7 +278,7 @@ class PointService:
     async def _refresh(self) -> None:
         dirty, self._dirty = list(self._dirty), {}
         for i, name in enumerate(dirty):
-            if i and i % 4 == 0:  # points that are computed without letting others run
+            if i and i % 4 == 0:  # number of points computed before other tasks run
                 await self._clock.sleep(OTHERS_PAUSE)
             self._map.refresh(name, self._bases)
         if dirty:
@@ -300,7 +300,7 @@ class PointService:
         self._dirty = dict.fromkeys(self._map.points)
 
     async def _save(self) -> Reason:
-        """Save them with the map; returns ``OK``, or why that failed."""
+        """Save the points with the map; return ``OK``, or the reason of the failure."""
         folder, run = self._folders.save, self._folders.run
         if folder is None:
             return Reason.OK
@@ -397,7 +397,7 @@ class PointService:
             y if request.y is None else request.y,
             yaw if request.yaw is None else math.remainder(request.yaw, math.tau),
         )
-        # A place far from here moves with what of the map is near it.
+        # A distant place moves with the part of the map near it.
         stamp, base = (here.stamp, here.pose) if request.x is None else nearest(self._trail, place)
         self._unanchored.pop(request.name, None)
         if request.x is not None and self._ask is not None and stamp not in self._bases:
@@ -407,10 +407,10 @@ class PointService:
         return place
 
     def picture(self, name: str) -> bytes:
-        """The picture of a point, JPEG.
+        """Return the image of a point, JPEG.
 
         Raises:
-            NotFoundError: no such point, or it has none.
+            NotFoundError: no such point, or it has no image.
         """
         tracked = self._map.points.get(name)
         if tracked is None or not tracked.picture:

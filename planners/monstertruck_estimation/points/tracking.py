@@ -1,7 +1,7 @@
-"""From readings to points of interest: pure; a point is stored relative to a pose, so it moves with the map.
+"""Points of interest from tag readings (pure); a point is stored relative to a pose, so it moves with the map.
 
-Every sighting keeps its place in the robot's base and the instant of its picture. Where the robot was then is asked of
-the mapper again after every correction, so sightings from before and after a loop agree once it is closed.
+Every sighting keeps its place in the robot's base and the instant of its image. After every correction, the mapper is
+asked again where the robot was then, so sightings from before and after a loop agree once it is closed.
 """
 
 import math
@@ -21,7 +21,7 @@ from monstertruck_schemas.body import Mount
 from monstertruck_schemas.points import PointKind, PointOfInterest
 
 KEPT_SIGHTINGS: Final = 24
-"""Sightings of a point at most."""
+"""Maximum number of sightings per point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,22 +29,22 @@ class PointSighting:
     """A point as seen from the robot at one instant."""
 
     stamp: int
-    """Of the picture, ns."""
+    """Stamp of the image (ns)."""
     base: Pose2
-    """The robot in map then, as known at that time."""
+    """Robot in map at that stamp, as known then."""
     place: Triple
-    """In base, m."""
+    """Place in base (m)."""
     yaw: float
-    """Direction it faces, in base, rad."""
+    """Direction that the point faces, in base (rad)."""
     spread: tuple[float, ...]
-    """Row-major (3, 3), covariance of x, y, yaw in base."""
+    """Covariance of x, y, yaw in base, row-major (3, 3)."""
     worth: int = 1
-    """Sightings that it stands for."""
+    """Number of sightings that it represents."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """One point, published or not yet."""
+    """Point, published or not yet."""
 
     name: str
     kind: PointKind
@@ -52,18 +52,18 @@ class Tracked:
     size: float | None
     sightings: tuple[PointSighting, ...]
     count: int
-    """All pictures so far."""
+    """Number of images so far."""
     first: int
     last: int
     picture: bytes = b""
     sharpest: float = 0.0
-    """Side of the tag in it, pixels."""
+    """Side of the tag in the sharpest image (pixels)."""
 
 
 Bases = Mapping[int, Pose2]
-"""Where the robot was at instants, by the map as it is now."""
+"""Poses of the robot by stamp, in the current map."""
 PoseAsker = Callable[[tuple[int, ...]], Bases]
-"""Asks the mapper where the robot was at instants; answers with what it knows by now."""
+"""Asks the mapper for the robot's poses at some stamps; returns those known so far."""
 
 
 @dataclass
@@ -72,31 +72,31 @@ class PointMap:
 
     Args:
         config: gates.
-        mount: of the camera.
+        mount: mount of the camera.
     """
 
     config: PointsConfig
     mount: Mount
     points: dict[str, Tracked] = field(default_factory=dict)
     shown: dict[str, PointOfInterest] = field(default_factory=dict)
-    """As they were when ``refresh`` was last called for each."""
+    """State of each point at its last ``refresh``."""
 
     def see(self, reading: TagReading, stamp: int, base: Pose2, covariance: Array, rate: float) -> bool:
-        """Take a reading in; returns whether it made a tag a point of interest.
+        """Take a reading; return whether it made a tag a point of interest.
 
         Args:
-            reading: of a picture.
-            stamp: of it, ns.
-            base: the robot then, in map.
-            covariance: of that, (3, 3).
-            rate: at which the robot turned, rad/s.
+            reading: reading from an image.
+            stamp: stamp of the image (ns).
+            base: robot in map at that stamp.
+            covariance: covariance of that pose, (3, 3).
+            rate: turn rate of the robot (rad/s).
         """
         name = f"tag-{reading.tag}"
         known = self.points.get(name)
         if known is None and len(self.points) >= self.config.most:
             return False
-        # What a saved map says was on the clock of another start.
-        # 100_000_000: least time between two pictures that count, ns
+        # Stamps in a saved map are from the clock of an earlier start.
+        # 100_000_000: minimum time between two images that are used, ns
         if known is not None and abs(stamp - known.last) < 100_000_000:
             return False
         new = sighting(reading, self.mount, stamp, base, covariance, rate)
@@ -111,7 +111,7 @@ class PointMap:
         return not before and self.is_known(known)
 
     def is_known(self, point: Tracked) -> bool:
-        """Whether enough pictures agree on it."""
+        """Whether enough images agree on a point."""
         if point.kind is PointKind.MARK:
             return True
         needed = self.config.sightings
@@ -121,11 +121,11 @@ class PointMap:
         """Mark a place by name, as an operator does.
 
         Args:
-            name: of the place; one that is there is moved.
-            stamp: an instant at which the robot was near it, ns.
-            base: where it was then, in map.
-            place: to be marked, in map.
-            covariance: of the robot's pose, (3, 3).
+            name: name of the place; an existing one is moved.
+            stamp: an instant at which the robot was near it (ns).
+            base: robot in map at that instant.
+            place: place to mark, in map.
+            covariance: covariance of the robot's pose, (3, 3).
         """
         x, y, yaw = between(np.array(base), np.array(place)).tolist()
         into = _into_base(base)
@@ -135,7 +135,7 @@ class PointMap:
         self.points[name] = Tracked(name, PointKind.MARK, None, None, (one,), 0, stamp, stamp)
 
     def anchor(self, name: str, base: Pose2) -> None:
-        """Leave a mark where it is in the map, for the robot was at ``base`` at its instant by the map of today."""
+        """Keep a mark at its place in the map: by the current map the robot was at ``base`` at its instant."""
         point = self.points[name]
         (old,) = point.sightings
         here = compose(np.array(old.base), np.array((*old.place[:2], old.yaw)))
@@ -146,11 +146,11 @@ class PointMap:
         self.points[name] = replace(point, sightings=(new,))
 
     def stamps(self) -> tuple[int, ...]:
-        """Instants at which it matters where the robot was."""
+        """Return the stamps at which the robot's pose is needed."""
         return tuple(sorted({one.stamp for point in self.points.values() for one in point.sightings}))
 
     def refresh(self, name: str, bases: Bases) -> None:
-        """Bring what is shown of a point up to date, by the map as it is now; about 0.3 ms."""
+        """Update the published state of a point by the current map; about 0.3 ms."""
         tracked = self.points.get(name)
         if tracked is None or not self.is_known(tracked):
             self.shown.pop(name, None)
@@ -158,15 +158,15 @@ class PointMap:
             self.shown[name] = self._point(tracked, bases)
 
     def pictured(self) -> list[tuple[PointOfInterest, bytes]]:
-        """Points as shown, with their pictures."""
+        """Return the published points with their images."""
         return [(point, self.points[name].picture) for name, point in self.shown.items() if name in self.points]
 
     def load(self, points: Iterable[tuple[PointOfInterest, bytes]]) -> None:
-        """Take over points of a saved map, with their pictures."""
+        """Take the points of a saved map, with their images."""
         for point, picture in points:
             spread = tuple(float(v) for v in point.covariance)
             place = (point.x, point.y, point.z)
-            # 2: sightings that a point of a saved map is worth: one that disagrees changes nothing yet
+            # 2: number of sightings that a point of a saved map represents: one that disagrees changes nothing yet
             one = PointSighting(0, (0.0, 0.0, 0.0), place, point.yaw, spread, worth=2)
             self.points[point.name] = Tracked(
                 point.name, point.kind, point.tag, point.size, (one,), max(point.sightings, self.config.sightings),
@@ -197,24 +197,24 @@ class PointMap:
 def sighting(
     reading: TagReading, mount: Mount, stamp: int, base: Pose2, covariance: Array, rate: float
 ) -> PointSighting:
-    """A reading in the robot's base, with what may be wrong with it.
+    """Return a reading as a sighting in the robot's base, with its uncertainty.
 
-    Of the two poses of a square the one is taken whose normal is level, as of a tag that hangs upright; where both are,
-    and fit alike, its heading is uncertain.
+    Two poses fit a square: the one with the level normal is used, as of a tag that hangs upright. If both normals are
+    level and fit equally well, the heading is uncertain.
     """
     turned = camera_axes(mount.yaw, mount.pitch, mount.roll)
     place = turned @ np.array(reading.middle) + np.array((mount.x, mount.y, mount.z))
     normals = [turned @ np.array(normal) for normal in (reading.normal, reading.other_normal)]
     level = [abs(float(normal[2])) for normal in normals]
-    doubted = 0.6  # ratio of the fits of the best and the second pose of a square up to which the tag is unambiguous
+    doubted = 0.6  # maximum ratio of the fits of the best and the second pose for an unambiguous tag
     second = reading.doubt > doubted and level[1] < level[0] - 0.1
     normal = normals[1 if second else 0]
     sure = reading.doubt <= doubted or abs(level[0] - level[1]) > 0.1
     away = math.hypot(*reading.middle)
-    along = 0.4 / max(reading.pixels, 1.0) * away  # standard deviation of a tag's side in a picture, pixels
+    along = 0.4 / max(reading.pixels, 1.0) * away  # standard deviation of a tag's side in an image, pixels
     side_error = 0.006  # standard deviation across the line of sight, m
     # 0.004: standard deviation of the direction of the line of sight, rad: mount and lens
-    # 0.015: error of the picture's stamp, s
+    # 0.015: error of the image's stamp, s
     across = side_error + away * (0.004 + abs(rate) * 0.015)
     bearing = math.atan2(place[1] - mount.y, place[0] - mount.x)
     c, s = math.cos(bearing), math.sin(bearing)
@@ -234,10 +234,10 @@ def sighting(
 
 
 def fused(sightings: Sequence[PointSighting], bases: Bases, config: PointsConfig) -> tuple[Array, float, Array]:
-    """Pose (x, y, yaw) of those that agree, height, and the pose's covariance, (3, 3).
+    """Return pose (x, y, yaw) and height of the sightings that agree, and the pose's covariance, (3, 3).
 
-    Errors of one place are alike in its sightings: the covariance is not less than that of the best one over the root
-    of how many places agree.
+    The sightings from one place share its errors: the minimum covariance is the best sighting's, divided by the root
+    of the number of places that agree.
     """
     places, spreads = in_map(sightings, bases)
     inside = _agreeing(places, spreads, _worth(sightings), config)
@@ -254,7 +254,7 @@ def fused(sightings: Sequence[PointSighting], bases: Bases, config: PointsConfig
 
 
 def in_map(sightings: Sequence[PointSighting], bases: Bases) -> tuple[Array, Array]:
-    """Poses (n, 3) and covariances (n, 3, 3) of sightings, by where the robot was."""
+    """Return poses (n, 3) and covariances (n, 3, 3) of sightings, by the robot's poses."""
     base = np.array([bases.get(one.stamp, one.base) for one in sightings])
     local = np.array([(*one.place[:2], one.yaw) for one in sightings])
     spreads = np.array([one.spread for one in sightings]).reshape(-1, 3, 3)
@@ -268,7 +268,7 @@ def _worth(sightings: Sequence[PointSighting]) -> NDArray[np.int64]:
 
 
 def _agreeing(places: Array, spreads: Array, worth: NDArray[np.int64], config: PointsConfig) -> NDArray[np.intp]:
-    """Indices of the largest group that agrees with one of them, of equal ones the newest."""
+    """Return the indices of the largest group that agrees with one of its members, the latest of equal groups."""
     apart = places[:, None, :2] - places[None, :, :2]
     both = spreads[:, None, :2, :2] + spreads[None, :, :2, :2]
     far = np.einsum("ijk,ijkl,ijl->ij", apart, np.linalg.inv(both), apart)
@@ -285,13 +285,13 @@ def _consensus(sightings: Sequence[PointSighting], bases: Bases, config: PointsC
 
 
 def _added(sightings: tuple[PointSighting, ...], new: PointSighting) -> tuple[PointSighting, ...]:
-    """With the new one; of one place the better one stays, and of too many the oldest but the first goes."""
+    """Return the sightings with the new one: the better one per place; if too many, without the second oldest."""
     for i, old in enumerate(sightings):
-        if old.worth > 1:  # of a saved map: from where it was seen is not known
+        if old.worth > 1:  # from a saved map: the robot's pose is unknown
             continue
         moved = math.dist(old.base[:2], new.base[:2])
-        # 0.08: distance within which sightings count as one, m: their errors are the same
-        # 0.08: difference in heading within which sightings count as one, rad
+        # 0.08: distance within which sightings merge, m: their errors are the same
+        # 0.08: difference in heading within which sightings merge, rad
         if moved < 0.08 and abs(math.remainder(old.base[2] - new.base[2], math.tau)) < 0.08:
             better = new if new.spread[0] + new.spread[4] < old.spread[0] + old.spread[4] else old
             return (*sightings[:i], better, *sightings[i + 1 :])
@@ -300,11 +300,11 @@ def _added(sightings: tuple[PointSighting, ...], new: PointSighting) -> tuple[Po
 
 
 def _into_base(base: Pose2) -> Array:
-    """Turns (x, y, yaw) of map into base's axes, (3, 3)."""
+    """Return the rotation of (x, y, yaw) from map into base's axes, (3, 3)."""
     c, s = math.cos(base[2]), math.sin(base[2])
     return np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0)))
 
 
 def nearest(trail: Sequence[tuple[int, Pose2]], place: Pose2) -> tuple[int, Pose2]:
-    """The instant at which the robot was nearest to a place, and where it was."""
+    """Return the instant at which the robot was nearest to a place, and its pose then."""
     return min(trail, key=lambda row: math.dist(row[1][:2], place[:2]))

@@ -1,7 +1,7 @@
-"""Long searches in pieces: what one scan may spend on them is counted as work, not as time, so that runs repeat.
+"""Long searches in pieces, with a budget per scan counted in work instead of time, so that runs repeat.
 
-A search is a generator that yields the cost of every piece before it does it. The unit is one look-up in a likelihood
-grid, 2 to 3 ns; other work is counted as so many of them.
+A search is a generator that yields the cost of every piece before it executes it. The unit is one look-up in a
+likelihood grid, 2 to 3 ns; other work is converted to it.
 """
 
 from collections.abc import Generator
@@ -9,10 +9,10 @@ from typing import Final, Generic, TypeVar
 
 T = TypeVar("T")
 Pieces = Generator[float, None, T]
-"""A search in pieces, with its result at the end."""
+"""Search in pieces that returns its result at the end."""
 
 BUDGET: Final = 9e6
-"""Work on searches at one scan, 20 to 25 ms."""
+"""Maximum work on searches per scan, 20 to 25 ms."""
 ELEMENT: Final = 100.0
 """Work of merging one element into a submap."""
 DRAWN: Final = 1000.0
@@ -20,9 +20,9 @@ DRAWN: Final = 1000.0
 CELL: Final = 0.2
 """Work per cell of one level of a likelihood grid."""
 EDGE: Final = 400.0
-"""Work per edge of the pose graph of bounding its drift."""
+"""Work per edge of the pose graph for bounding its drift."""
 EDGE_OPTIMISED: Final = 4000.0
-"""Work per edge of optimising the pose graph."""
+"""Work per edge for optimising the pose graph."""
 VERIFIED: Final = 3e6
 """Work of verifying a match."""
 CROSSED: Final = 2e5
@@ -30,14 +30,14 @@ CROSSED: Final = 2e5
 
 
 class ScanBudget:
-    """Work left at one scan. The first piece is always done, so that every search ends."""
+    """Work left for one scan. The first piece is always allowed, so that every search ends."""
 
     def __init__(self, units: float = BUDGET) -> None:
         self._left = units
         self._begun = False
 
     def allows(self, cost: float) -> bool:
-        """Whether a piece of this ``cost`` is to be done at this scan; if so, it is taken off."""
+        """Whether a piece of this ``cost`` fits in this scan; if so, deduct it."""
         if self._begun and cost > self._left:
             return False
         self._begun = True
@@ -46,16 +46,16 @@ class ScanBudget:
 
 
 class PiecewiseSearch(Generic[T]):
-    """A search that is continued scan by scan."""
+    """Search that continues scan by scan."""
 
     def __init__(self, pieces: Pieces[T]) -> None:
         self._pieces = pieces
         self._cost = 0.0
         self.result: T | None = None
-        """Its result once it has ended."""
+        """Result of the search once it has ended."""
 
     def run(self, budget: ScanBudget) -> bool:
-        """Do pieces while the budget allows it; True when the search has ended."""
+        """Execute pieces within the budget; return whether the search has ended."""
         while budget.allows(self._cost):
             try:
                 self._cost = next(self._pieces)
@@ -66,7 +66,7 @@ class PiecewiseSearch(Generic[T]):
 
 
 def finished(pieces: Pieces[T]) -> T:
-    """The result of a search without any limit."""
+    """Return the result of a search without a limit."""
     while True:
         try:
             next(pieces)

@@ -19,7 +19,7 @@ from monstertruck_kinematics.se2 import between, compose, compose_jacobians, inv
 from monstertruck_runtime.clock import SECOND
 
 INITIAL_ROWS: Final = 64
-"""Rows allocated at first."""
+"""Number of rows allocated at first."""
 
 
 class GrowingArray:
@@ -44,7 +44,7 @@ class GrowingArray:
 
     @property
     def view(self) -> NDArray[Any]:
-        """The rows, not copied."""
+        """The rows, without a copy."""
         return self._data[: self._count]
 
     def __len__(self) -> int:
@@ -56,7 +56,7 @@ class Keyframe:
     """A scan that is part of the map."""
 
     stamp: int
-    """ns."""
+    """Stamp (ns)."""
     scan: Scan
     """Downsampled points in base."""
     cloud: Cloud
@@ -140,11 +140,12 @@ class EdgeList:
 class Trajectory:
     """Every scan's pose relative to a keyframe, so that the whole trajectory moves with the graph.
 
-    A scan that becomes a keyframe is stored twice: relative to the keyframe before it, and as itself. What optimisation
-    moved the one against the other is distributed over the scans between, or the trajectory would jump at keyframes.
+    A scan that becomes a keyframe is stored twice: relative to the previous keyframe, and as itself. Optimisation may
+    move one against the other; this offset is distributed over the scans between, or the trajectory would jump at
+    keyframes.
 
     Args:
-        most: scans stored; beyond that every second one is dropped.
+        most: maximum number of scans stored; beyond it, every second one is dropped.
     """
 
     def __init__(self, most: int) -> None:
@@ -163,20 +164,20 @@ class Trajectory:
                 rows.set(rows.view[::2])
 
     def reattach(self, since: int, keys: Array, key: int) -> None:
-        """Attach scans from ``since`` on, ns, to keyframe ``key``, at their poses by ``keys``, shape (n, 3)."""
+        """Attach scans from ``since`` (ns) to keyframe ``key``, at their poses by ``keys``, shape (n, 3)."""
         late = np.flatnonzero(self._stamps.view >= since)
         poses = compose(keys[self._keys.view[late]], self._relative.view[late])
         self._relative.view[late] = between(keys[key], poses)
         self._keys.view[late] = key
 
     def move(self, stand_in: NDArray[np.int64], offset: Array) -> None:
-        """Keyframe k is replaced by ``stand_in[k]``, in whose frame it was at ``offset[k]``."""
+        """Replace keyframe k by ``stand_in[k]``, in whose frame it was at ``offset[k]``."""
         keys = self._keys.view
         self._relative.set(compose(offset[keys], self._relative.view))
         self._keys.set(stand_in[keys])
 
     def poses(self, keys: Array) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (n,) and poses (n, 3) of all scans, given the poses of the keyframes."""
+        """Return stamps (n,) and poses (n, 3) of all scans, given the poses of the keyframes."""
         stamps = self._stamps.view.copy()
         poses = compose(keys[self._keys.view], self._relative.view)
         joints = self._joints()
@@ -189,7 +190,7 @@ class Trajectory:
         return np.delete(stamps, joints), np.delete(poses, joints, axis=0)
 
     def at(self, stamps: NDArray[np.int64], keys: Array, joined: NDArray[np.bool_]) -> Array:
-        """Poses (n, 3) at any instants, between scans by a straight line; NaN outside, and off the map.
+        """Return poses (n, 3) at any instants, linear between scans; NaN outside, and off the map.
 
         Args:
             stamps: (n,), ns.
@@ -210,11 +211,11 @@ class Trajectory:
         return found
 
     def marked(self, keys: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Marks of all scans, shape (n,), given those of the keyframes."""
+        """Return marks of all scans, shape (n,), given the marks of the keyframes."""
         return np.asarray(np.delete(keys[self._keys.view], self._joints()))
 
     def _joints(self) -> NDArray[np.intp]:
-        """Rows of scans that became keyframes, relative to the keyframe before."""
+        """Return rows of scans that became keyframes, relative to the previous keyframe."""
         stamps = self._stamps.view
         return np.flatnonzero(stamps[1:] == stamps[:-1])
 
@@ -224,12 +225,12 @@ Numbers = NDArray[np.intp]
 LOOSENED: Final = 30.0
 """Factor on the standard deviation of an edge of odometry that the scans contradict."""
 VIEW: Final = 0.7
-"""Metres that one radian between two views counts as."""
+"""Weight of one radian between two views (m)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Join:
-    """Two submaps that were joined, maybe wrongly."""
+    """Join of two submaps, possibly wrong."""
 
     own: int
     """Number of the robot's submap, to which later keyframes belong."""
@@ -238,16 +239,16 @@ class Join:
     others: Numbers
     """Keyframes of the other submap, in rising order."""
     since: int
-    """Keyframes there were."""
+    """Number of keyframes at the join."""
 
 
 class _Drift(NamedTuple):
     """Drift against one keyframe, and what it was computed from."""
 
     poses: Array
-    """Replaced as a whole by every change."""
+    """Poses, replaced as a whole by every change."""
     revision: int
-    """Of the edges."""
+    """Revision of the edges."""
     source: int
     bound: tuple[Array, Array]
 
@@ -265,16 +266,16 @@ class KeyframeMap:
         self.poses: Array = np.zeros((0, 3))
         self.edges = EdgeList()
         self.part: NDArray[np.int64] = np.zeros(0, np.int64)
-        """Shape (n,): the submap of every keyframe, by the number of its first one; 0 = the map."""
+        """Submap of every keyframe, by the number of its first keyframe, shape (n,); 0 is the map."""
         self.doubtful: list[Join] = []
-        """Joins, in their order, that what the robot saw since then has not confirmed yet."""
+        """Joins, in their order, that later observations have not confirmed yet."""
         self._drift: _Drift | None = None
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def add(self, scan: Scan, stamp: int, pose: Array, *, apart: bool = False) -> None:
-        """Add a keyframe, without edges; ``apart``: it begins a submap that only loop closures may join to the rest."""
+        """Add a keyframe, without edges; ``apart`` starts a submap that only loop closures may join to the rest."""
         self.part = np.append(self.part, len(self) if apart or not len(self) else self.part[-1])
         kept = scan.downsampled(self.config.key_cell, self.config.key_points)
         self.frames.append(Keyframe(stamp, kept, Cloud.of(kept)))
@@ -292,22 +293,22 @@ class KeyframeMap:
         self.poses[moved] = compose(target, between(origin, self.poses[moved]))
 
     def join(self, one: int, other: int) -> None:
-        """Submaps ``one`` and ``other`` are related by edges: they are one, which is to be confirmed."""
+        """Merge submaps ``one`` and ``other``, now related by edges; the join is yet to be confirmed."""
         own, other = (one, other) if one == self.part[-1] else (other, one)
         self.doubtful.append(Join(own, other, np.flatnonzero(self.part == other), len(self)))
         self.part[self.part == max(own, other)] = min(own, other)
 
     def sides(self, join: Join) -> tuple[Numbers, Numbers]:
-        """Keyframes, rising, of the robot's side of a join in doubt, those since then included, and of the other side.
+        """Return the keyframes, rising, of the robot's side of a join in doubt, including later ones, and of the other.
 
-        What later joins brought belongs to neither.
+        Keyframes from later joins belong to neither.
         """
         later = self.doubtful[self.doubtful.index(join) :]
         apart = np.concatenate([each.others for each in later])
         return np.setdiff1d(np.flatnonzero(self.part == self.part[join.others[0]]), apart), join.others
 
     def separate(self, join: Join) -> None:
-        """Undo a ``join`` in doubt, and those since then: no edge relates what they joined."""
+        """Undo a ``join`` in doubt, and later ones: no edge relates the submaps they joined."""
         while join in self.doubtful:
             own, others = self.sides(self.doubtful[-1])
             last = self.doubtful.pop()
@@ -317,7 +318,7 @@ class KeyframeMap:
         self.optimise()
 
     def joined(self) -> NDArray[np.bool_]:
-        """Which keyframes belong to the map, shape (n,)."""
+        """Whether each keyframe belongs to the map, shape (n,)."""
         return np.asarray(self.part == 0)
 
     def add_odometry_edge(self, delta: Array, covariance: Array) -> None:
@@ -328,12 +329,12 @@ class KeyframeMap:
         self.edges.add(new - 1, new, delta, information, (place**2, turn**2), odometry=True)
 
     def loosen_odometry(self, since: int) -> None:
-        """Loosen the edges of odometry to keyframes after ``since``, ns."""
+        """Loosen the edges of odometry to keyframes after ``since`` (ns)."""
         after = np.array([key.stamp for key in self.frames]) > since
         self.edges.loosen(self.edges.odometry & after[self.edges.edges().target])
 
     def add_scan_edges(self, local: Numbers) -> None:
-        """Add edges from the newest keyframe to those of ``local`` that it overlaps, the nearest first."""
+        """Add edges from the latest keyframe to those of ``local`` that it overlaps, the nearest first."""
         new = len(self) - 1
         order = local[np.argsort(self._closeness(local, self.poses[new]), kind="stable")]
         linked = 0
@@ -343,12 +344,12 @@ class KeyframeMap:
                 break
 
     def _link(self, origin: int, target: int) -> bool:
-        """Register two keyframes from their present poses and add the edge; False if they do not fit."""
+        """Register two keyframes from their current poses and add the edge; return False if they do not fit."""
         config = self.config
         guess = between(self.poses[origin], self.poses[target])
         fit = register(self.frames[target].scan, self.frames[origin].cloud, guess)
         off = between(guess, fit.pose)
-        # Greatest correction of an edge between keyframes that were matched to one submap, m and rad.
+        # Maximum correction of an edge between keyframes that were matched to one submap (m, rad).
         link_max_correction = (0.15, 0.1)
         far = math.hypot(off[0], off[1]) > link_max_correction[0] or abs(off[2]) > link_max_correction[1]
         link_overlap = 0.4
@@ -359,17 +360,17 @@ class KeyframeMap:
         turn = config.drift_turn[0] + config.drift_turn[1] * abs(float(guess[2]))
         covariance: Array = np.asarray(np.linalg.inv(fit.information + np.eye(3)), dtype=np.float64)
         weakest, _ = deviations(covariance)
-        link_floor = (0.005, 0.005, 0.002)  # least standard deviation of an edge between scans, m and rad
+        link_floor = (0.005, 0.005, 0.002)  # minimum standard deviation of an edge between scans, m and rad
         information = np.linalg.inv(covariance + np.diag(np.square(link_floor)))
         spread = (place**2 + weakest**2, turn**2)
-        recent = 5  # keyframes this few apart are neighbours in time: an edge between them is no loop closure
+        recent = 5  # maximum distance in keyframes of neighbours in time: an edge between them is not a loop closure
         self.edges.add(origin, target, fit.pose, information, spread, loop=origin < target - recent)
         return True
 
     def drift(self, source: int) -> tuple[Array, Array]:
-        """Bound of the drift against ``source``: covariances in its frame, and summed variances.
+        """Return the bound of the drift against ``source``: covariances in its frame, and summed variances.
 
-        The newest one is kept, as several parts of a step ask for it.
+        The latest result is kept, because several parts of a step ask for it.
         """
         known, revision = self._drift, self.edges.revision
         if known is None or known.poses is not self.poses or known[1:3] != (revision, source):
@@ -378,12 +379,12 @@ class KeyframeMap:
         return known.bound
 
     def well_known(self, source: int) -> Numbers:
-        """Numbers, rising, of the keyframes whose drift against ``source`` is below ``local_spread``."""
+        """Return the numbers, rising, of the keyframes whose drift against ``source`` is below ``local_spread``."""
         _, far = self.drift(source)
         return np.asarray(np.flatnonzero(far <= self.config.local_spread**2))
 
     def around(self, source: int, most: int, reach: float | None = None) -> Numbers:
-        """Numbers of the well-known keyframes near ``source``, nearest first."""
+        """Return the numbers of the well-known keyframes near ``source``, nearest first."""
         near, centre = self.well_known(source), self.poses[source]
         off = self.poses[near, :2] - centre[:2]
         near = near[np.hypot(off[:, 0], off[:, 1]) <= (reach or self.config.local_reach)]
@@ -391,13 +392,13 @@ class KeyframeMap:
         return np.asarray(near[order][:most])
 
     def local(self) -> Numbers:
-        """Numbers, rising, of the keyframes of the submap around the newest one."""
+        """Return the numbers, rising, of the keyframes of the submap around the latest one."""
         newest = len(self) - 1
         recent = np.flatnonzero(self.part == self.part[newest])[-3:]
         return np.union1d(self.around(newest, self.config.local_keys), recent)
 
     def submap(self, numbers: Numbers) -> Submap:
-        """The numbered keyframes merged in map."""
+        """Return the numbered keyframes, merged in map."""
         return Submap(Cloud.of(merged([self.frames[k].scan for k in numbers], self.poses[numbers])))
 
     def optimise(self) -> None:
@@ -425,7 +426,7 @@ class KeyframeMap:
 
         Returns:
             For every former keyframe whether it is kept, (n,), the number of the keyframe that represents it, (n,), and
-            its pose in the frame of that one, (n, 3).
+            its pose in that keyframe's frame, (n, 3).
         """
         gone, stand_in, edges, spread, odometry = pruned(
             self.poses, self.part, self.edges.edges(), self.edges.spread, self.edges.odometry, self.config.pruning
@@ -445,7 +446,7 @@ class KeyframeMap:
 
 
 def redundancy(poses: Array, part: NDArray[np.int64]) -> Array:
-    """Distance, m, from every pose to the most similar view of the same submap, shape (n,): small means redundant."""
+    """Return the distance (m) of every pose to the most similar view of its submap, shape (n,): small is redundant."""
     result = np.full(len(poses), np.inf)
     for k in range(1, len(poses)):
         off = between(poses[k], poses)
@@ -486,7 +487,7 @@ def pruned(
     for node in np.argsort(redundancy(poses, part), kind="stable").tolist():
         if not allowance:
             break
-        if node == 0 or node >= count - 60 or not touching[node]:  # the newest keyframes are never removed
+        if node == 0 or node >= count - 60 or not touching[node]:  # the latest keyframes are never removed
             continue
         others = {int(edges.origin[k] + edges.target[k] - node) for k in touching[node]}
         if any(gone[other] for other in others):
@@ -546,7 +547,7 @@ def _surest(
 
 
 def _seen_from(edges: Edges, k: int, node: int) -> tuple[Array, Array]:
-    """Measurement and covariance of edge ``k`` with ``node`` as origin."""
+    """Return measurement and covariance of edge ``k`` with ``node`` as origin."""
     measured, covariance = edges.measured[k], np.linalg.inv(edges.information[k])
     if edges.origin[k] == node:
         return measured, covariance
@@ -557,11 +558,11 @@ def _seen_from(edges: Edges, k: int, node: int) -> tuple[Array, Array]:
 
 
 REFINE_NEIGHBOURS: Final = 2
-"""Preceding keyframes that each is always paired with."""
+"""Number of preceding keyframes that each is always paired with."""
 REFINE_PARTNERS: Final = 12
-"""Most earlier keyframes that each is paired with."""
+"""Maximum number of earlier keyframes that each is paired with."""
 REFINE_REACH: Final = 4.5
-"""Greatest distance of a partner, m; an angle of view counts as REFINE_TURN metres per radian."""
+"""Maximum distance of a partner (m); an angle of view is weighted as REFINE_TURN metres per radian."""
 REFINE_TURN: Final = 1.0
 REFINE_OVERLAP: Final = 0.4
 
@@ -570,7 +571,7 @@ def partners(poses: Array) -> NDArray[np.int64]:
     """Pairs (earlier, later), shape (n, 2): the two preceding, and the nearest of every stretch of the trajectory."""
     result: list[tuple[int, int]] = []
     steps = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
-    # At most one keyframe per this length of the trajectory is a partner, besides the neighbours in time, m.
+    # Minimum length of trajectory per partner keyframe, besides the neighbours in time, m.
     refine_spacing = 1.0
     stretch = np.floor(np.cumsum(steps) / refine_spacing).astype(np.int64)
     for k in range(1, len(poses)):
@@ -585,13 +586,13 @@ def partners(poses: Array) -> NDArray[np.int64]:
 
 
 WITNESSES: Final = 1500
-"""Pairs that are used to check it, at most, evenly chosen."""
+"""Maximum number of pairs that check it, evenly chosen."""
 
 
 def witnesses(keys: list[Keyframe], poses: Array, part: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Pairs (earlier, later), shape (n, 2), that see the same place at times far apart, but are not ``partners``.
+    """Return pairs (earlier, later), shape (n, 2), of one place at times far apart that are not ``partners``.
 
-    The joint registration has no term of theirs, so that they can check it.
+    The joint registration has no term for them, so that they can check it.
     """
     stamps = np.array([key.stamp for key in keys])
     witness_pause = 60.0  # seconds between two views of a place that are used to check the joint registration
@@ -610,27 +611,27 @@ def witnesses(keys: list[Keyframe], poses: Array, part: NDArray[np.int64]) -> ND
 
 
 def agreement(keys: list[Keyframe], poses: Array, pairs: NDArray[np.int64]) -> float:
-    """Sum over ``pairs`` of the share of points that lie within 5 cm of the other scan's surfaces."""
+    """Return the sum over ``pairs`` of the share of points within 5 cm of the other scan's surfaces."""
     witness_reach = 0.05  # distance within which a point agrees with the other scan, m
     return float(sum(_share(keys, poses, i, j, witness_reach) for i, j in pairs.tolist()))
 
 
 def _share(keys: list[Keyframe], poses: Array, i: int, j: int, reach: float = CELL) -> float:
-    """Share of the points of keyframe ``j`` that find a partner in ``i`` nearer than ``reach``, m."""
+    """Return the share of the points of keyframe ``j`` with a partner in ``i`` nearer than ``reach`` (m)."""
     _, _, found = normal_equations(keys[j].scan, keys[i].cloud, between(poses[i], poses[j]), reach)
     return found / max(len(keys[j].scan), 1)
 
 
 def refine(keys: list[Keyframe], poses: Array, steady: Edges, loops: Edges, rounds: int = 8) -> Array:
-    """Poses, shape (n, 3), at which all scans fit each other best.
+    """Return the poses, shape (n, 3), at which all scans fit each other best.
 
     Args:
         keys: the keyframes.
-        poses: shape (n, 3), where they are.
+        poses: current poses, shape (n, 3).
         steady: edges that are always used (odometry).
         loops: edges of loop closures, used where no registered pair replaces them: two views of one place from opposite
             sides overlap too little to be a pair.
-        rounds: greatest number of rounds.
+        rounds: maximum number of rounds.
     """
     pairs = partners(poses)
     part = parts(steady.joined(loops), len(poses))
@@ -648,7 +649,7 @@ def refine(keys: list[Keyframe], poses: Array, steady: Edges, loops: Edges, roun
 
 
 def _covered(loops: Edges, pair_edges: Edges) -> NDArray[np.bool_]:
-    """Which of ``loops`` have a registered pair within about four keyframes of both ends."""
+    """Whether each of ``loops`` has a registered pair within about four keyframes of both ends."""
     known = np.unique(_stretches(pair_edges.origin, pair_edges.target, 0, 0))
     result = np.zeros(len(loops), bool)
     for i, j in itertools.product((-1, 0, 1), repeat=2):
@@ -657,13 +658,13 @@ def _covered(loops: Edges, pair_edges: Edges) -> NDArray[np.bool_]:
 
 
 def _stretches(origin: NDArray[np.int64], target: NDArray[np.int64], i: int, j: int) -> NDArray[np.int64]:
-    """One number for the two stretches that an edge joins, shifted by ``i`` and ``j``."""
+    """Return one number for the two stretches that an edge joins, shifted by ``i`` and ``j``."""
     refine_stretch = 4  # keyframes within which a registered pair replaces the edge of a loop closure
     return np.asarray((origin // refine_stretch + i) * (1 << 32) + target // refine_stretch + j)
 
 
 def _linearised(keys: list[Keyframe], poses: Array, pairs: NDArray[np.int64], reach: float) -> Edges:
-    """One edge per overlapping pair: its pose after a Gauss-Newton step, and the information."""
+    """Return one edge per overlapping pair: its pose after a Gauss-Newton step, and the information."""
     places = between(poses[pairs[:, 0]], poses[pairs[:, 1]])
     measured, information, kept = np.zeros((len(pairs), 3)), np.zeros((len(pairs), 3, 3)), np.zeros(len(pairs), bool)
     for k, (i, j) in enumerate(pairs.tolist()):
@@ -671,7 +672,7 @@ def _linearised(keys: list[Keyframe], poses: Array, pairs: NDArray[np.int64], re
         if found < REFINE_OVERLAP * len(keys[j].scan):
             continue
         step = -np.linalg.solve(h + np.diag((1.0, 1.0, 1.0)), g)
-        refine_max_step = 0.2  # a pair whose Gauss-Newton step is longer than this, m, is left out of this round
+        refine_max_step = 0.2  # maximum Gauss-Newton step (m) of a pair that is used in this round
         if np.hypot(step[0], step[1]) > refine_max_step:
             continue
         measured[k], information[k], kept[k] = places[k] + step, h, True

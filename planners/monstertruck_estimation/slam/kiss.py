@@ -1,10 +1,10 @@
 """kiss-icp (Vizzo et al. 2023) for planar scans: its map and registration, a scan matcher, and a second opinion.
 
 All points are kept: the package's own second downsampling leaves too few of a planar scan. The matcher returns neither
-a score nor a failure, so every result is measured as ours are (overlap, residual, information) and passes the same
-gate. The second opinion is scan odometry on a map of its own. It shares nothing with the estimate but the points of the
-scans: no wheels, no submaps, no pose graph. Each guess is the motion before. It drifts, so only motions over some
-seconds are compared.
+a score nor a failure, so every result is measured like ours (overlap, residual, information) and passes the same gate.
+The second opinion is scan odometry with a separate map. It shares only the points of the scans with the estimate: no
+wheels, no submaps, no pose graph. Each guess is the previous motion. It drifts, so only motions over some seconds are
+compared.
 """
 
 import math
@@ -35,7 +35,7 @@ class KissMap:
         config.registration.max_num_threads = 1
         self._registration = get_registration(config)
         voxel = 0.1  # edge of the voxels of its map, m
-        max_distance = 100.0  # points of the map farther away are forgotten by the package, m
+        max_distance = 100.0  # distance beyond which the package forgets points of the map, m
         per_voxel = 20
         self._map = VoxelHashMap(voxel, max_distance, per_voxel)
 
@@ -44,18 +44,18 @@ class KissMap:
         self._map.clear()
 
     def add(self, points: Array) -> None:
-        """Take points, (n, 2), m."""
+        """Take points, (n, 2) (m)."""
         self._map.add_points(_spatial(points))
 
     def update(self, points: Array, pose: Array) -> None:
-        """Take the points, (n, 2), of a scan at ``pose``, (3,), and forget those that are far from it."""
+        """Take the points, (n, 2), of a scan at ``pose``, (3,), and forget those far from it."""
         self._map.update(_spatial(points), _matrix(pose))
 
     def align(self, points: Array, guess: Array) -> Array:
-        """Pose, (3,), of a scan; the guess where the map is empty. Not finite where the registration failed."""
+        """Return a scan's pose, (3,): the guess if the map is empty, not finite if the registration failed."""
         if self._map.empty():
             return guess
-        reach = 0.5  # greatest distance of a pair, m
+        reach = 0.5  # maximum distance of a pair, m
         found = self._registration.align_points_to_map(
             points=_spatial(points),
             voxel_map=self._map,
@@ -67,12 +67,12 @@ class KissMap:
 
 
 def _spatial(points: Array) -> Array:
-    """Points (n, 2) as points (n, 3) at height 0, m."""
+    """Return points (n, 2) as points (n, 3) at height 0 (m)."""
     return np.column_stack((points, np.zeros(len(points))))
 
 
 def _matrix(pose: Array) -> Array:
-    """A planar pose (3,), m and rad, as a homogeneous matrix (4, 4)."""
+    """Return a planar pose (3,) (m, rad) as a homogeneous matrix (4, 4)."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     result = np.eye(4)
     result[:2, :2] = (c, -s), (s, c)
@@ -81,7 +81,7 @@ def _matrix(pose: Array) -> Array:
 
 
 class KissMatcher:
-    """See ``ScanMatcher``; the map it registers to is the mapper's submap, so that loop closures move it too."""
+    """``ScanMatcher`` that registers to the mapper's submap, so that loop closures move its map, too."""
 
     def __init__(self) -> None:
         self._map = KissMap()
@@ -104,20 +104,20 @@ class KissMatcher:
 JUMPS: Final = frozenset({"closed", "joined", "found", "refuted"})
 """Events after which the estimate's next motion does not follow its last pose."""
 COMPARABLE: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED})
-"""Elsewhere the estimate says itself that it is in doubt, or in a corridor, where scans do not constrain the motion."""
+"""States with a reliable motion: in others the estimate is in doubt, or in a corridor that leaves it unconstrained."""
 
 
 class KissWitness:
-    """Compares the estimate's motion with that by kiss-icp alone."""
+    """Compare the estimate's motion with kiss-icp's alone."""
 
     def __init__(self) -> None:
         self._map = KissMap()
         self._pose, self._motion = np.zeros(3), np.zeros(3)
         self._poses: deque[tuple[int, Array, Array]] = deque()
-        """Stamp, pose by kiss-icp, pose of the estimate."""
+        """Stamp, pose by kiss-icp, pose by the estimate."""
 
     def compare(self, scan: Scan, estimate: SlamEstimate) -> float | None:
-        """Take a scan with the estimate of its pose; how far both motions are apart, m, if that is too much."""
+        """Take a scan with its estimated pose; return the difference of both motions (m) if it is too large."""
         guess = compose(self._pose, self._motion)
         pose = self._map.align(scan.points, guess)
         if not np.isfinite(pose).all():
@@ -134,7 +134,7 @@ class KissWitness:
         _, by_kiss, by_estimate = self._poses[0]
         off = between(between(by_kiss, pose), between(by_estimate, np.array(estimate.pose)))
         distance = math.hypot(off[0], off[1])
-        if distance <= 0.2:  # difference of those that is reported, m
+        if distance <= 0.2:  # maximum difference that is not reported, m
             return None
         self._poses.clear()
         return distance

@@ -1,8 +1,8 @@
-"""Localisation in a saved map: tracking by scan matching; the whole map is searched for a robot of unknown place.
+"""Localisation in a saved map: tracking by scan matching, and a search of the whole map if the place is unknown.
 
-What the search finds is compared with the whole map again over the next metres, and every match with the saved grid:
-a match that fits walls, but whose beams cross others, is none. Beams that end where the map knows nothing are not
-matched: at the edge of the map they count neither for a pose nor against it.
+The estimator checks the result of a search against the whole map over the next metres, and every match against the
+saved grid: it rejects a match that fits walls while its beams cross others. Beams that end in unknown cells are not
+matched: at the edge of the map they are no evidence for or against a pose.
 """
 
 import math
@@ -36,21 +36,21 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
 FOUND_COVARIANCE: Final = np.diag(np.square((0.05, 0.05, 0.02)))
-"""Covariance of a pose found by global localisation, m^2 and rad^2."""
+"""Covariance of a pose found by global localisation (m^2, rad^2)."""
 MATCH_COVARIANCE: Final = np.diag(np.square((0.02, 0.02, 0.01)))
-"""Covariance of a match itself, m^2 and rad^2."""
+"""Covariance of a match itself (m^2, rad^2)."""
 MAX_CONTRADICTION: Final = 0.3
-"""Greatest share of beams that contradict the saved grid of a match that counts: people and new furniture do, too."""
+"""Maximum share of a valid match's beams that contradict the saved grid, as people and new furniture do, too."""
 
 Predicted = tuple[Array, Array, Array]
-"""Pose by the predicted motion, shape (3,), and covariances, (3, 3): of the window of its match, and as published."""
+"""Pose predicted from motion, shape (3,), and its covariances, (3, 3): for the match window, and as published."""
 
 
 def submap_of(saved: SavedMap) -> Submap:
-    """All surfaces of a saved map.
+    """Return all surfaces of a saved map as a submap.
 
     Raises:
-        InputError: it has none.
+        InputError: the map has no surfaces.
     """
     if saved.graph is not None and saved.graph.scans:
         return Submap(Cloud.of(merged(saved.graph.scans, saved.graph.poses)))
@@ -61,12 +61,12 @@ def submap_of(saved: SavedMap) -> Submap:
 
 
 class LocalisationEstimator:
-    """An ``Estimator`` in a saved map.
+    """``Estimator`` that localises in a saved map.
 
     Args:
         saved: the map.
         config: noise models.
-        start: base in map, if known approximately; None = anywhere.
+        start: approximate pose of base in map; None if unknown.
     """
 
     def __init__(self, saved: SavedMap, config: MapperConfig, start: Pose2 | None = None) -> None:
@@ -78,19 +78,19 @@ class LocalisationEstimator:
         self._evidence = EvidenceGrid(saved.grid)
         self._global = self._search_anew() if start is None else None
         self._tracking = start is not None
-        """Whether the place is known; with a search under way it is being checked."""
+        """Whether the place is known; while a search runs, it is being checked."""
         self._checked = 0.0
-        """Distance since the place was found, m."""
+        """Distance travelled since the place was found (m)."""
         self._pose = np.array(start or (0.0, 0.0, 0.0))
         self._covariance = np.diag((0.2**2, 0.2**2, 0.1**2))
-        """Of the pose as the matches have it: of the window of the next one."""
+        """Covariance of the pose from the matches alone; it sets the window of the next match."""
         self._published_covariance = self._covariance
-        """That of the predicted motion where matches do not count, and along the weak direction of degenerate ones."""
+        """Published covariance: the predicted motion's for invalid matches and along a match's weak direction."""
         self._stamp: int | None = None
         self._misfits = 0
-        """Matches in a row that do not count."""
+        """Number of invalid matches in a row."""
         self._blind = False
-        """Whether the last match left a direction open."""
+        """Whether the last match was degenerate."""
         self._published = False
         self._offset = ClockOffsetEstimator()
         self._scan_odometry = ScanOdometry()
@@ -133,7 +133,7 @@ class LocalisationEstimator:
                 self._scan_odometry.forget()
         else:
             match, status = self._track(scan, delta, (guess, covariance, published), mount)
-            # By scans alone the first match behind a corridor makes up for an error there: that is no velocity.
+            # Without odometry, the first match after a corridor corrects the error made there: that is no velocity.
             blind, self._blind = self._blind, match.degenerate
             if not blind or match.degenerate or self.odometry is OdometryUse.USED:
                 self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
@@ -168,7 +168,7 @@ class LocalisationEstimator:
         return self._saved.graph
 
     def trajectory(self) -> None:
-        """See ``Estimator``: the poses were estimated one by one."""
+        """See ``Estimator``: None, because the poses were estimated one by one."""
 
     def on_map(self) -> None:
         """See ``Estimator``."""
@@ -188,19 +188,19 @@ class LocalisationEstimator:
         matched = self._matched_alone if alone else self._matched
         match, good = matched(scan, delta, predicted, mount)
         if not good:
-            # The predicted motion may be wrong: by a late odometry, or by stamps that are not those of the scans.
+            # The predicted motion may be wrong, from late odometry or from stamps that do not belong to the scans.
             before = compose(guess, inverse(delta)), *predicted[1:]
             still, good = matched(scan, np.zeros(3), before, mount)
-            # Half a fit near the prediction says more than scans alone do, but less than wheels.
+            # A partial fit near the prediction is better evidence than scans alone, but weaker than wheels.
             if good or (alone and _strayed(match, guess) and not _strayed(still, before[0])):
                 match, guess = still, before[0]
         if match.accepted and not good and (not alone or _strayed(match, guess)):
             match = rejected(guess, covariance, MatchStatus.FAR)
         place, turn = deviations(match.covariance)
-        # New obstacles lower the overlap; only a pose of large covariance is searched for.
+        # New obstacles lower the overlap: only a pose with a large covariance starts a search.
         self._misfits = 0 if good else self._misfits + 1
         self.counts["rejected"] += not match.accepted
-        # Standard deviation from which the robot is searched for on the whole map, m and rad.
+        # Standard deviation that starts a search of the whole map (m, rad).
         lost_deviation = (1.0, 0.5)
         if self._misfits >= 3 * LOST_AFTER or place > lost_deviation[0] or turn > lost_deviation[1]:
             self._global, self._tracking = self._search_anew(), False
@@ -210,7 +210,7 @@ class LocalisationEstimator:
         return match, LocalisationStatus.LOST if lost else status_of(match, LocalisationStatus.LOCALISED)
 
     def _matched_alone(self, scan: Scan, delta: Array, predicted: Predicted, mount: Pose2) -> tuple[ScanMatch, bool]:
-        """Match all beams, for the motion is known too badly to say which end on mapped ground."""
+        """Match all beams: the motion is not known well enough to select those that end on mapped ground."""
         match = self._front.match(scan, delta, *predicted[:2], self._submap)
         contradiction = self._evidence.judge(match.pose, scan.points, np.array(mount[:2])).contradiction
         if not (fits(match) and contradiction <= MAX_CONTRADICTION):
@@ -218,20 +218,20 @@ class LocalisationEstimator:
         return _without_weak_direction(match, predicted[0], predicted[2]), True
 
     def _matched(self, scan: Scan, delta: Array, predicted: Predicted, mount: Pose2) -> tuple[ScanMatch, bool]:
-        """Match the beams that end on mapped ground; whether the match counts."""
+        """Match the beams that end on mapped ground; return the match and whether it is valid."""
         guess, covariance, published = predicted
         sensor = np.array(mount[:2])
         mapped = self._evidence.judged(guess, scan.points, sensor)
         share = float(mapped.mean()) if len(mapped) else 0.0
-        if share < 0.65:  # least share of a scan's beams that end on mapped ground
+        if share < 0.65:  # minimum share of a scan's beams that end on mapped ground
             return rejected(guess, covariance, MatchStatus.EMPTY), False
-        whole = share >= 0.95  # share of beams on mapped ground from which on all beams are matched
+        whole = share >= 0.95  # minimum share of beams on mapped ground for matching all beams
         seen = scan if whole else scan.chosen(mapped)
         match = self._front.match(seen, delta, guess, covariance, self._submap)
         contradiction = self._evidence.judge(match.pose, seen.points, sensor).contradiction
-        # Least overlap of the beams on mapped ground where others do not end there, and of a match far from the motion.
+        # Minimum overlap of the beams on mapped ground if others end elsewhere, and of a match far from the motion.
         partial_overlap = 0.8
-        # Greatest share of these beams that contradict the saved grid: few walls fit in many places.
+        # Maximum share of these beams that contradict the saved grid: a few walls fit in many places.
         partial_contradiction = 0.15
         clear = match.overlap >= partial_overlap and contradiction <= partial_contradiction
         if _far(match.pose, guess, published):
@@ -251,17 +251,16 @@ class LocalisationEstimator:
         return rejected(guess, covariance, MatchStatus.EMPTY), status
 
     def _found(self, scan: Scan, pose: Array, mount: Pose2) -> tuple[ScanMatch, LocalisationStatus]:
-        """Track from ``pose``; the search goes on, as a check."""
+        """Track from ``pose``; the search continues as a check."""
         self._tracking, self._checked, self._misfits = True, 0.0, 0
         return self._track(scan, np.zeros(3), (pose, FOUND_COVARIANCE, FOUND_COVARIANCE), mount)
 
     def _refuted(self, pose: Array, found: Array | None, delta: Array) -> bool:
-        """Whether the check says that the robot is not at ``pose``; it ends when it has confirmed the place."""
+        """Whether the check refutes ``pose``; the check ends when it has confirmed the place."""
         assert self._global is not None
         self._checked += math.hypot(delta[0], delta[1])
         if (found is None or not _apart(pose, found)) and not self._global.outside:
-            # Distance after which the search that confirms a place found ends, and after which it ends without having
-            # done so, m.
+            # Distance after which the check ends (m): once it has confirmed the place, and without a confirmation.
             checked_way = (3.0, 9.0)
             if self._checked >= checked_way[0 if found is not None else 1]:
                 self._global = None
@@ -272,7 +271,7 @@ class LocalisationEstimator:
 
 
 def _without_weak_direction(match: ScanMatch, guess: Array, covariance: Array) -> ScanMatch:
-    """A degenerate match has its pose along the weak direction from ``guess``, whose ``covariance`` is that there."""
+    """Replace the pose of a degenerate match along its weak direction by ``guess`` with its ``covariance`` there."""
     if match.information is None or not match.degenerate:
         return match
     information = constrained(match, match.information)
@@ -281,10 +280,10 @@ def _without_weak_direction(match: ScanMatch, guess: Array, covariance: Array) -
 
 
 def _far(pose: Array, guess: Array, covariance: Array) -> bool:
-    """Whether ``pose`` is further from ``guess``, of ``covariance``, than its motion and a match can be."""
+    """Whether ``pose`` is further from ``guess`` than its ``covariance`` and a match's explain."""
     off = _difference(pose, guess)
     distance = math.sqrt(float(off @ np.linalg.solve(covariance + MATCH_COVARIANCE, off)))
-    far = 3.0  # standard deviations of the predicted pose from which a match is far from the motion
+    far = 3.0  # standard deviations of the predicted pose beyond which a match is far from the motion
     return distance > far or _apart(pose, guess)
 
 
@@ -295,17 +294,17 @@ def _difference(pose: Array, other: Array) -> Array:
 
 
 def _strayed(match: ScanMatch, guess: Array) -> bool:
-    """Whether a match is rejected, or not of the place where it began."""
+    """Whether a match is rejected or has left the place where it began."""
     return not match.accepted or _apart(match.pose, guess)
 
 
 def _apart(one: Array, other: Array) -> bool:
-    """Whether two poses are not of the same place."""
+    """Whether two poses are of different places."""
     off = between(one, other)
-    same_place = (0.5, 0.2)  # two poses are of the same place if they differ by less, m and rad
+    same_place = (0.5, 0.2)  # maximum difference of two poses of the same place (m, rad)
     return math.hypot(off[0], off[1]) > same_place[0] or abs(float(off[2])) > same_place[1]
 
 
 def patch_of(saved: SavedMap) -> GridPatch:
-    """The saved grid as it is published."""
+    """Return the saved grid in its published form."""
     return GridPatch(saved.grid.cells, saved.grid.origin, saved.grid.resolution)

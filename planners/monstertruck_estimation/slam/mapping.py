@@ -47,40 +47,40 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 
 UNKNOWN: Final = np.diag((100.0**2, 100.0**2, math.pi**2))
-"""Covariance of the pose of a robot that is lost."""
+"""Covariance of a lost robot's pose."""
 
 
 class MappingEvent(StrEnum):
-    """What happened at a step."""
+    """Event of a step."""
 
     KEY = "key"
     REJECTED = "rejected"
     CLOSED = "closed"
     PRUNED = "pruned"
     APART = "apart"
-    """The robot is lost: a submap that is not joined to the map was begun."""
+    """The robot is lost: a submap that is not joined to the map was started."""
     JOINED = "joined"
     """Two submaps were joined."""
     PARTED = "parted"
-    """Their join was wrong, and is undone."""
+    """Their join was wrong and is undone."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Where the robot is after one scan."""
+    """Result of one scan."""
 
     stamp: int
-    """ns, the scan's."""
+    """Stamp of the scan (ns)."""
     pose: Array
-    """Shape (3,): base in map. It jumps at a loop closure; use odom and the next field where it must not."""
+    """Base in map, shape (3,). It jumps at a loop closure; use odom and the next field where it must not."""
     map_from_odom: Array | None
-    """Shape (3,): pose of odom in map; None without odometry, and while lost."""
+    """Pose of odom in map, shape (3,); None without odometry, and while lost."""
     covariance: Array
-    """Shape (3, 3): of ``pose`` against the map around it; ``UNKNOWN`` while lost."""
+    """Covariance of ``pose`` against the map around it, shape (3, 3); ``UNKNOWN`` while lost."""
     match: ScanMatch
-    """Result of scan matching; its pose is that before a closure at this step."""
+    """Result of scan matching; its pose is from before a closure at this step."""
     scan: Scan
-    """The points as matched, deskewed."""
+    """Points as matched, deskewed."""
     events: tuple[MappingEvent, ...] = ()
 
 
@@ -134,12 +134,12 @@ class Mapper:
 
         Args:
             scan: points in base at ``stamp``, their motion distortion undone by odometry or by ``twist``.
-            stamp: ns; a scan that is not later than the one before is ignored (None).
-            odom: shape (3,), pose of base in odom at ``stamp``; None predicts from the motion so far.
+            stamp: stamp of the scan (ns); a scan not later than the previous one is ignored (None).
+            odom: pose of base in odom at ``stamp``, shape (3,); None predicts from the motion so far.
             again: prepares the same scan for another velocity of the base (vx, vy, wz; m/s, rad/s): without odometry
                 the scan is deskewed by the motion of its first match and matched a second time.
-            period: seconds of a revolution of a sensor that turns evenly, however unevenly its scans are stamped (by a
-                busy host, say); 0 = take stamps as they are.
+            period: time of a revolution of a sensor that turns evenly (s), however unevenly its scans are stamped (by
+                a busy host, say); 0 takes stamps as they are.
         """
         if self._stamp is not None and stamp <= self._stamp:
             return None
@@ -189,7 +189,7 @@ class Mapper:
         return self._motion.use
 
     def _best_match(self, scan: Scan, motion: tuple[Array, Array]) -> tuple[tuple[Array, Array], ScanMatch]:
-        """Match after the predicted ``motion``, or after the first of the other predictions of which one fits."""
+        """Match after the predicted ``motion``, or after the first of the other predictions with a fit."""
         match = self._matched(scan, *motion)
         if fits(match) or self._submap is None:
             return motion, match
@@ -200,7 +200,7 @@ class Mapper:
         return motion, match
 
     def _matched(self, scan: Scan, delta: Array, noise: Array) -> ScanMatch:
-        """Match ``scan`` after a motion ``delta`` of covariance ``noise``."""
+        """Match ``scan`` after a motion ``delta`` with covariance ``noise``."""
         guess, covariance = _moved(self._pose, self._covariance, delta, noise)
         if self._submap is None:
             return rejected(guess, covariance, MatchStatus.EMPTY)
@@ -221,7 +221,7 @@ class Mapper:
         return match
 
     def _led(self, match: ScanMatch, delta: Array, guess: Array, covariance: Array) -> bool:
-        """Whether ``match`` is where the wheels led: ``guess``, of ``covariance``."""
+        """Whether ``match`` is where the wheels led: at ``guess`` with its ``covariance``."""
         return match.accepted and self._motion.by_wheels(delta) and led_there(match, guess, covariance)
 
     def finish(self) -> bool:
@@ -241,15 +241,15 @@ class Mapper:
         return joint
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array]:
-        """Stamps (n,), ns, and poses (n, 3) of base in map at all scans, as the graph has them now."""
+        """Return stamps (n,) (ns) and poses (n, 3) of base in map at all scans, by the current graph."""
         return self._trajectory.poses(self.map.poses)
 
     def poses_at(self, stamps: NDArray[np.int64]) -> Array:
-        """Base in map at instants (n,), ns, as the graph has it now, (n, 3); NaN where it is not known."""
+        """Return base in map at instants (n,) (ns) by the current graph, (n, 3); NaN if unknown."""
         return self._trajectory.at(stamps, self.map.poses, self.map.joined())
 
     def on_map(self) -> NDArray[np.bool_]:
-        """Which scans of ``trajectory``, shape (n,), belong to the map, not to a submap that is not joined to it."""
+        """Whether each scan of ``trajectory`` belongs to the map, not to a submap that is not joined to it; (n,)."""
         return self._trajectory.marked(self.map.joined())
 
     def _key_is_due(self, scan: Scan) -> bool:
@@ -262,23 +262,23 @@ class Mapper:
         return self._has_moved(self._pose)
 
     def _has_moved(self, pose: Array) -> bool:
-        """Whether ``pose``, shape (3,), is as far from the newest keyframe as the next one."""
+        """Whether ``pose``, shape (3,), is a keyframe's distance away from the latest keyframe."""
         return self._key_share(between(self.map.poses[-1], pose)) >= 1.0
 
     def _key_share(self, moved: Array) -> float:
-        """The motion ``moved``, shape (3,), as a share of that between keyframes."""
+        """Return the motion ``moved``, shape (3,), as a share of the motion between keyframes."""
         way, turned = math.hypot(moved[0], moved[1]), abs(float(moved[2]))
         return max(way / self.config.key_distance, turned / self.config.key_turn)
 
     def _is_elsewhere(self, scan: Scan) -> bool:
-        """Whether a lost robot is not where its motion since the last fit led it."""
+        """Whether a lost robot has left the place where its motion since the last fit led it."""
         if not len(self.map) or len(scan) < MIN_PAIRS or not self._loss.lost:
             return False
         alone = self._motion.use is not OdometryUse.USED
         return alone or self._loss.after_gap or contradicts(self.map, scan, self._pose)
 
     def _begin_submap(self, scan: Scan, stamp: int) -> tuple[MappingEvent, ...]:
-        """Begin a submap of the scans since the first misfit; joins in doubt are undone: they may be wrong."""
+        """Start a submap from the scans since the first misfit; undo joins in doubt, as they may be wrong."""
         place = between(self.map.poses[-1], self._pose)
         change = self._relocation.part(self.map, self._closer)
         if change is not None:
@@ -292,13 +292,13 @@ class Mapper:
         return () if change is None else (MappingEvent(change),)
 
     def _searched(self) -> tuple[MappingEvent, ...]:
-        """Continue the searches for loops and for the places of submaps, as far as the budget goes."""
+        """Continue the searches for loops and for the places of submaps within the budget."""
         if not len(self.map):
             return ()
         poses, place = self.map.poses, between(self.map.poses[-1], self._pose)
         events: tuple[MappingEvent, ...] = ()
         budget = ScanBudget()
-        # One search at a time: neither must see the other move the poses.
+        # One search at a time: the poses must not move during a search.
         if not self._relocation.busy and self._closer.step(self.map, budget):
             events += (MappingEvent.CLOSED,)
         if not self._closer.busy and (change := self._relocation.step(self.map, self._closer, budget)) is not None:
@@ -309,7 +309,7 @@ class Mapper:
         return events
 
     def _extend(self, scan: Scan, stamp: int, match: ScanMatch) -> tuple[MappingEvent, ...]:
-        """Add the scan as a keyframe with its edges, have loops searched for from it, prune the map."""
+        """Add the scan as a keyframe with its edges, start a search for loops from it, and prune the map."""
         events: tuple[MappingEvent, ...] = (MappingEvent.KEY,)
         self.map.add(scan, stamp, self._pose)
         if not self._loss.fits:
@@ -339,71 +339,71 @@ class Mapper:
 
 
 def fits(match: ScanMatch) -> bool:
-    """Whether the scan fits the map without a doubt."""
+    """Whether the scan clearly fits the map."""
     return match.accepted and match.overlap >= LOW_OVERLAP
 
 
 def _evenly(dt: float, period: float) -> float:
-    """``dt`` as the nearest number of whole revolutions."""
+    """Return ``dt`` rounded to whole revolutions."""
     return dt if period <= 0 else max(round(dt / period), 1) * period
 
 
 def _moved(pose: Array, covariance: Array, delta: Array, noise: Array) -> tuple[Array, Array]:
-    """Pose and covariance after a motion ``delta`` of covariance ``noise``."""
+    """Return pose and covariance after a motion ``delta`` with covariance ``noise``."""
     by_pose, by_delta = compose_jacobians(pose, delta)
     return compose(pose, delta), by_pose @ covariance @ by_pose.T + by_delta @ noise @ by_delta.T
 
 
 LOST_AFTER: Final = 10
-"""Scans in a row that do not fit, after which the robot is lost."""
+"""Number of misfits in a row after which the robot is lost."""
 
 
 class Estimator(Protocol):
-    """Mapping, or localisation in a saved map, as the worker runs it."""
+    """Mapping, or localisation in a saved map, as run by the worker."""
 
     counts: dict[str, int]
-    """Scans, keyframes, closures, rejected matches."""
+    """Numbers of scans, keyframes, closures, rejected matches."""
 
     @property
     def twist(self) -> Twist2:
-        """Velocity of base by the last scans, m/s and rad/s."""
+        """Velocity of base by the last scans (m/s, rad/s)."""
 
     @property
     def odometry(self) -> OdometryUse:
         """Whether the motion between scans is predicted by odometry."""
 
     def step(self, scan: Scan, inputs: ScanInput) -> SlamEstimate | None:
-        """Take a scan; None if it is not later than the one before."""
+        """Take a scan; return None if it is not later than the previous one."""
 
     def changes(self) -> tuple[list[GridPatch], bool]:
-        """Tiles that have changed since the last call, and whether the grid was rebuilt."""
+        """Return the tiles changed since the last call, and whether the grid was rebuilt."""
 
     def patch(self) -> GridPatch:
-        """The whole grid."""
+        """Return the whole grid."""
 
     def graph(self) -> SavedGraph | None:
-        """The pose graph to save with the grid; None without one."""
+        """Return the pose graph to save with the grid; None without one."""
 
     def trajectory(self) -> tuple[NDArray[np.int64], Array] | None:
-        """Stamps (n,), ns, and poses (n, 3) of base in map at all scans; None in a saved map."""
+        """Return stamps (n,) (ns) and poses (n, 3) of base in map at all scans; None in a saved map."""
 
     def on_map(self) -> NDArray[np.bool_] | None:
-        """Which of these scans, (n,), belong to the map, not to a submap apart; None in a saved map."""
+        """Whether each of these scans, (n,), belongs to the map, not to a separate submap; None in a saved map."""
 
     def poses_at(self, stamps: NDArray[np.int64]) -> Array | None:
-        """Base in map at instants (n,), ns: (n, 3), NaN where it is not known; None in a saved map."""
+        """Return base in map at instants (n,) (ns): (n, 3), NaN if unknown; None in a saved map."""
 
     def finish(self) -> bool:
-        """Optimise everything jointly; False if the result was not kept."""
+        """Optimise everything jointly; return False if the result was not kept."""
 
 
 class MappingEstimator:
-    """The mapper with its grid.
+    """Mapper with its grid.
 
     Args:
         mapper: noise models and limits.
-        grid: of the occupancy grid.
-        front: scan front end; None = the default one.
+        grid: settings of the occupancy grid.
+        front: scan front end; None for the default.
         start: base in map at the first scan.
         body: see ``GridBuilder``.
     """
@@ -422,7 +422,7 @@ class MappingEstimator:
         self._apart: list[tuple[Scan, int, Pose2]] = []
         """Keyframes that are not on the map: scan, stamp, mount."""
         self._doubtful: list[tuple[Scan, int, Pose2]] = []
-        """Those on it by a join that is in doubt."""
+        """Keyframes on the map by a join that is in doubt."""
         self._offset = ClockOffsetEstimator()
         self._scan_odometry = ScanOdometry()
 
@@ -534,7 +534,7 @@ class MappingEstimator:
             (self._doubtful if on_map[k] else self._apart).append((scan, stamp, mount))
 
     def _withdraw_parted(self) -> None:
-        """Take what a wrong join had brought to the map out of the grid."""
+        """Remove the contributions of a wrong join from the grid."""
         stamps, _ = self.mapper.trajectory()
         on_map = self.mapper.on_map()
         self._apart += [row for row in self._doubtful if not on_map[np.searchsorted(stamps, row[1])]]
@@ -548,7 +548,7 @@ class MappingEstimator:
 
 
 def status_of(match: ScanMatch, good: LocalisationStatus) -> LocalisationStatus:
-    """``good``, or DEGENERATE if the match does not constrain one direction."""
+    """Return ``good``, or DEGENERATE if the match does not constrain one direction."""
     return LocalisationStatus.DEGENERATE if match.accepted and match.degenerate else good
 
 
@@ -562,7 +562,7 @@ def estimate(
     moved: ScanIncrement | None = None,
     odometry: OdometryUse = OdometryUse.NONE,
 ) -> SlamEstimate:
-    """Plain numbers of a match; ``placed`` are pose, covariance and odom in map."""
+    """Return plain numbers of a match; ``placed`` are pose, covariance and odom in map."""
     pose, covariance, correction = placed
     return SlamEstimate(
         stamp=stamp,
@@ -583,6 +583,6 @@ def estimate(
 
 
 def plain(pose: Any) -> Pose2:
-    """A pose as three floats."""
+    """Return a pose as three floats."""
     x, y, yaw = (float(value) for value in pose)
     return x, y, yaw

@@ -17,11 +17,11 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import OdometryUse
 
 NOISE_MEMORY: Final = 40
-"""Scans over which the noise of odometry, and of the motion predicted without it, is estimated."""
+"""Number of scans over which the noise of odometry, and of the motion predicted without it, is estimated."""
 
 
 def velocity(delta: Array, dt: float) -> Twist2:
-    """Velocity in base (vx, vy, wz; m/s, rad/s) of the motion ``delta``, shape (3,), in ``dt`` s; 0 if dt is."""
+    """Return the velocity in base (vx, vy, wz; m/s, rad/s) of ``delta``, shape (3,), in ``dt`` s; 0 if ``dt`` is 0."""
     if dt <= 0:
         return 0.0, 0.0, 0.0
     vx, vy, wz = (delta / dt).tolist()
@@ -29,27 +29,27 @@ def velocity(delta: Array, dt: float) -> Twist2:
 
 
 FEWEST_SAMPLES: Final = 2
-"""Fewest steps of a comparison."""
+"""Minimum number of steps of a comparison."""
 SLACK: Final = (0.1, 0.2)
-"""Tolerated difference for an offset of the clocks, and its largest value with that of crossed motion, m and rad."""
+"""Tolerated difference for an offset of the clocks, and its maximum including crossed motion (m, rad)."""
 CONTRADICTIONS: Final = 2
-"""Comparisons in a row that contradict odometry before it is dropped, by their last scans and by their first ones: one
-scan with a late stamp contradicts nothing, wherever it lies."""
+"""Number of comparisons in a row that must contradict odometry, by their last and by their first scans, before it is
+dropped: one scan with a late stamp contradicts nothing, wherever it lies."""
 
 
 class OdometryCheck:
-    """Compares distances and turns by odometry with those by the scans, which are independent of the wheels.
+    """Compare distances and turns by odometry with the scans', which are independent of the wheels.
 
     The differences of their motions are summed over some seconds: clocks that disagree shift both a little and change
-    no sum. A slow robot's are compared over as much motion as a fast one's: within seconds alone its error would not
-    exceed ``SLACK``. What was contradicted, ways or turns, must agree step by step over 2 m or 2 rad before odometry
-    counts again: a turn of the wrong sign agrees as long as the robot drives straight. Where ways are contradicted,
-    turns count on if they agree over all that was compared, and the reverse.
+    no sum. A slow robot is compared over as much motion as a fast one: within seconds alone its error would not exceed
+    ``SLACK``. A contradicted quantity, distances or turns, must agree step by step over 2 m or 2 rad before odometry is
+    used again: a turn of the wrong sign agrees as long as the robot drives straight. If distances are contradicted,
+    turns remain in use while they agree over everything compared, and the reverse.
     """
 
     def __init__(self) -> None:
         self._steps: deque[Array] = deque()
-        """Seconds, motion by odometry and by the scans, whether these measured the way; shape (8,)."""
+        """Seconds, motion by odometry and by scans, and whether the scans measured the distance; shape (8,)."""
         self._odom, self._scans, self._seconds = np.zeros(3), np.zeros(3), 0.0
         self._seen = True
         self._row = 0
@@ -57,29 +57,29 @@ class OdometryCheck:
         self._kept = np.ones(2, bool)
         self._agreed = np.zeros((2, 2))
         self.since = 0.0
-        """Seconds before the newest scan from which on odometry is contradicted."""
+        """Start of the contradiction, in seconds before the latest scan."""
 
     @property
     def contradicted(self) -> bool:
-        """Whether ways or turns by odometry are wrong."""
+        """Whether distances or turns by odometry are wrong."""
         return bool(self._wrong.any())
 
     @property
     def kept(self) -> tuple[bool, bool]:
-        """Whether its ways, and its turns, are used even so."""
+        """Whether its distances, and its turns, are still used."""
         way, turn = self._kept.tolist()
         return way, turn
 
     def add(self, dt: float, odom: Array, moved: Array, *, seen: bool = True) -> None:
         """Take the motions in base over ``dt`` seconds, shape (3,), by odometry and by the scans.
 
-        Where the scans have not ``seen`` the way (a corridor), it contradicts nothing, and agrees with nothing.
+        If the scans have not ``seen`` the distance (a corridor), it neither contradicts nor agrees with anything.
         """
         self._seconds += dt
         self._odom, self._scans = compose(self._odom, odom), compose(self._scans, moved)
         self._seen &= seen
         step = np.array((self._seconds, *self._odom, *self._scans, self._seen))
-        # Least length of a step of the comparison, s and motion: the noise of single matches would add up to a
+        # Minimum length of a comparison step, in seconds and motion: the noise of single matches would add up to a
         # distance.
         sample = (0.25, 0.1)
         if self._seconds < sample[0] or _motion(step) < sample[1]:
@@ -92,7 +92,7 @@ class OdometryCheck:
             self._judge()
 
     def interrupt(self, dt: float) -> None:
-        """Over ``dt`` seconds there is nothing to compare, and the next motion does not follow the last one."""
+        """Skip ``dt`` seconds without a comparison; the next motion does not follow the last one."""
         self._odom, self._scans, self._seconds, self._seen = np.zeros(3), np.zeros(3), self._seconds + dt, True
 
     def _long_enough_without_oldest(self) -> bool:
@@ -101,14 +101,14 @@ class OdometryCheck:
         return sum(float(step[0]) for step in later) > compared[0] and sum(map(_motion, later)) > compared[1]
 
     def _judge(self) -> None:
-        """Compare over the last ``FEWEST_SAMPLES`` and more steps; drop odometry, or take it back."""
+        """Compare over at least the last ``FEWEST_SAMPLES`` steps; drop odometry, or use it again."""
         rows = np.array(self._steps)[::-1]
         differences = np.cumsum(rows[:, 1:4] - rows[:, 4:7], axis=0)
         off = np.stack((np.hypot(differences[:, 0], differences[:, 1]), np.abs(differences[:, 2])), axis=1)
         lengths = np.stack((_lengths(rows[:, 1:4]), _lengths(rows[:, 4:7])))
         seen = np.stack((rows[:, 7], np.ones(len(rows))), axis=1)
         motion = np.cumsum(lengths, axis=1).max(axis=0)
-        # Tolerated difference of the distance per radian, m, and of the turn per metre, rad: levers, unequal wheels.
+        # Tolerated difference of the distance per radian (m), and of the turn per metre (rad): levers, unequal wheels.
         crossed = 0.1
         slack = np.minimum(SLACK[0] + crossed * motion[:, ::-1], SLACK[1])
         tolerance = 0.3  # tolerated difference of odometry and scans as a share of the distance, or of the turn
@@ -118,7 +118,7 @@ class OdometryCheck:
         if self._row >= CONTRADICTIONS:
             if not self.contradicted:
                 self.since = float(rows[:, 0].sum())
-                # Wheels that say nothing agree with nothing.
+                # Wheels without information agree with nothing.
                 self._kept = off[-1] < tolerance * (lengths * seen).sum(axis=1).min(axis=0)
             self._wrong |= wrong
             self._kept &= ~wrong
@@ -138,21 +138,21 @@ class OdometryCheck:
 
 
 def _lengths(motions: Array) -> Array:
-    """Ways and turns, m and rad, shape (..., 2), of motions, shape (..., 3)."""
+    """Return distances and turns (m, rad), shape (..., 2), of motions, shape (..., 3)."""
     return np.stack((np.hypot(motions[..., 0], motions[..., 1]), np.abs(motions[..., 2])), axis=-1)
 
 
 def _motion(step: Array) -> float:
-    """Distance or turn, m or rad, of a step by odometry or the scans: what is most."""
+    """Return the largest distance or turn (m or rad) of a step by odometry or the scans."""
     return float(max(_lengths(step[1:4]).max(), _lengths(step[4:7]).max()))
 
 
 class LastMotionPredictor:
-    """Predicts the motion between two scans from the last ones, without odometry.
+    """Predict the motion between two scans from the last ones, without odometry.
 
-    Either the velocity lasts, or the motion from scan to scan: a busy host stamps scans that were made evenly in
-    bursts, none for a second and then some at once, or in the wrong order; over the times between such stamps a steady
-    robot would stand and leap. The motion from scan to scan is used where its errors were clearly smaller.
+    The prediction keeps either the velocity or the motion from scan to scan. A busy host stamps evenly made scans in
+    bursts, none for a second and then several at once, or in the wrong order; by such stamps, a steady robot would
+    stand and leap. The motion from scan to scan is used if its errors were clearly smaller.
 
     Args:
         config: initial noise.
@@ -161,27 +161,27 @@ class LastMotionPredictor:
     def __init__(self, config: MapperConfig) -> None:
         self._config = config
         self._times: deque[float] = deque(maxlen=NOISE_MEMORY)
-        steps = 3  # motions of which the median is the one that lasts from scan to scan
+        steps = 3  # number of motions whose median is kept from scan to scan
         self._steps: deque[tuple[float, Array]] = deque(maxlen=steps)
         self._predictions = np.zeros((2, 3))
-        """By the velocity, and from scan to scan."""
+        """Predictions by the velocity, and from scan to scan."""
         self._errors = np.zeros(2)
-        """Their mean squares; a radian counts as a metre."""
+        """Mean squares of their errors; a radian weighs as much as a metre."""
         self._accepted = False
 
     def predict(self, dt: float) -> tuple[Array, Array]:
-        """Motion in base over the next ``dt`` seconds, and its covariance (3, 3)."""
+        """Return the motion in base over the next ``dt`` seconds, and its covariance (3, 3)."""
         self._times.append(dt)
         if self._steps:
             before, last = self._steps[-1]
-            max_stretch = 3.0  # greatest factor by which a pause makes a motion longer than the last one
+            max_stretch = 3.0  # maximum factor by which a pause lengthens the last motion
             lasting = last * (min(dt / before, max_stretch) if before > 0 else 0.0)
             self._predictions = np.stack((lasting, np.median([step for _, step in self._steps], axis=0)))
-        # Share of the mean squared error of the prediction by velocity below which that from scan to scan is used: half
+        # Maximum share of the velocity's mean squared error for using the motion from scan to scan: half
         # as far off.
         clearly = 0.25
         from_scan_to_scan = bool(self._errors[1] < clearly * self._errors[0])
-        # Where stamps are no measure of the time, the usual time has passed at least.
+        # If stamps do not measure the time, at least the usual time has passed.
         seconds = max(dt, sum(self._times) / len(self._times)) if from_scan_to_scan else dt
         place = self._config.odometry_floor[0] + self._config.blind_speed[0] * seconds
         turn = self._config.odometry_floor[1] + self._config.blind_speed[1] * seconds
@@ -190,7 +190,7 @@ class LastMotionPredictor:
     def learn(self, dt: float, moved: Array, match: ScanMatch) -> None:
         """Take the motion ``moved``, shape (3,), in ``dt`` seconds by the match."""
         before, self._accepted = self._accepted, match.accepted
-        # The first motion after a misfit makes up for what was predicted wrongly at it.
+        # The first motion after a misfit corrects the wrong prediction at the misfit.
         if not (before and match.accepted):
             return
         if self._steps and _is_clear(match):
@@ -200,16 +200,16 @@ class LastMotionPredictor:
 
 
 def _is_clear(match: ScanMatch) -> bool:
-    """Whether a match says what the motion was, without the prediction's help."""
-    clear_match = (0.15, 0.75)  # least degeneracy and overlap of a match that is compared with odometry
+    """Whether a match measures the motion without the prediction's help."""
+    clear_match = (0.15, 0.75)  # minimum degeneracy and overlap of a match that is compared with odometry
     return match.degeneracy >= clear_match[0] and match.overlap >= clear_match[1]
 
 
 class MotionPredictor:
-    """Predicts the motion between two scans, adapts the noise of odometry to the matches, and drops wrong odometry.
+    """Predict the motion between two scans, adapt the noise of odometry to the matches, and drop wrong odometry.
 
     Wheels slip, and many logs stamp odometry and scans by different clocks; no constant fits all. The factors
-    follow the root mean square of the innovations (adaptive Kalman filtering, Mehra 1972), of ways and of turns.
+    follow the root mean square of the innovations (adaptive Kalman filtering, Mehra 1972), of distances and of turns.
 
     Args:
         config: initial noise.
@@ -247,10 +247,10 @@ class MotionPredictor:
 
     @property
     def others(self) -> tuple[tuple[Array, Array], ...]:
-        """The predictions that ``predict`` did not choose, and their covariances; none without odometry.
+        """Return the predictions that ``predict`` did not choose, and their covariances; none without odometry.
 
-        That by the scans' own motion is always among all of them: wheels of which only ways or turns count may still
-        be wrong at one scan, and would then lose a robot that scans alone do not lose.
+        The scans' own motion is always among all the predictions: wheels with only valid distances or only valid turns
+        may still be wrong at one scan, and would then lose a robot that scans alone do not lose.
         """
         if self._by_odometry is None:
             return ()
@@ -259,12 +259,12 @@ class MotionPredictor:
         return (self._by_motion, self._by_odometry) if any(self.check.kept) else (self._by_odometry,)
 
     def by_wheels(self, delta: Array) -> bool:
-        """Whether the motion ``delta``, shape (3,), is that by odometry, and nothing contradicts it."""
+        """Whether ``delta``, shape (3,), is the motion by odometry, and nothing contradicts it."""
         return self.use is OdometryUse.USED and self._by_odometry is not None and delta is self._by_odometry[0]
 
     @property
     def odom(self) -> Array | None:
-        """Newest pose of base in odom."""
+        """Latest pose of base in odom."""
         return self._odom
 
     @property
@@ -273,7 +273,7 @@ class MotionPredictor:
         return velocity(self._delta, self._dt)
 
     def predict(self, dt: float, odom: Array | None) -> tuple[Array, Array]:
-        """Motion in base over the last ``dt`` seconds, and its covariance (3, 3)."""
+        """Return the motion in base over the last ``dt`` seconds, and its covariance (3, 3)."""
         config = self._config
         now = None if odom is None or not np.isfinite(odom).all() else np.array(odom, dtype=float)
         self._given |= odom is not None
@@ -295,7 +295,7 @@ class MotionPredictor:
         return np.where(kept, self._by_odometry[0], motion), np.where(kept, self._by_odometry[1], noise)
 
     def _noise(self, delta: Array) -> Array:
-        """Covariance, shape (3, 3), of the motion ``delta`` by odometry."""
+        """Return the covariance, shape (3, 3), of the motion ``delta`` by odometry."""
         config, (by_turn, by_way) = self._config, self._config.odometry_turn
         way, turned = math.hypot(delta[0], delta[1]), abs(float(delta[2]))
         place = self.factors[0] * math.hypot(config.odometry_floor[0], config.odometry_distance * way)
@@ -303,10 +303,10 @@ class MotionPredictor:
         return np.diag((place**2, place**2, turn**2))
 
     def off(self, moved: Array) -> tuple[float, float] | None:
-        """How far ``moved``, shape (3,), is from the motion by odometry, or as the last one, whichever is nearer.
+        """Return the difference of ``moved``, shape (3,), from odometry or from the last motion, if that is nearer.
 
         Returns:
-            m and rad beyond two standard deviations of odometry; None where it is not in use.
+            Difference beyond two standard deviations of odometry (m, rad); None if odometry is not in use.
         """
         if self.use is not OdometryUse.USED or self._by_odometry is None:
             return None
@@ -321,7 +321,7 @@ class MotionPredictor:
         self._dt, self._delta = dt, moved
         self._alone.learn(dt, moved, match)
         fitted, self._fitted = self._fitted, match.accepted and match.overlap >= LOW_OVERLAP
-        # The first motion after a misfit makes up for what was predicted wrongly at it.
+        # The first motion after a misfit corrects the wrong prediction at the misfit.
         if self._by_odometry is None or not (fitted and self._fitted):
             self.check.interrupt(dt)
             return
@@ -343,7 +343,7 @@ class MotionPredictor:
 UNCONSTRAINED: Final = np.diag((1e-4, 1e-4, 1e-2))
 """Added to every information: an unconstrained direction has a standard deviation of 100 m, or of 10 rad."""
 OVERLAP_DROP: Final = 0.15
-"""After a rejected match the overlap must return to the running mean less this."""
+"""Maximum distance of the overlap below its running mean for a valid match after a rejected one."""
 OVERLAP_GAIN: Final = 0.05
 """Weight of one match in the running mean of the overlap."""
 
@@ -351,9 +351,9 @@ OVERLAP_GAIN: Final = 0.05
 class ScanOdometry:
     """Scan odometry: the motion between successive matches, by the scans alone.
 
-    With odometry only matches of good overlap give a motion, and none is given across a rejected match: the robot may
-    have been carried, and a half fit at a wrong place must not count before the overlap is back to its mean. Without
-    odometry rejected matches are skipped, and every accepted one counts.
+    With odometry, only matches of good overlap give a motion, and none is given across a rejected match: the robot may
+    have been carried, and a partial fit at a wrong place must not be used before the overlap is back at its mean.
+    Without odometry, rejected matches are skipped, and every accepted one is used.
     """
 
     def __init__(self) -> None:
@@ -365,12 +365,12 @@ class ScanOdometry:
     def take(
         self, stamp: int, match: ScanMatch, pose: Array, *, alone: bool, corrected: bool = False
     ) -> ScanIncrement | None:
-        """The motion since the last match that was used; None if this one is not.
+        """Return the motion since the last match that was used; None if this one is not.
 
         Args:
-            stamp: of the scan, ns.
+            stamp: stamp of the scan (ns).
             match: result of scan matching; its covariance includes the prediction, its information does not.
-            pose: shape (3,), pose after the step, in which a loop may have been closed.
+            pose: pose after the step, in which a loop may have been closed, shape (3,).
             alone: there is no odometry.
             corrected: a loop closure moved the map at this step: the next motion begins at ``pose``.
         """
@@ -388,7 +388,7 @@ class ScanOdometry:
         turn = np.eye(3)
         turn[:2, :2] = rotation(-match.pose[2])
         covariance = turn @ np.linalg.inv(constrained(match, match.information) + UNCONSTRAINED) @ turn.T
-        match_floor = (0.002, 0.001)  # least standard deviation of a match, m and rad
+        match_floor = (0.002, 0.001)  # minimum standard deviation of a match, m and rad
         covariance = (covariance + covariance.T) / 2 + np.diag(
             np.square((match_floor[0], match_floor[0], match_floor[1]))
         )
@@ -396,12 +396,12 @@ class ScanOdometry:
         return ScanIncrement(since, (x, y, yaw), tuple(covariance.ravel().tolist()))
 
     def forget(self) -> None:
-        """Start again: the next match has no predecessor."""
+        """Restart: the next match has no predecessor."""
         self._last, self._least = None, LOW_OVERLAP
 
 
 def constrained(match: ScanMatch, information: Array) -> Array:
-    """``information`` of a match, shape (3, 3), without its component along the weak direction if it is degenerate.
+    """Return the ``information``, shape (3, 3), of a match; if degenerate, without its weak direction's component.
 
     That component comes from the ends of the visible walls, which move along with the robot.
     """
@@ -413,26 +413,26 @@ def constrained(match: ScanMatch, information: Array) -> Array:
 
 
 OFFSET_LEAST_SCANS: Final = 120
-"""Fewest scans."""
+"""Minimum number of scans."""
 LEAST_EXCITATION: Final = 0.05
-"""Least standard deviation of the yaw rate, rad/s."""
+"""Minimum standard deviation of the yaw rate (rad/s)."""
 
 
 class ClockOffsetEstimator:
-    """Estimates a constant offset between the clocks of odometry and scans, as logs with badly stamped wheels have it.
+    """Estimate a constant offset between the clocks of odometry and scans, as found in logs with badly stamped wheels.
 
-    The yaw rate by the matches is correlated with that of odometry at shifted times; the lag of the best correlation is
-    the offset. Only the yaw takes part: both measure it best.
+    The yaw rate of the matches is correlated with odometry's yaw rate at shifted times; the lag of the best
+    correlation is the offset. Only the yaw is used: both measure it best.
     """
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[int, float, float]] = deque(maxlen=300)  # scans compared
+        self._samples: deque[tuple[int, float, float]] = deque(maxlen=300)  # number of scans compared
         self._seen = 0
         self.offset: float | None = None
-        """Seconds by which odometry runs ahead of the scans; None = not known, or none."""
+        """Lead of odometry over the scans (s); None if unknown or zero."""
 
     def add(self, stamp: int, matched: float, odom: float) -> None:
-        """Take the yaw of an accepted match and that of odometry, both rad at ``stamp``, ns; not finite: ignored."""
+        """Take the yaw of an accepted match and of odometry (rad) at ``stamp`` (ns); ignore them unless finite."""
         if not math.isfinite(odom):
             return
         self._samples.append((stamp, matched, odom))
@@ -443,12 +443,12 @@ class ClockOffsetEstimator:
 
 
 def find_offset(stamps: Array, matched: Array, odom: Array) -> float | None:
-    """Seconds by which ``odom`` runs ahead of ``matched``; None if there is no clear offset.
+    """Return the lead of ``odom`` over ``matched`` (s); None without a clear offset.
 
     Args:
-        stamps: shape (n,), ns, rising.
-        matched: shape (n,), yaw by the scans, rad.
-        odom: shape (n,), yaw by the wheels, rad.
+        stamps: rising stamps, shape (n,) (ns).
+        matched: yaw by the scans, shape (n,) (rad).
+        odom: yaw by the wheels, shape (n,) (rad).
     """
     times = (stamps - stamps[0]) / SECOND
     wheel, scan = np.unwrap(odom), np.unwrap(matched)
@@ -463,8 +463,8 @@ def find_offset(stamps: Array, matched: Array, odom: Array) -> float | None:
     best, still = int(np.argmax(likeness)), likeness[np.argmin(np.abs(offset_lags))]
     if (
         abs(offset_lags[best]) < 0.09  # smaller offsets are within the noise, s
-        or likeness[best] < 0.8  # least correlation at the offset
-        or likeness[best] - still < 0.08  # how much better it must be than at zero
+        or likeness[best] < 0.8  # minimum correlation at the offset
+        or likeness[best] - still < 0.08  # minimum gain over zero offset
     ):
         return None
     return -float(offset_lags[best])

@@ -1,4 +1,4 @@
-"""Localisation by a program off board: pose in map from odometry and the corrections that clients send."""
+"""Off-board localisation: pose in map from odometry and the corrections that clients send."""
 
 import asyncio
 
@@ -25,10 +25,10 @@ from monstertruck_schemas.state import GateState, Odometry, Transform
 
 
 class OutsideLocalisation:
-    """Follows odometry by the newest correction of one client, which must renew it within its lease.
+    """Follow odometry with the latest correction of one client, which must renew it within its lease.
 
-    Requests are examined as those for driving are: nonce, sequence, age and role of the sender. While the lease of one
-    source runs, corrections of others are refused. Without corrections the pose goes on by odometry and counts as lost.
+    Requests are checked like drive requests: nonce, sequence, age and role of the sender. While one source's lease
+    runs, corrections of others are refused. Without corrections the pose continues by odometry with status lost.
 
     Args:
         config: slew, jump and deviation.
@@ -38,8 +38,8 @@ class OutsideLocalisation:
         odometry: pose in odom.
         pose: ``state/pose``.
         health: ``health/slam``.
-        events: where refusals, and pose lost and found, are reported.
-        max_age: see ``GateConfig.max_request_age``, s.
+        events: receives refusals, and pose lost and found.
+        max_age: see ``GateConfig.max_request_age`` (s).
     """
 
     name = ServiceName.SLAM.value
@@ -67,18 +67,18 @@ class OutsideLocalisation:
         self._covariance = np.diag((deviation**2, deviation**2, turn**2)).ravel()
         self._latest: Odometry | None = None
         self._corrected_at: Odometry | None = None
-        """Odometry at the newest correction."""
+        """Odometry at the latest correction."""
         self._source, self._until = "", 0
-        """Client that localises, and the end of its lease, ns."""
+        """Client that localises, and the end of its lease (ns)."""
         self._status = LocalisationStatus.SEARCHING
         self._corrections = 0
         self._refused = 0
         self._said: dict[Reason, int] = {}
-        """When a refusal was reported last, ns, by reason."""
+        """Time of the last report of a refusal (ns), by reason."""
         self._due = 0
 
     def frames(self) -> tuple[Transform, ...]:
-        """Odom in map as published."""
+        """Return odom in map as published."""
         stamp = 1 if self._latest is None else self._latest.stamp
         return (planar("map", "odom", stamp, self._correction.value),)
 
@@ -95,7 +95,7 @@ class OutsideLocalisation:
                 self._take(request)
             except RequestRefusedError as error:
                 self._refused += 1
-                now, quiet = self._clock.now(), SECOND  # between two events for one reason, ns
+                now, quiet = self._clock.now(), SECOND  # minimum time between two events with one reason, ns
                 if now - self._said.get(error.refusal, -quiet) >= quiet:
                     self._said[error.refusal] = now
                     self._events(error.refusal, Severity.WARNING, request.source, f"localisation refused: {error}")
@@ -104,7 +104,7 @@ class OutsideLocalisation:
         """Follow a correction.
 
         Raises:
-            RequestRefusedError: the sender may not, another one localises, or it is no pose.
+            RequestRefusedError: the sender may not localise, a different one does, or it is not a pose.
         """
         now, correction = self._clock.now(), request.correction
         examine(request, self._gate.latest, self._sequences, now, self._max_age)

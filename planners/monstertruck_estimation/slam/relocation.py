@@ -1,13 +1,13 @@
-"""Relocalisation: finds that scans no longer fit the map, and where the submap started then belongs in that map.
+"""Relocalisation: detect that scans no longer fit the map, and find the place of the new submap in that map.
 
-A robot that was carried fits nowhere near its predicted pose. Its scans begin a submap of their own, which no odometry
-joins to the map. The surroundings of the newest keyframe are searched for in every submap but its own, the map first
-(branch and bound, a slice of yaws per scan, so that no scan waits for all of them); a place found is verified as every
-loop closure is, and joins both only with the support of matches from other places. So a submap whose place was not
-found while the robot was in it is found when the robot comes back to it, from the map or from a later submap.
+A robot that was carried fits nowhere near its predicted pose. Its scans start a separate submap, which no odometry
+joins to the map. The surroundings of the latest keyframe are searched for in every other submap, the map first (branch
+and bound, a slice of yaws per scan, so that no scan waits for all of them). A place found is verified like every loop
+closure, and joins both submaps only with the support of matches from other places. So a submap whose place was not
+found while the robot was in it is found when the robot returns to it, from the map or from a later submap.
 
-A join may be wrong all the same: a room that looks like one of the map fits it as well as that one does. So it is in
-doubt while the robot drives on, and undone if what both sides saw contradicts it then, or if the robot is lost again.
+A join may still be wrong: a room that looks like one of the map fits it just as well. So a join is in doubt while the
+robot drives on, and undone if the observations of both sides contradict it then, or if the robot is lost again.
 """
 
 import math
@@ -29,35 +29,35 @@ from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 
 LOST_PATH: Final = 7.0
-"""Distance by wheels that agree with sparse scans, as a multiple of that between keyframes, after which the robot is
-lost. Three scans so far apart, or a turn among people, may show the same crowd. By default it is 2.1 m, less than
+"""Distance after which the robot is lost, by wheels that agree with sparse scans, as a multiple of the distance between
+keyframes. Three scans so far apart, or a turn among people, may show the same crowd. By default it is 2.1 m, less than
 ``VIEW``: a submap that begins there still shares surroundings with the last keyframe."""
 PERIOD_GAIN: Final = 0.1
-"""Weight of one period in the usual one."""
+"""Weight of one period in the usual period."""
 
 
 class LossDetector:
-    """Whether scans fit the map.
+    """Detect that scans no longer fit the map.
 
     After a misfit or a gap the overlap must return to its mean less ``OVERLAP_DROP``, and after a gap the match must
-    constrain all directions: a half fit, or one wall, is found in many places. That it looks through no wall of the
-    map, and that the motion led there, is for the mapper to judge: rooms of one shape overlap wherever they are.
+    constrain all directions: a partial fit, or one wall, is found in many places. The mapper judges whether the match
+    looks through walls of the map, and whether the motion led there: rooms of one shape overlap wherever they are.
     """
 
     def __init__(self) -> None:
         self._stamp: int | None = None
         self.fitted = 0
-        """Stamp of the last scan that fitted, ns."""
+        """Stamp of the last scan that fitted (ns)."""
         self._period = 0.0
         self._usual = 0.0
         self._misfits = 0
         self._spacing, self._path = 0.0, 0.0
         self.after_gap = False
-        """No scan has fitted since a gap."""
+        """Whether no scan has fitted since a gap."""
 
     @property
     def fits(self) -> bool:
-        """Whether the newest scan fits."""
+        """Whether the latest scan fits."""
         return not self._misfits and not self.after_gap
 
     def doubts(self, match: ScanMatch) -> bool:
@@ -67,7 +67,7 @@ class LossDetector:
     def suspects(self, match: ScanMatch, guess: Array, covariance: Array) -> bool:
         """Whether an accepted ``match`` overlaps clearly less than usual, and is far from the predicted pose.
 
-        So it is at a place that only looks alike. ``guess``, shape (3,), has ``covariance``, shape (3, 3).
+        Such a match is at a place that only looks similar. ``guess``, shape (3,), has ``covariance``, shape (3, 3).
         """
         if not match.accepted or match.overlap >= self._usual - OVERLAP_DROP:
             return False
@@ -77,7 +77,7 @@ class LossDetector:
 
     @property
     def sparse(self) -> bool:
-        """Whether scans come a keyframe's distance apart by wheels that agree with them."""
+        """Whether scans are a keyframe's distance apart by wheels that agree with them."""
         return self._spacing >= 1.0
 
     @property
@@ -85,16 +85,16 @@ class LossDetector:
         """Whether scans have not fitted for 1.5 s."""
         since = (self._stamp or 0) - self.fitted
         far = not self.sparse or self.after_gap or self._path >= LOST_PATH
-        lost_after = 1.5  # seconds of scans that do not fit after which the robot is lost
-        lost_scans = 3  # number of scans that do not fit after which the robot is lost
+        lost_after = 1.5  # seconds of misfits after which the robot is lost
+        lost_scans = 3  # number of misfits after which the robot is lost
         return self._misfits >= lost_scans and since >= lost_after * SECOND and far
 
     def arrive(self, stamp: int) -> None:
-        """A scan of ``stamp``, ns, is there, and will be matched."""
+        """Register the arrival of a scan with ``stamp`` (ns) that will be matched."""
         if self._stamp is not None:
             dt = (stamp - self._stamp) / SECOND
-            # A longer pause, s, that is also so many times the usual one, is a gap: the robot may be elsewhere after
-            # it.
+            # A gap is a pause longer than this (s) and than this multiple of the usual one: the robot may be elsewhere
+            # after it.
             gap = (5.0, 3.0)
             self.after_gap |= dt > max(gap[0], gap[1] * self._period)
             self._period += (dt - self._period) * (PERIOD_GAIN if self._period else 1.0)
@@ -105,10 +105,10 @@ class LossDetector:
 
         Args:
             match: the match.
-            moved: distance, and motion, since the scan before by wheels that agree with the scans, as multiples of
-                those between keyframes; 0 without such wheels.
-            led: the match is where the wheels led over a gap, or between sparse scans: it fits, however little of what
-                it sees is known.
+            moved: distance, and motion, since the previous scan by wheels that agree with the scans, as multiples of
+                the distance and motion between keyframes; 0 without such wheels.
+            led: the match is where the wheels led over a gap, or between sparse scans: it fits, however little of its
+                view is known.
         """
         self._path += moved[0]
         self._spacing += (moved[1] - self._spacing) * PERIOD_GAIN
@@ -124,16 +124,16 @@ class LossDetector:
         self.restart()
 
     def restart(self) -> None:
-        """The newest scan fits, for it is part of the map."""
+        """Treat the latest scan as fitting, because it is part of the map."""
         self._misfits, self.after_gap, self.fitted, self._path = 0, False, self._stamp or 0, 0.0
 
 
 CERTAIN_PREDICTION: Final = (0.5, 0.5)
-"""Standard deviation of the predicted pose, m and rad, up to which a match near it is believed after a gap."""
+"""Maximum standard deviation of the predicted pose (m, rad) for accepting a match near it after a gap."""
 
 
 def prediction_is_certain(covariance: Array) -> bool:
-    """Whether a predicted pose, of ``covariance`` (3, 3), is known so well that no other place comes into question.
+    """Whether the ``covariance``, (3, 3), of a predicted pose is small enough to rule out any other place.
 
     A match in a wider window is one place that fits; there may be others.
     """
@@ -142,47 +142,47 @@ def prediction_is_certain(covariance: Array) -> bool:
 
 
 def led_there(match: ScanMatch, guess: Array, covariance: Array) -> bool:
-    """Whether ``match`` is where wheels led over a gap: ``guess``, shape (3,), of ``covariance``, shape (3, 3).
+    """Whether ``match`` is where wheels led over a gap: ``guess``, shape (3,), with ``covariance``, shape (3, 3).
 
-    They must know the position; a turn over the gap may have made the yaw uncertain, which the scan shows.
+    The wheels must know the position; a turn over the gap may have made the yaw uncertain, which the scan shows.
     """
     off = match.pose - guess
     off[2] = math.remainder(off[2], math.tau)
-    # Mahalanobis distance from the predicted pose up to which a match is where the wheels led. Half of the right
-    # matches are so near (chi-square of three degrees of freedom: 48 %), and of wrong ones, spread over the matcher's
-    # ``WINDOW`` of three standard deviations on each axis, one in fifteen (a ball in a cube).
+    # Maximum Mahalanobis distance from the predicted pose of a match where the wheels led. Half of the right matches
+    # are that near (chi-square of three degrees of freedom: 48 %), and one in fifteen of the wrong ones, which are
+    # spread over the matcher's ``WINDOW`` of three standard deviations on each axis (a ball in a cube).
     led = 1.5
     near = float(off @ np.linalg.solve(covariance, off)) <= led**2
     return near and deviations(covariance)[0] <= CERTAIN_PREDICTION[0]
 
 
 OFF_MOTION: Final = (0.5, 1.0)
-"""Difference of a match from the motion by odometry, or the last one, m or rad, up to which these may be wrong.
+"""Maximum difference of a match from odometry, or from the last motion, if these may be wrong (m, rad).
 
-With every misfit the window of the next match grows, and that of the last motion is wide: a robot that was carried fits
-somewhere in it sooner or later. The last motion corrects wheels that are late.
+Every misfit enlarges the window of the next match, and the window of the last motion is wide: a robot that was carried
+fits somewhere in it sooner or later. The last motion corrects wheels that are late.
 """
 OFF_MOTION_SUSPECT: Final = ((0.25, 0.25), (0.1, 0.1))
-"""Difference from which on such a match may be at a place that looks similar: usual matches, and doubtful ones."""
+"""Minimum difference of a match that may be at a similar-looking place: for usual matches, and for doubtful ones."""
 SUSPECT_CONTRADICTION: Final = 0.03
-"""Greatest contradiction of scan and map of such a match."""
+"""Maximum contradiction of scan and map for such a match."""
 
 
 def exceeds(off: tuple[float, float], limits: tuple[float, float]) -> bool:
-    """Whether a difference is more than ``limits``, m or rad."""
+    """Whether a difference exceeds ``limits`` (m, rad)."""
     return off[0] > limits[0] or off[1] > limits[1]
 
 
 def contradicts(keyframes: KeyframeMap, scan: Scan, pose: Array, most: float = CONTRADICTION) -> bool:
     """Whether ``scan`` at ``pose``, shape (3,), and the keyframes around it contradict each other.
 
-    They do where more than a share ``most`` of the beams of either pass through walls of the other. What no keyframe
-    saw contradicts nothing: the robot drove on by odometry alone, where there was little to see.
+    They do if more than a share ``most`` of the beams of either pass through walls of the other. Areas that no keyframe
+    saw contradict nothing: the robot drove on by odometry alone, where there was little to see.
     """
     own = np.flatnonzero(keyframes.part == keyframes.part[-1])
     off = keyframes.poses[own, :2] - pose[:2]
     far = np.hypot(off[:, 0], off[:, 1])
-    order = np.argsort(far, kind="stable")[:6]  # keyframes that a scan is compared with
+    order = np.argsort(far, kind="stable")[:6]  # maximum number of keyframes for comparison with a scan
     near = own[order[far[order] <= keyframes.config.local_reach]]
     if not len(near):
         return False
@@ -191,47 +191,47 @@ def contradicts(keyframes: KeyframeMap, scan: Scan, pose: Array, most: float = C
 
 
 POINTS: Final = 160
-"""Points of the surroundings searched for, at most."""
+"""Maximum number of points of the surroundings in a search."""
 SLICE: Final = 2e6
-"""Look-ups of the first level in one slice of the search."""
+"""Number of look-ups of the first level in one slice of the search."""
 MAX_RIVAL: Final = 0.9
-"""A place is ambiguous if another one scores more than this share of its score."""
+"""A place is ambiguous if a second one scores more than this share of its score."""
 APART: Final = (1.0, 0.5)
-"""Two places differ by more, m or rad."""
+"""Minimum difference of two distinct places (m, rad)."""
 
 
 CONFIRMING_WAY: Final = 10.0
-"""Distance near keyframes of the other side, m, after which a join that nothing contradicts is confirmed."""
+"""Distance near keyframes of the other side (m) after which a join without contradiction is confirmed."""
 
 
 class JoinChange(StrEnum):
-    """What a search has changed."""
+    """Change made by a search."""
 
     JOINED = "joined"
     PARTED = "parted"
 
 
 class Relocation:
-    """Joins submaps: the newest keyframe's to the map, and those left open to the one in which the robot is.
+    """Join submaps: the latest keyframe's to the map, and those left open to the robot's current submap.
 
     A join is checked at every keyframe until it is confirmed.
     """
 
     def __init__(self) -> None:
         self._submaps: dict[int, tuple[int, Array, Submap]] = {}
-        """Of each part: its keyframes, the pose of its first one, and their surfaces, all when they were merged."""
+        """For each part: its keyframes, the pose of the first one, and their surfaces, all as of the merge."""
         self._progress: PiecewiseSearch[Join | JoinChange | None] | None = None
         self._last = -1
 
     @property
     def busy(self) -> bool:
-        """Whether a search is on its way."""
+        """Whether a search is running."""
         return self._progress is not None
 
     def step(self, keyframes: KeyframeMap, closer: LoopCloser, budget: ScanBudget) -> JoinChange | None:
-        """Continue the search, or the check of a join; what was joined or parted, which moves poses.
+        """Continue the search, or the check of a join; return whether submaps were joined or parted.
 
-        A place found moves a submap.
+        Both move poses. A place found moves a submap.
         """
         newest = len(keyframes) - 1
         if self._progress is None:
@@ -245,7 +245,7 @@ class Relocation:
         return self._part(keyframes, closer, found) if isinstance(found, Join) else found
 
     def part(self, keyframes: KeyframeMap, closer: LoopCloser) -> JoinChange | None:
-        """Undo all joins that are in doubt, if there are any."""
+        """Undo all joins in doubt, if there are any."""
         return self._part(keyframes, closer, keyframes.doubtful[0]) if keyframes.doubtful else None
 
     def _part(self, keyframes: KeyframeMap, closer: LoopCloser, join: Join) -> JoinChange:
@@ -255,7 +255,7 @@ class Relocation:
         return JoinChange.PARTED
 
     def _examined(self, keyframes: KeyframeMap, closer: LoopCloser, at: int) -> Pieces[Join | JoinChange | None]:
-        """Check the joins in doubt, then search for keyframe ``at``; a join that is wrong, or what was changed."""
+        """Check the joins in doubt, then search for keyframe ``at``; return a wrong join, or the change made."""
         for join in tuple(keyframes.doubtful):
             own, others = keyframes.sides(join)
             if (yield from opposed(keyframes, own, others)):
@@ -265,7 +265,7 @@ class Relocation:
         return (yield from self._joined(keyframes, closer, at))
 
     def finish(self, keyframes: KeyframeMap, closer: LoopCloser) -> bool:
-        """Search for every open submap in all others, without a budget; True if submaps were joined."""
+        """Search for every open submap in all others, without a budget; return whether submaps were joined."""
         self.forget()
         joined = False
         while any(finished(self._joined(keyframes, closer, at)) for at in _samples(keyframes)):
@@ -274,13 +274,13 @@ class Relocation:
         return joined
 
     def forget(self) -> None:
-        """The keyframes have other numbers."""
+        """Forget the search, because the keyframes were renumbered."""
         self._submaps, self._progress, self._last = {}, None, -1
 
     def _joined(self, keyframes: KeyframeMap, closer: LoopCloser, at: int) -> Pieces[JoinChange | None]:
         """Place the surroundings of keyframe ``at`` in the other submaps, and verify them there.
 
-        A place is given up when most of the keyframes verified do not fit.
+        A place is rejected when most of the verified keyframes do not fit.
         """
         for part in _others(keyframes, at):
             pose = yield from self._place(keyframes, at, part)
@@ -298,7 +298,7 @@ class Relocation:
         return None
 
     def _place(self, keyframes: KeyframeMap, at: int, part: int) -> Pieces[Array | None]:
-        """Where in submap ``part`` the surroundings of keyframe ``at`` are; None if nowhere, or at several places."""
+        """Return the place of keyframe ``at``'s surroundings in submap ``part``; None without one, or with several."""
         origin, submap = yield from self._submap(keyframes, part)
         levels = 7  # levels of the pyramid of the whole map
         yield submap.grid_cost(levels)
@@ -307,12 +307,12 @@ class Relocation:
         middle, half = (low + high) / 2, float((high - low).max() / 2) + 1.0
         _, query = surroundings(keyframes, at)
         points = query.points[np.linspace(0, len(query) - 1, min(len(query), POINTS)).astype(np.intp)]
-        fewest_slices = 4  # slices of a search, at least
+        fewest_slices = 4  # minimum number of slices of a search
         slices = max(math.ceil(look_ups(points, (half, math.pi), levels) / SLICE), fewest_slices)
         peaks: list[Peak] = []
-        work = 15_000  # blocks evaluated below the first level in one slice, at most
-        anywhere = (1e6, 1e6)  # standard deviation of the predicted pose, m and rad: nothing is known of it
-        min_score = 0.5  # mean likelihood of a place found
+        work = 15_000  # maximum number of blocks evaluated below the first level in one slice
+        anywhere = (1e6, 1e6)  # standard deviation of the predicted pose, m and rad: it is unknown
+        min_score = 0.5  # minimum mean likelihood of a place found
         for k in range(slices):
             yield SLICE + work * len(points)
             guess = np.array((*middle, (k + 0.5) * math.tau / slices))
@@ -322,7 +322,7 @@ class Relocation:
         best = _unique(peaks)
         if best is None:
             return None
-        # Once more round the best, for a place that looks alike from the same direction.
+        # Search again around the best place for a similar one in the same direction.
         window = half, 0.1  # half width of the search for a rival that looks the same way, rad
         yield look_ups(points, window, levels)
         peak = correlate(grid, points, best, window, anywhere, min_score, APART[0], work)
@@ -331,11 +331,11 @@ class Relocation:
         return compose(keyframes.poses[part], between(origin, peak.pose))
 
     def _submap(self, keyframes: KeyframeMap, part: int) -> Pieces[tuple[Array, Submap]]:
-        """The keyframes of ``part``, merged again when there are more of them, and where its first one was then."""
+        """Return the keyframes of ``part``, merged again when it has grown, and the pose of the first one then."""
         numbers = np.flatnonzero(keyframes.part == part)
         known = self._submaps.get(part)
         if known is None or known[0] != len(numbers):
-            part_keys = 300  # keyframes of the map, or of a submap, searched in, at most
+            part_keys = 300  # maximum number of keyframes of the map, or of a submap, in a search
             kept = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), part_keys)).astype(np.intp)]
             yield ELEMENT * sum(len(keyframes.frames[k].scan) for k in kept)
             known = self._submaps[part] = len(numbers), keyframes.poses[part], keyframes.submap(kept)
@@ -343,16 +343,16 @@ class Relocation:
 
 
 def _way_along(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.intp]) -> float:
-    """Distance, m, along those of ``own`` that are near ``others``."""
+    """Return the distance (m) along those of ``own`` that are near ``others``."""
     off = keyframes.poses[own, None, :2] - keyframes.poses[others, :2]
     met = own[np.hypot(off[..., 0], off[..., 1]).min(axis=1, initial=math.inf) < VIEW]
     return float(np.hypot(*np.diff(keyframes.poses[met, :2], axis=0).T).sum())
 
 
 def _others(keyframes: KeyframeMap, at: int) -> list[int]:
-    """Submaps that the one of keyframe ``at`` may be joined to, the map first, then the newest."""
+    """Return the submaps that keyframe ``at``'s submap may be joined to, the map first, then the latest."""
     parts, counts = np.unique(keyframes.part, return_counts=True)
-    fewest_keys = 2  # keyframes of a submap before it is searched for, or in
+    fewest_keys = 2  # minimum number of keyframes of a submap in a search
     if counts[parts == keyframes.part[at]] < fewest_keys:
         return []
     others = parts[(parts != keyframes.part[at]) & (counts >= fewest_keys)]
@@ -360,9 +360,9 @@ def _others(keyframes: KeyframeMap, at: int) -> list[int]:
 
 
 def _samples(keyframes: KeyframeMap) -> list[int]:
-    """Keyframes of every open submap, evenly chosen."""
+    """Return keyframes of every open submap, evenly chosen."""
     parts = [np.flatnonzero(keyframes.part == part) for part in np.unique(keyframes.part[~keyframes.joined()])]
-    last_keys = 12  # keyframes of every open submap searched for at the end of a run, at most
+    last_keys = 12  # maximum number of keyframes per open submap searched for at the end of a run
     chosen = [own[np.linspace(0, len(own) - 1, min(len(own), last_keys)).astype(np.intp)] for own in parts]
     return [int(k) for own in chosen for k in own]
 
@@ -379,7 +379,7 @@ def _checks(keyframes: KeyframeMap, at: int, part: int) -> tuple[list[int], int]
     near = few[np.hypot(off[..., 0], off[..., 1]).min(axis=1) < VIEW]
     there = keyframes.poses[few, :2] - keyframes.poses[at, :2]
     middle = few[np.argmin(np.hypot(there[:, 0], there[:, 1]))]
-    checks = 10  # keyframes verified at a place found, at most
+    checks = 10  # maximum number of keyframes verified at a place found
     check_spacing = 2  # step between these keyframes
     near = near[np.abs(near - middle) <= checks * check_spacing]
     near = near[np.argsort(np.abs(near - middle), kind="stable")][: checks * check_spacing : check_spacing]
@@ -387,7 +387,7 @@ def _checks(keyframes: KeyframeMap, at: int, part: int) -> tuple[list[int], int]
 
 
 def _unique(peaks: list[Peak]) -> Array | None:
-    """The best pose, if no other place is nearly as good."""
+    """Return the best pose, if no other place is nearly as good."""
     if not peaks:
         return None
     best = max(peaks, key=lambda peak: peak.score)

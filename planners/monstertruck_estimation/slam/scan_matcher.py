@@ -14,9 +14,9 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.base import position_deviation
 
 MIN_PAIRS: Final = 12
-"""Fewest corresponding pairs of an accepted match."""
+"""Minimum number of corresponding pairs of an accepted match."""
 MIN_OVERLAP: Final = 0.35
-"""Least share of a scan's points that fit the submap, of an accepted match."""
+"""Minimum share of a scan's points that fit the submap in an accepted match."""
 WINDOW: Final = 3.0
 """Half width of the correlative search in standard deviations of the predicted pose."""
 GATE: Final = 6.0
@@ -28,16 +28,16 @@ LOW_OVERLAP: Final = 0.6
 
 
 class MatchStatus(StrEnum):
-    """Why a match was accepted or rejected."""
+    """Reason why a match was accepted or rejected."""
 
     ACCEPTED = "accepted"
     EMPTY = "empty"
     OVERLAP = "overlap"
     FAR = "far"
     CONTRADICTED = "contradicted"
-    """Beams of the scan pass through walls of the map there, or beams of the map through what the scan meets."""
+    """Beams of the scan pass through walls of the map, or beams of the map through objects in the scan."""
     UNSURE = "unsure"
-    """After a gap in the scans: the robot may be anywhere, and one place that fits is no proof."""
+    """After a gap in the scans: the robot may be anywhere, and one place that fits is not a proof."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,20 +45,20 @@ class ScanMatch:
     """Pose of a scan in a submap, with its uncertainty and quality."""
 
     pose: Array
-    """Shape (3,), m and rad; the guess if the match is rejected."""
+    """Pose, shape (3,) (m, rad); the guess if the match is rejected."""
     covariance: Array
-    """Shape (3, 3), of ``pose``; the guess's if the match is rejected."""
+    """Covariance of ``pose``, shape (3, 3); the guess's covariance if the match is rejected."""
     overlap: float
     """Share of the points that fit, 0..1."""
     residual: float
-    """Root mean square distance across the surfaces, m."""
+    """Root mean square distance across the surfaces (m)."""
     degeneracy: float
     """Smaller eigenvalue of the information on the position over the greater one, 0..1: near 0 in a corridor."""
     direction: float
-    """Yaw of the weakest direction in the submap's frame, rad, in [-pi/2, pi/2]."""
+    """Yaw of the weakest direction in the submap's frame (rad), in [-pi/2, pi/2]."""
     verdict: MatchStatus
     information: Array | None = None
-    """Shape (3, 3), inverse covariance by the scan alone, without the guess; None if the match is rejected."""
+    """Inverse covariance by the scan alone, without the guess, shape (3, 3); None if the match is rejected."""
 
     @property
     def accepted(self) -> bool:
@@ -74,16 +74,16 @@ class ScanMatch:
 
 
 class ScanMatcher(Protocol):
-    """Registers scans; may keep a map of its own."""
+    """Scan registration, possibly with a separate map."""
 
     def match(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
-        """Pose of ``scan`` in the submap's frame.
+        """Return the pose of ``scan`` in the submap's frame.
 
         Args:
             scan: points in base.
-            delta: shape (3,), predicted motion of the base since the last scan.
-            guess: shape (3,), pose predicted by it in the submap's frame.
-            covariance: shape (3, 3), of ``guess``.
+            delta: predicted motion of the base since the last scan, shape (3,).
+            guess: pose predicted by it in the submap's frame, shape (3,).
+            covariance: covariance of ``guess``, shape (3, 3).
             submap: the map around the predicted pose.
         """
 
@@ -91,7 +91,7 @@ class ScanMatcher(Protocol):
 class PlanarMatcher:
     """Correlation in a window given by the guess's covariance, then generalised ICP with the guess as prior.
 
-    Every piece of surface counts by its length, not by the beams that met it.
+    Every piece of surface is weighted by its length, not by the beams that met it.
     A match that is rejected or overlaps little is repeated in a window three times as wide, because wheels
     slip further than their covariance; its result must overlap more.
     """
@@ -107,23 +107,23 @@ class PlanarMatcher:
         match = self._match_in_window(scan, guess, covariance, submap)
         if match.accepted and match.overlap >= LOW_OVERLAP:
             return match
-        wide_overlap_gain = 0.15  # and how much more than the first match it must overlap
+        wide_overlap_gain = 0.15  # minimum gain in overlap over the first match
         least = match.overlap + wide_overlap_gain if match.accepted else 0.0
         wide_factor = 3.0  # factor on the standard deviation of the predicted pose in the wide search
         again = self._match_in_window(scan, guess, covariance * wide_factor**2, submap)
-        if again.accepted and again.overlap >= max(0.5, least):  # least overlap of a result of the wide search,
+        if again.accepted and again.overlap >= max(0.5, least):  # minimum overlap of a result of the wide search,
             return again
         return match
 
     def _match_in_window(self, scan: Scan, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
         deviation = deviations(covariance)
         margin = 0.15  # added to it, m: stamps of odometry and scans disagree
-        max_window = (2.0, 1.6)  # greatest half width of the search, m and rad
+        max_window = (2.0, 1.6)  # maximum half width of the search, m and rad
         window = min(WINDOW * deviation[0] + margin, max_window[0]), min(WINDOW * deviation[1], max_window[1])
         prior: Array = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         coarse_points = 160  # points of a scan used in the correlative search
         points = scan.points[np.linspace(0, len(scan) - 1, min(len(scan), coarse_points)).astype(np.intp)]
-        min_score = 0.2  # least mean likelihood of a result of the correlative search
+        min_score = 0.2  # minimum mean likelihood of a result of the correlative search
         levels = 4  # levels of its likelihood pyramid
         peak = correlate(submap.grid(levels), points, guess, window, deviation, min_score)
         fit = register(scan, submap.cloud, guess, prior)
@@ -135,7 +135,7 @@ class PlanarMatcher:
 
 
 def gated(fit: Fit, guess: Array, covariance: Array) -> ScanMatch:
-    """Accept or reject a fit whose predicted pose was ``guess``, of ``covariance`` (shape (3, 3))."""
+    """Accept or reject a fit with predicted pose ``guess`` and its ``covariance``, shape (3, 3)."""
     ratio, direction = degeneracy(fit.information)
     verdict = MatchStatus.ACCEPTED
     off = fit.pose - guess
@@ -155,17 +155,17 @@ def gated(fit: Fit, guess: Array, covariance: Array) -> ScanMatch:
 
 
 def rejected(guess: Array, covariance: Array, verdict: MatchStatus) -> ScanMatch:
-    """A rejected match: its pose is the guess."""
+    """Return a rejected match: its pose is the guess."""
     return ScanMatch(guess, covariance, 0.0, 0.0, 0.0, 0.0, verdict)
 
 
 def deviations(covariance: Array) -> tuple[float, float]:
-    """Greatest standard deviation of the position (m) and that of the yaw (rad)."""
+    """Return the maximum standard deviation of the position (m) and the standard deviation of the yaw (rad)."""
     return position_deviation(covariance), math.sqrt(max(float(covariance[2, 2]), 0.0))
 
 
 def degeneracy(information: Array) -> tuple[float, float]:
-    """Ratio of the eigenvalues of the information on the position (the yaw unknown); yaw of the weakest direction."""
+    """Return the eigenvalue ratio of the position's information (yaw unknown), and the yaw of the weakest direction."""
     by_yaw = max(float(information[2, 2]), 1e-9)
     position = information[:2, :2] - np.outer(information[:2, 2], information[2, :2]) / by_yaw
     values, vectors = np.linalg.eigh(position)

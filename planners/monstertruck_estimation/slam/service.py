@@ -40,7 +40,7 @@ from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
 
 TARGET: Final = "monstertruck_estimation.slam.worker:SlamWorker"
 UNMATCHED: Final = SECOND
-"""Time without a usable scan after which the pose is predicted by odometry alone and the lidar is no source, ns."""
+"""Time without a usable scan after which odometry alone predicts the pose and the lidar is no longer a source (ns)."""
 CORRECTIONS: Final = {
     "closed": (Reason.LOOP_CLOSED, Severity.INFO, "closure {}"),
     "joined": (Reason.LOOP_CLOSED, Severity.INFO, "two submaps are joined"),
@@ -55,19 +55,19 @@ class SlamService:
 
     Args:
         config: mapping, and where the map is saved.
-        mount: of the lidar.
-        body: length and width of the robot, m.
+        mount: mount of the lidar.
+        body: length and width of the robot (m).
         run: this run, for saved maps.
         clock: time.
         scan: lidar, bounded and counted.
-        odometry: pose in odom; None = no odometry: the pose is published once per scan.
-        angles: of body and mount at the time of scans, to discard hits of the ground; None = no compass.
+        odometry: pose in odom; without it (None) the pose is published once per scan.
+        angles: angles of body and mount at the time of scans, to discard hits of the ground; None without a compass.
         pose: ``state/pose``.
         whole: ``state/map``.
         tiles: ``state/map_tiles``.
         motion: ``state/scan_motion``.
         health: ``health/slam``.
-        events: where closures, losses and unusable scans are reported.
+        events: receives closures, losses and unusable scans.
     """
 
     name = ServiceName.SLAM.value
@@ -99,7 +99,7 @@ class SlamService:
         self._newest: SlamEstimate | None = None
         self._latest: Odometry | None = None
         self._matched_at: Odometry | None = None
-        """Odometry at the newest estimate."""
+        """Odometry at the latest estimate."""
         self._status: LocalisationStatus | None = None
         self._degenerate_said: int | None = None
         self._use = OdometryUse.NONE
@@ -111,15 +111,15 @@ class SlamService:
         self._under_way: asyncio.Task[Any] | None = None
         self._one_step = asyncio.Lock()
         self._asked = asyncio.Event()
-        """The map is to be saved."""
+        """Set when the map must be saved."""
         self._started = False
-        """The worker has a map."""
+        """Whether the worker has a map."""
         self._instants: tuple[int, ...] = ()
         self._sent_instants: tuple[int, ...] = ()
         self._bases: dict[int, Pose2] = {}
 
     def frames(self) -> Iterable[Transform]:
-        """Odom in map as published; without odometry, base in map."""
+        """Return odom in map as published; without odometry, base in map."""
         if self._odometry is not None:
             stamp = self._history[-1][0] if self._history else 1
             return (planar("map", "odom", stamp, self._correction.value),)
@@ -129,15 +129,15 @@ class SlamService:
         return planar("map", "odom", stamp, self._newest.pose), planar("odom", "base", stamp, (0.0, 0.0, 0.0))
 
     def bases_at(self, instants: tuple[int, ...]) -> Mapping[int, Pose2]:
-        """Poses of base at instants, ns, by the present graph; updated every ``tiles_period``.
+        """Return the poses of base at some instants (ns) by the current graph; updated every ``tiles_period``.
 
-        Those requested now are answered later, those the map does not know never.
+        Instants requested now are answered later; instants unknown to the map are never answered.
         """
         self._instants = instants
         return self._bases
 
     def save_soon(self) -> bool:
-        """Save the map with the next scan; returns whether there is a map and a folder for it."""
+        """Save the map with the next scan; return whether there is a map and a folder for it."""
         self._due["save"] = 0
         self._asked.set()
         return self._config.save is not None and self._config.mode == "mapping"
@@ -249,7 +249,7 @@ class SlamService:
                     self._report_saved(await self._step(worker, WorkerInput(save=self._config.save)))
 
     async def _step(self, worker: WorkerActor, work: WorkerInput) -> WorkerOutput:
-        """Shielded: cancelling a step kills the worker, and the map that is still to be saved with it."""
+        """Run a shielded step: cancelling it would kill the worker, and with it the map that is still to be saved."""
         self._under_way = asyncio.ensure_future(worker.step(work))
         outputs: WorkerOutput = await asyncio.shield(self._under_way)
         return outputs
@@ -261,7 +261,7 @@ class SlamService:
         if not task.done():
             await task
         if self._config.save is not None and self._config.mode == "mapping" and task.exception() is None:
-            # First as it is, for the joint fit takes seconds that there may not be.
+            # Save it as it is first: the joint fit takes seconds that may not be available.
             self._report_saved(await worker.step(WorkerInput(save=self._config.save)))
             self._report_saved(await worker.step(WorkerInput(save=self._config.save, finish=True)))
 
@@ -285,7 +285,7 @@ class SlamService:
         )
 
     def _motion(self, begin: int, end: int) -> tuple[Pose2 | None, Twist2]:
-        """Base in odom at ``begin``, and the velocity until ``end``; both ns."""
+        """Return base in odom at ``begin``, and the velocity until ``end``; both in ns."""
         history = self._history
         stale = SECOND // 5  # odometry older than the scan by more than this is not used, ns
         if not history or begin - history[-1][0] > stale or begin < history[0][0]:
@@ -306,12 +306,12 @@ class SlamService:
         return None if angles is None else plane_slopes(*angles, yaw=self._mount.yaw)
 
     def _start(self, odom: Pose2 | None) -> Pose2:
-        """Start pose of a new map: the present pose in map."""
+        """Return the start pose of a new map: the current pose in map."""
         if odom is not None:
             return self._correction.pose(odom, 0.0)
         return (0.0, 0.0, 0.0) if self._newest is None else self._newest.pose
 
-    # What comes back
+    # Output of the worker
 
     def _work(self, scan: ScanInput, start: Start | None) -> WorkerInput:
         config, now = self._config, self._clock.now()
@@ -387,8 +387,8 @@ class SlamService:
             return
         before, self._status = self._status, estimate.status
         said, now = self._degenerate_said, self._clock.now()
-        # Least time between two events about scans that leave a direction undetermined, ns: in a corridor they
-        # alternate.
+        # Minimum time between two events about scans that leave a direction undetermined, ns: in a corridor such scans
+        # alternate with others.
         quiet = 30 * SECOND
         if estimate.status is LocalisationStatus.DEGENERATE and (said is None or now - said >= quiet):
             self._degenerate_said = now
@@ -418,13 +418,13 @@ class SlamService:
 
 
 def carried_on(covariance: Array, before: Odometry, now: Odometry, turn: float) -> Array:
-    """Covariance, (9,), of a pose in map that was estimated at ``before`` and predicted by odometry until ``now``.
+    """Return the covariance, (9,), of a pose in map estimated at ``before`` and predicted by odometry until ``now``.
 
     Args:
-        covariance: (9,), at ``before``.
+        covariance: covariance at ``before``, (9,).
         before: odometry at the estimate.
-        now: present odometry.
-        turn: yaw of odom in map, rad.
+        now: current odometry.
+        turn: yaw of odom in map (rad).
     """
     way = np.array((now.pose.x - before.pose.x, now.pose.y - before.pose.y))
     swung, swing, turned = np.eye(3), np.eye(3), np.eye(3)
@@ -433,13 +433,13 @@ def carried_on(covariance: Array, before: Odometry, now: Odometry, turn: float) 
     swing[:2, 2] = turned[:2, :2] @ swung[:2, 2]
     gained = now.pose_covariance.reshape(3, 3) - swung @ before.pose_covariance.reshape(3, 3) @ swung.T
     sizes, axes = np.linalg.eigh((gained + gained.T) / 2)
-    gained = (axes * np.maximum(sizes, 0.0)) @ axes.T  # a compass may have taken some of it away
+    gained = (axes * np.maximum(sizes, 0.0)) @ axes.T  # a compass may have reduced the covariance
     found = swing @ covariance.reshape(3, 3) @ swing.T + turned @ gained @ turned.T
     return np.asarray(found.ravel())
 
 
 def grid_message(patch: GridPatch, now: int, seq: int) -> Grid:
-    """A patch of the map as a grid of its own."""
+    """Return a patch of the map as a separate grid."""
     rows, columns = patch.cells.shape
     cells = np.ascontiguousarray(patch.cells).reshape(-1)
     cells.flags.writeable = False
@@ -458,7 +458,7 @@ def grid_message(patch: GridPatch, now: int, seq: int) -> Grid:
 
 
 def scan_motion(stamp: int, moved: ScanIncrement, now: int, seq: int) -> ScanMotion:
-    """Motion of base between two scans."""
+    """Return the motion of base between two scans as a message."""
     x, y, yaw = moved.motion
     return ScanMotion(
         stamp=stamp,
@@ -474,7 +474,7 @@ def scan_motion(stamp: int, moved: ScanIncrement, now: int, seq: int) -> ScanMot
 def slam_health(
     estimate: SlamEstimate, counts: Mapping[str, int], lost: tuple[int, int], now: int, seq: int
 ) -> SlamHealth:
-    """Match of the newest scan, for health; ``lost`` counts scans not used and dropped."""
+    """Return the match of the latest scan as health; ``lost`` is the number of scans not used and dropped."""
     return SlamHealth(
         stamp=estimate.stamp,
         received=now,

@@ -51,32 +51,32 @@ class SavedGraph:
     """Keyframes and the edges between them."""
 
     stamps: NDArray[np.int64]
-    """Shape (n,), ns."""
+    """Stamps, shape (n,) (ns)."""
     poses: Array
-    """Shape (n, 3), base in map."""
+    """Poses of base in map, shape (n, 3)."""
     scans: tuple[Scan, ...]
-    """In base."""
+    """Scans in base."""
     edges: dict[str, NDArray[Any]]
     """``edge_*`` arrays of the file: ends (m, 2), measured (m, 3), information (m, 3, 3), spread (m, 2), loop (m,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class SavedMap:
-    """What a folder holds."""
+    """Content of a map folder."""
 
     grid: WorldMap
     graph: SavedGraph | None
-    """None for a map of another program: grid only."""
+    """Pose graph; None for a map of another program, which has a grid only."""
 
 
 def elements(points: Array, **known: Array) -> Scan:
-    """Surface elements at ``points``, shape (n, 2); of what is not known of them, zeros."""
+    """Return surface elements at ``points``, shape (n, 2), with zeros for unknown fields."""
     every = {name: known.get(name, np.zeros(len(points))) for name in ELEMENTS if name != "points"}
     return Scan(points=points, **every)
 
 
 def saved_graph(known: KeyframeMap) -> SavedGraph:
-    """The graph as it is, to be saved, without submaps that are not joined to its first keyframe."""
+    """Return the current graph for saving, without submaps that are not joined to its first keyframe."""
     kept = known.joined()
     edges = known.edges.edges()
     inside = kept[edges.origin]
@@ -97,7 +97,7 @@ def saved_graph(known: KeyframeMap) -> SavedGraph:
 
 
 def g2o_text(graph: SavedGraph) -> str:
-    """The graph as text of g2o: ``VERTEX_SE2`` by number of the keyframe, the first one fixed, and ``EDGE_SE2``."""
+    """Return the graph as g2o text: ``VERTEX_SE2`` by number of the keyframe, the first one fixed, and ``EDGE_SE2``."""
     vertices = [f"VERTEX_SE2 {i} {x:.9g} {y:.9g} {yaw:.9g}" for i, (x, y, yaw) in enumerate(graph.poses.tolist())]
     corner = np.triu_indices(3)
     edges = [
@@ -241,11 +241,11 @@ def surface_elements(grid: WorldMap) -> Scan:
     if not len(cells):
         return elements(np.zeros((0, 2)), normals=np.zeros((0, 2)), variances=np.zeros((0, 2)))
     normal_reach = 0.2  # faces up to this far away make the normal, m
-    normal_cells = 4.0  # least reach in cells: the steps of an oblique wall must be averaged
+    normal_cells = 4.0  # minimum reach in cells: the steps of an oblique wall must be averaged
     normals, straight, aside = _fitted(cells, towards, max(normal_reach / step, normal_cells))
     # A free cell next to a wall is one cell from the middle of the wall's cells.
     points = (cells + aside - normals + 0.5) * step + np.array(grid.origin)
-    across = 0.02**2 + step**2 / 12  # least standard deviation of a drawn wall, m
+    across = 0.02**2 + step**2 / 12  # minimum standard deviation of a drawn wall, m
     variances = np.stack((np.full(len(points), across), np.where(straight, SLIDE**2, across)), axis=-1)
     return elements(points, normals=normals, variances=variances, extents=np.where(straight, step / 2, 0.0))
 

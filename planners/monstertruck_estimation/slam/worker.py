@@ -1,4 +1,4 @@
-"""SLAM worker: maps or localises: ``monstertruck_estimation.slam.worker:SlamWorker``.
+"""SLAM worker for mapping or localisation: ``monstertruck_estimation.slam.worker:SlamWorker``.
 
 A step's inputs are a ``WorkerInput``, its outputs a ``WorkerOutput``; the first one brings the configuration.
 """
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class SlamWorker:
-    """Holds the map; building it compiles all numba functions."""
+    """Worker step that holds the map; building it compiles all numba functions."""
 
     def __init__(self) -> None:
         self._estimator: Estimator | None = None
@@ -41,7 +41,7 @@ class SlamWorker:
         _warm_up()
 
     def step(self, inputs: WorkerInput) -> WorkerOutput:
-        """Do one step's work.
+        """Execute one step.
 
         Raises:
             InputError: no start came first.
@@ -60,7 +60,7 @@ class SlamWorker:
                 wrong = estimator.odometry is OdometryUse.CONTRADICTED
                 swept = replace(inputs.scan, twist=estimator.twist) if wrong else inputs.scan
                 scan = prepare_input(swept, self._longest, estimator.twist)
-                if len(scan) < 3:  # a scan with fewer points is left out
+                if len(scan) < 3:  # minimum number of points of a scan
                     left_out, refused = (
                         ScanLeftOut.EMPTY,
                         f"only {len(scan)} of {len(inputs.scan.ranges)} beams have a return",
@@ -95,7 +95,7 @@ class SlamWorker:
         )
 
     def _begin(self, start: Start) -> tuple[str, ...]:
-        """Make the estimator; returns remarks on the saved map it reads."""
+        """Make the estimator; return remarks on the saved map it reads."""
         config = start.config
         settings = config.mapper
         self._run = start.run
@@ -110,7 +110,7 @@ class SlamWorker:
         return ()
 
     def _refusal(self, scan: ScanInput) -> tuple[ScanLeftOut, str] | tuple[None, None]:
-        """Why a scan cannot be used, without and with figures; None if it can."""
+        """Return the reason why a scan cannot be used, without and with figures; None if it can."""
         if self._first is None:
             self._first = scan
         elif not _same_field(scan, self._first):
@@ -139,7 +139,7 @@ def _same_field(scan: ScanInput, other: ScanInput) -> bool:
 
 
 def _ends(scan: ScanInput) -> tuple[float, float]:
-    """Bearings of the first and of the last beam, rad."""
+    """Return the bearings of the first and of the last beam (rad)."""
     return scan.start_angle, scan.start_angle + scan.angle_increment * (len(scan.ranges) - 1)
 
 
@@ -149,7 +149,7 @@ def _field_text(scan: ScanInput) -> str:
 
 
 def matcher_of(kind: str) -> ScanMatcher | None:
-    """The scan matcher of this name; None = the default one."""
+    """Return the scan matcher of this name; None for the default one."""
     if kind == "planar":
         return None
     from monstertruck_estimation.slam.kiss import KissMatcher  # noqa: PLC0415  # its library is for this kind only
@@ -174,7 +174,7 @@ def _warm_up() -> None:
     keyframes.optimise()
     finished(opposed(keyframes, np.array((0,)), np.array((len(keyframes) - 1,))))
     estimator.changes()
-    # What a few scans of a small room do not come to: loops that are closed, and a saved map.
+    # A few scans of a small room do not cover loop closures and a saved map.
     points = scans[0].points
     describe(points)
     moved(View.of(points), View.of(scans[1].points), np.zeros(3))

@@ -15,19 +15,19 @@ from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 
 UNKNOWN: Final = -1
-"""Value of a cell nothing is known of."""
+"""Value of an unknown cell."""
 
 
 @dataclass(frozen=True, slots=True)
 class GridPatch:
-    """A rectangle of a grid."""
+    """Rectangle of a grid."""
 
     cells: NDArray[np.int8]
     """Shape (rows, columns), row 0 at the lowest y: -1 unknown, 0 free .. 100 occupied."""
     origin: tuple[float, float]
-    """Outer corner of cell (0, 0) in map, m."""
+    """Outer corner of cell (0, 0) in map (m)."""
     resolution: float
-    """Edge of a cell, m."""
+    """Edge of a cell (m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +35,9 @@ class ScanInput:
     """One scan with odometry, tilt and mount."""
 
     stamp: int
-    """ns, of the first beam."""
+    """Stamp of the first beam (ns)."""
     ranges: Array
-    """Shape (n,), m; +inf where the beam met nothing within the sensor's range, NaN where nothing is known."""
+    """Ranges, shape (n,) (m); +inf if the beam met nothing within the sensor's range, NaN if unknown."""
     start_angle: float
     angle_increment: float
     range_min: float
@@ -45,21 +45,21 @@ class ScanInput:
     time_increment: float = 0.0
     """Seconds between neighbouring beams."""
     mount: Pose2 = (0.0, 0.0, 0.0)
-    """Planar pose of the sensor in base, m and rad."""
+    """Planar pose of the sensor in base (m, rad)."""
     odom: Pose2 | None = None
     """Base in odom at ``stamp``; None without odometry."""
     twist: Twist2 = (0.0, 0.0, 0.0)
-    """The base's velocity during the scan, m/s and rad/s."""
+    """Velocity of base during the scan (m/s, rad/s)."""
     slopes: tuple[float, float] | None = None
-    """Rise per metre along the sensor's x and y axis; None = not known, assumed level."""
+    """Rise per metre along the sensor's x and y axis; None if unknown: assumed level."""
     height: float | None = None
-    """Height of the sensor over the ground, m; None = not known, hits of the ground are not removed."""
+    """Height of the sensor above the ground (m); None if unknown: hits of the ground are not removed."""
     ceiling: float | None = None
-    """Height of the ceiling over the ground, m."""
+    """Height of the ceiling above the ground (m)."""
 
     @classmethod
     def of(cls, scan: LaserScan, mount: Pose2) -> Self:
-        """From the message alone."""
+        """Return the input with the message's data alone."""
         return cls(
             stamp=scan.stamp,
             ranges=np.where((scan.codes == VALID_BEAM) | (scan.codes <= NO_ECHO), scan.ranges, np.nan),
@@ -80,14 +80,14 @@ class Start:
     pose: Pose2 = (0.0, 0.0, 0.0)
     """Base in map at the first scan."""
     body: tuple[float, float] | None = None
-    """Length and width of the robot, m: where it stands the ground is free; None = not known."""
+    """Length and width of the robot (m): the ground under it is free; None if unknown."""
     run: str = ""
-    """Run that makes the map, for its saves; empty = every save is of a run of its own."""
+    """Run that makes the map, for its saves; if empty, every save is a separate run."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerInput:
-    """One step's work; None and False = not requested."""
+    """Work of one step; None and False for parts not requested."""
 
     start: Start | None = None
     scan: ScanInput | None = None
@@ -102,7 +102,7 @@ class WorkerInput:
     trajectory: bool = False
     """Return the poses of all scans."""
     instants: tuple[int, ...] = ()
-    """Return where the base was at these, ns."""
+    """Instants at which to return the pose of base (ns)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,11 +110,12 @@ class ScanIncrement:
     """Motion of base between two accepted matches, by the scans alone."""
 
     since: int
-    """Stamp of the earlier scan, ns."""
+    """Stamp of the earlier scan (ns)."""
     motion: Pose2
     """Base at the later one in base at the earlier one."""
     covariance: tuple[float, ...]
-    """Row-major (3, 3), of the later scan's pose in the map, in base's axes; the earlier one's came with its own."""
+    """Covariance of the later scan's pose in the map, in base's axes, row-major (3, 3); the earlier one's was sent
+    before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +126,7 @@ class SlamEstimate:
     pose: Pose2
     """Base in map at ``stamp``."""
     covariance: tuple[float, ...]
-    """Row-major (3, 3)."""
+    """Covariance of the pose, row-major (3, 3)."""
     map_from_odom: Pose2 | None
     """Odom in map; None without odometry."""
     status: LocalisationStatus
@@ -136,16 +137,16 @@ class SlamEstimate:
     verdict: str
     events: tuple[str, ...] = ()
     offset: float | None = None
-    """Seconds by which odometry runs ahead of the scans; None = none found."""
+    """Lead of odometry over the scans (s); None if none was found."""
     moved: ScanIncrement | None = None
-    """None for the first scan, and after rejected matches."""
+    """Motion since the last match; None for the first scan, and after rejected matches."""
     disagreement: float | None = None
-    """How far the witness's motion over the last seconds is off, m; None = not more than it may be, or no witness."""
+    """Deviation of the witness's motion over the last seconds (m); None if within its limit, or without a witness."""
     odometry: OdometryUse = OdometryUse.NONE
 
 
 class ScanLeftOut(StrEnum):
-    """Why a scan was not used."""
+    """Reason why a scan was not used."""
 
     GEOMETRY = "another geometry"
     ORDER = "not later than the scan before"
@@ -158,20 +159,20 @@ class WorkerOutput:
 
     estimate: SlamEstimate | None = None
     refused: str | None = None
-    """Why the scan was left out, with its figures."""
+    """Reason why the scan was left out, with its figures."""
     left_out: ScanLeftOut | None = None
-    """The same without figures."""
+    """The same reason without figures."""
     tiles: tuple[GridPatch, ...] = ()
     whole: GridPatch | None = None
     counts: dict[str, int] = field(default_factory=dict)
     """Scans, keyframes, closures, rejected matches since the start."""
     saved: str | None = None
     error: str | None = None
-    """Why the map could not be saved."""
+    """Reason why the map could not be saved."""
     trajectory: tuple[NDArray[np.int64], Array] | None = None
-    """Stamps (n,), ns, and poses (n, 3) of base in map at the first beam of every scan; None in a saved map."""
+    """Stamps (n,) (ns), and poses (n, 3) of base in map at the first beam of every scan; None in a saved map."""
     on_map: NDArray[np.bool_] | None = None
-    """Shape (n,): which scans of ``trajectory`` belong to the map, not to a submap that is not joined to it."""
+    """Whether each scan of ``trajectory`` belongs to the map, not to a submap that is not joined to it, shape (n,)."""
     bases: Array | None = None
     """Shape (n, 3): base in map at the instants requested; NaN where it is not known; None in a saved map."""
     joint: bool | None = None

@@ -337,7 +337,7 @@ class PlanningStep:
         memory.drop_explained(lambda places: static_map.unexplained(places, tolerance))
 
     def _plan(self, static_map: StaticMap, task: PlanTask) -> RouteAnswer:
-        """Plan a route that does not reverse onto unseen ground, or one to a lookout on that ground.
+        """Plan a route that does not reverse onto unseen ground, or one to a viewpoint on that ground.
 
         Unseen ground covered by one route is closed to the next.
         """
@@ -361,16 +361,16 @@ class PlanningStep:
         return look or RouteAnswer(Reason.UNSEEN_STOP, text)
 
     def _look(self, static_map: StaticMap, task: PlanTask, unseen: Unseen) -> RouteAnswer | None:
-        """Plan a route to a lookout on the closed ground; None if none was found."""
+        """Plan a route to a viewpoint on the closed ground; None if none was found."""
         assert self._route_map is not None
         lookouts = unseen.lookouts(self._closed, self._route_map.field, self._planner.config.margin)
         if not len(lookouts):
             return None
-        # 5.0: reverse cost when choosing lookouts, so that the robot reaches them driving forward
+        # 5.0: reverse cost when choosing viewpoints, so that the robot reaches them driving forward
         ahead = replace(self._vehicle.reeds_shepp(), reverse_cost=5.0)
         there = np.array([self._vehicle.reference_pose(pose) for pose in lookouts])
         far = ahead.distance(np.tile(self._vehicle.reference_pose(task.pose), (len(there), 1)), there)
-        for index in np.argsort(far)[:4].tolist():  # maximum number of tried lookouts
+        for index in np.argsort(far)[:4].tolist():  # maximum number of tried viewpoints
             x, y, yaw = lookouts[index].tolist()
             answer = self._plan_known(static_map, replace(task, goal=(x, y, yaw), via=()))
             self._route = None

@@ -23,7 +23,7 @@ SOON: Final = 5.0
 PACE: Final = 0.1
 """Mean speed along a route (m/s), used to estimate its time of arrival at a place."""
 SHOWN: Final = 0.6
-"""Fraction of the ground that must be visible from a lookout."""
+"""Fraction of the ground that must be visible from a viewpoint."""
 BESIDE: Final = 0.03
 """Ground within this distance of the body is treated as under it (m), as in the gate."""
 
@@ -95,7 +95,7 @@ class Unseen:
         directions = 12  # number of directions for the positions, and for the headings there
         around = np.arange(directions) * (math.tau / directions)
         x, y = places.mean(axis=0).tolist()
-        # (0.7, 1.1, 1.5): distances of tried lookouts from the unseen ground (m)
+        # (0.7, 1.1, 1.5): distances of tried viewpoints from the unseen ground (m)
         poses = np.array(
             [(x + r * math.cos(a), y + r * math.sin(a), yaw) for r in (0.7, 1.1, 1.5) for a in around for yaw in around]
         )
