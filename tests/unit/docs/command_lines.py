@@ -154,6 +154,9 @@ INSTEAD = {
     "monstertruckd calibrate camera": Instead(
         None, "needs a board held before a camera: tests/daemon/test_calibration_mounts_virtual.py"
     ),
+    "monstertruckd explore --arm --robot turtle": Instead(
+        None, "drives for minutes; tests/daemon/test_explore_virtual.py explores"
+    ),
     "monstertruckd demo --fast -c robot.yaml": Instead(None, OWN_DEVICE),
     "monstertruckd emulate ranger --link /tmp/ranger": Instead(None, OWN_DEVICE),
     "monstertruckd probe ranger --port /tmp/ranger": Instead(None, OWN_DEVICE),
