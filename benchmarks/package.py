@@ -10,24 +10,21 @@ upgraded, rolled back, booted again and purged. Ten minutes each.
 """
 
 import argparse
-import json
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import monotonic
 
-from service import READY_GOAL, Bench, checkout, copy_tree, deaths, emulated_truck, freezable
-from service_parts.machine import Machine, NotBootedError, Output, install_tools, until
+from service import READY_GOAL, Bench, checkout, copy_tree, deaths, emulated_truck, freezable, judged
+from service_parts.machine import Machine, Output, install_tools, until
 
 from monstertruckd import __version__
 from monstertruckd.bootstrap import find_uv
 
 ROOT = Path(__file__).resolve().parents[1]
-OUTPUT = ROOT / "runs" / "benchmarks" / "package.json"
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 DEMO_EXTRAS = ("sim", "slam", "planning")
 CHECKERS = ("twine", "check-wheel-contents")
@@ -250,25 +247,12 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="parts to run")
     parser.add_argument("--keep", type=Path, help="keep the machine in this folder, and use the one that is there")
     arguments = parser.parse_args()
-    with TemporaryDirectory(prefix="package-", dir="/var/tmp") as scratch:
-        folder = arguments.keep or Path(scratch)
-        folder.mkdir(parents=True, exist_ok=True)
-        bench = Packages(Machine(folder / "root", folder / "console.log"))
-        stopped_by = None
-        try:
-            for part in arguments.only:
-                parts[part](bench, Path(scratch))
-        except NotBootedError as error:
-            stopped_by = str(error)
-            print(f"stopped: {error}", file=sys.stderr)
-    met = stopped_by is None and not bench.missed
-    result = {"bench": "package", "figures": bench.figures, "goals": bench.goals, "missed": bench.missed, "met": met}
-    if stopped_by is not None:
-        result["stopped_by"] = stopped_by
-    OUTPUT.parent.mkdir(parents=True, exist_ok=True)
-    OUTPUT.write_text(json.dumps(result, indent=1), encoding="utf-8")
-    print(json.dumps(result))
-    return 0 if met else 1
+
+    def run(bench: Packages, scratch: Path) -> None:
+        for part in arguments.only:
+            parts[part](bench, scratch)
+
+    return judged("package", Packages, arguments.keep, run)
 
 
 if __name__ == "__main__":

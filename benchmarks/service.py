@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import monotonic
-from typing import Any
+from typing import Any, TypeVar
 
 from mcap.reader import make_reader
 from service_parts.machine import Machine, NotBootedError, Output, install_tools, until
@@ -32,7 +32,6 @@ from monstertruckd.tools.drill.observer import STANDING_SPEED, written
 
 ROOT = Path(__file__).resolve().parents[1]
 PARTS = Path(__file__).resolve().parent / "service_parts"
-OUTPUT = ROOT / "runs" / "benchmarks" / "service.json"
 SERVICE = "monstertruckd.service"
 PROGRAM, NEXT, NEVER = (Path("/opt") / name for name in ("monstertruckd", "next", "never"))
 """What is installed first, another version, and one whose gate never ticks."""
@@ -204,6 +203,8 @@ class Bench:
         for words in says:
             self.holds(f"{name}_journal: {words}", any(words in line for line in reported), "\n".join(reported[-40:]))
 
+
+AnyBench = TypeVar("AnyBench", bound=Bench)
 
 # What is tried, in this order
 
@@ -442,29 +443,41 @@ def run(bench: Bench) -> None:
                 stage(bench)
 
 
-def main() -> int:
-    """All stages; 0 = every goal is met."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--keep", type=Path, help="leave what is built in this folder, and use what is there already")
-    arguments = parser.parse_args()
-    with TemporaryDirectory(prefix="service-", dir="/var/tmp") as scratch:
-        folder = arguments.keep or Path(scratch)
+def judged(name: str, kind: type[AnyBench], keep: Path | None, run: Callable[[AnyBench, Path], None]) -> int:
+    """Run a benchmark of the machine, print and write its result; 0 if every goal is met.
+
+    Args:
+        name: Name of the benchmark.
+        kind: Class of its bench.
+        keep: Folder that keeps the machine; None for one that is removed.
+        run: Runs all of it, with a scratch folder; may raise ``NotBootedError``.
+    """
+    with TemporaryDirectory(prefix=f"{name}-", dir="/var/tmp") as scratch:
+        folder = keep or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
-        bench = Bench(Machine(folder / "root", folder / "console.log"))
+        bench = kind(Machine(folder / "root", folder / "console.log"))
         stopped_by = None
         try:
-            run(bench)
+            run(bench, Path(scratch))
         except NotBootedError as error:
             stopped_by = str(error)
             print(f"stopped: {error}", file=sys.stderr)
     met = stopped_by is None and not bench.missed
-    result = {"bench": "service", "figures": bench.figures, "goals": bench.goals, "missed": bench.missed, "met": met}
+    result = {"bench": name, "figures": bench.figures, "goals": bench.goals, "missed": bench.missed, "met": met}
     if stopped_by is not None:
         result["stopped_by"] = stopped_by
-    OUTPUT.parent.mkdir(parents=True, exist_ok=True)
-    OUTPUT.write_text(json.dumps(result, indent=1), encoding="utf-8")
+    output = ROOT / "runs" / "benchmarks" / f"{name}.json"
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps(result, indent=1), encoding="utf-8")
     print(json.dumps(result))
     return 0 if met else 1
+
+
+def main() -> int:
+    """All stages; 0 = every goal is met."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--keep", type=Path, help="leave what is built in this folder, and use what is there already")
+    return judged("service", Bench, parser.parse_args().keep, lambda bench, _: run(bench))
 
 
 if __name__ == "__main__":
