@@ -30,12 +30,14 @@ from monstertruck_estimation.slam.relocation import (
     prediction_is_certain,
 )
 from monstertruck_estimation.slam.scan_matcher import (
+    GATE_LOW_OVERLAP,
     LOW_OVERLAP,
     MIN_PAIRS,
     MatchStatus,
     PlanarMatcher,
     ScanMatch,
     ScanMatcher,
+    off_guess,
     rejected,
 )
 from monstertruck_estimation.slam.scans import Scan, prepare_input
@@ -145,9 +147,7 @@ class Mapper:
             return None
         dt = 0.0 if self._stamp is None else _evenly((stamp - self._stamp) / SECOND, period)
         self._loss.arrive(stamp)
-        predicted, noise = self._motion.predict(dt, odom)
-        scan = self._movers.still(stamp, predicted if self._motion.by_wheels(predicted) else None, scan)
-        (delta, noise), match = self._best_match(scan, (predicted, noise))
+        scan, (delta, noise), match = self._best_match(scan, stamp, self._motion.predict(dt, odom))
         # Time between two scans, s, in which their motion gives the velocity during a scan (for deskewing).
         deskew_period = (0.02, 0.5)
         if again is not None and match.accepted and deskew_period[0] <= dt <= deskew_period[1]:
@@ -188,16 +188,35 @@ class Mapper:
         """Whether the motion between scans is predicted by odometry."""
         return self._motion.use
 
-    def _best_match(self, scan: Scan, motion: tuple[Array, Array]) -> tuple[tuple[Array, Array], ScanMatch]:
-        """Match after the predicted ``motion``, or after the first of the other predictions with a fit."""
+    def _best_match(
+        self, scan: Scan, stamp: int, motion: tuple[Array, Array]
+    ) -> tuple[Scan, tuple[Array, Array], ScanMatch]:
+        """Match after the predicted ``motion``, or after the first of the other predictions with a fit.
+
+        Returns:
+            The scan, without what moves if the predicted motion is right; the motion, and the match after it.
+        """
         match = self._matched(scan, *motion)
+        still = self._still(scan, stamp, motion[0], match)
+        if still is not scan:
+            instead = self._matched(still, *motion)
+            guess, covariance = _moved(self._pose, self._covariance, *motion)
+            # Of wheels that are wrong, walls seem to move: then the rest fits elsewhere.
+            if fits(instead) and (fits(match) or off_guess(instead.pose, guess, covariance) <= GATE_LOW_OVERLAP):
+                return still, motion, instead
         if fits(match) or self._submap is None:
-            return motion, match
+            return scan, motion, match
         for other in self._motion.others:
             instead = self._matched(scan, *other)
             if fits(instead):
-                return other, instead
-        return motion, match
+                return scan, other, instead
+        return scan, motion, match
+
+    def _still(self, scan: Scan, stamp: int, delta: Array, match: ScanMatch) -> Scan:
+        """Return ``scan`` without what moves, by the distance of ``delta`` and the turn of its ``match`` if it fits."""
+        by_wheels = delta if self._motion.by_wheels(delta) else None
+        turn = between(self._pose, match.pose)[2] if fits(match) else delta[2]
+        return self._movers.still(stamp, by_wheels, float(turn), scan)
 
     def _matched(self, scan: Scan, delta: Array, noise: Array) -> ScanMatch:
         """Match ``scan`` after a motion ``delta`` with covariance ``noise``."""

@@ -2,8 +2,8 @@
 
 A crowd that walks along fits itself best where it stood before, so it drags the match with it, most of all in a
 corridor, where walls do not constrain the motion ahead. A point moves if an older scan looked through its place, or if
-what hid its place has left since. A thing that moves is narrow: where a whole wall seems to move, odometry is wrong and
-nothing is marked.
+what hid its place has left since. A thing that moves is narrow: a whole wall that seems to move contradicts odometry,
+and stays.
 """
 
 import math
@@ -57,12 +57,13 @@ class MoverDetector:
         self._newest: tuple[int, Array, View] | None = None
         """Stamp, motion before it and view of the scan that ``settle`` keeps."""
 
-    def still(self, stamp: int, delta: Array | None, scan: Scan) -> Scan:
+    def still(self, stamp: int, delta: Array | None, turn: float, scan: Scan) -> Scan:
         """Return ``scan`` without the points that move.
 
         Args:
             stamp: of the scan, ns.
             delta: shape (3,), motion of base since the scan before by odometry; None without trusted odometry.
+            turn: of base since then by the match of the whole scan, rad.
             scan: points in base.
         """
         if delta is None or not len(scan):
@@ -80,7 +81,8 @@ class MoverDetector:
         if not old:
             return scan
         _, pose, before = old[-1]
-        marks = narrow(scan.points, moved(view, before, between(pose, compose(self._pose, delta))))
+        here = compose(self._pose, np.array((delta[0], delta[1], turn)))
+        marks = narrow(scan.points, moved(view, before, between(pose, here)))
         return scan.chosen(~marks) if marks.any() else scan
 
     def settle(self, turn: float) -> None:
@@ -108,7 +110,7 @@ def moved(view: View, before: View, motion: Array) -> Marks:
 def narrow(points: Array, marks: Marks) -> Marks:
     """The marked ones of ``points``, shape (n, 2), in the order of the beams, that form things of 0.8 m at most.
 
-    None where wider things have more points: then it is odometry that is wrong.
+    Wider things stay: a wall that seems to move contradicts odometry.
     """
     numbers = np.flatnonzero(marks)
     if not len(numbers):
@@ -122,7 +124,7 @@ def narrow(points: Array, marks: Marks) -> Marks:
     widths = np.hypot(*(chosen[last] - chosen[first]).T)
     result = np.zeros_like(marks)
     result[numbers[(widths <= 0.8)[things]]] = True
-    return result if 2 * result.sum() > len(numbers) else np.zeros_like(marks)
+    return result
 
 
 UNKNOWN: Final = 0

@@ -22,7 +22,7 @@ from monstertruck_estimation.slam.closure import CONTRADICTION, VIEW, LoopCloser
 from monstertruck_estimation.slam.correlation import Peak, Submap, correlate, look_ups
 from monstertruck_estimation.slam.keyframes import Join, KeyframeMap
 from monstertruck_estimation.slam.motion import OVERLAP_DROP, OVERLAP_GAIN
-from monstertruck_estimation.slam.scan_matcher import GATE_LOW_OVERLAP, LOW_OVERLAP, ScanMatch, deviations
+from monstertruck_estimation.slam.scan_matcher import GATE_LOW_OVERLAP, LOW_OVERLAP, ScanMatch, deviations, off_guess
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between, compose
@@ -71,9 +71,7 @@ class LossDetector:
         """
         if not match.accepted or match.overlap >= self._usual - OVERLAP_DROP:
             return False
-        off = match.pose - guess
-        off[2] = math.remainder(off[2], math.tau)
-        return float(off @ np.linalg.solve(covariance, off)) > GATE_LOW_OVERLAP**2
+        return off_guess(match.pose, guess, covariance) > GATE_LOW_OVERLAP
 
     @property
     def sparse(self) -> bool:
@@ -146,14 +144,11 @@ def led_there(match: ScanMatch, guess: Array, covariance: Array) -> bool:
 
     The wheels must know the position; a turn over the gap may have made the yaw uncertain, which the scan shows.
     """
-    off = match.pose - guess
-    off[2] = math.remainder(off[2], math.tau)
     # Maximum Mahalanobis distance from the predicted pose of a match where the wheels led. Half of the right matches
     # are that near (chi-square of three degrees of freedom: 48 %), and one in fifteen of the wrong ones, which are
     # spread over the matcher's ``WINDOW`` of three standard deviations on each axis (a ball in a cube).
     led = 1.5
-    near = float(off @ np.linalg.solve(covariance, off)) <= led**2
-    return near and deviations(covariance)[0] <= CERTAIN_PREDICTION[0]
+    return off_guess(match.pose, guess, covariance) <= led and deviations(covariance)[0] <= CERTAIN_PREDICTION[0]
 
 
 OFF_MOTION: Final = (0.5, 1.0)

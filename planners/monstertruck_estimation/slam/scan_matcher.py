@@ -138,20 +138,23 @@ def gated(fit: Fit, guess: Array, covariance: Array) -> ScanMatch:
     """Accept or reject a fit with predicted pose ``guess`` and its ``covariance``, shape (3, 3)."""
     ratio, direction = degeneracy(fit.information)
     verdict = MatchStatus.ACCEPTED
-    off = fit.pose - guess
-    off[2] = math.remainder(off[2], math.tau)
     if fit.pairs < MIN_PAIRS:
         verdict = MatchStatus.EMPTY
     elif fit.overlap < MIN_OVERLAP:
         verdict = MatchStatus.OVERLAP
-    elif (
-        float(off @ np.linalg.solve(covariance, off)) > (GATE if fit.overlap >= LOW_OVERLAP else GATE_LOW_OVERLAP) ** 2
-    ):
+    elif off_guess(fit.pose, guess, covariance) > (GATE if fit.overlap >= LOW_OVERLAP else GATE_LOW_OVERLAP):
         verdict = MatchStatus.FAR
     posterior = np.linalg.inv(fit.information + np.linalg.inv(covariance))
     if verdict is not MatchStatus.ACCEPTED:
         return ScanMatch(guess, covariance, fit.overlap, fit.residual, ratio, direction, verdict)
     return ScanMatch(fit.pose, posterior, fit.overlap, fit.residual, ratio, direction, verdict, fit.information)
+
+
+def off_guess(pose: Array, guess: Array, covariance: Array) -> float:
+    """Return the Mahalanobis distance of ``pose`` from ``guess``, both shape (3,), with its ``covariance``, (3, 3)."""
+    off = pose - guess
+    off[2] = math.remainder(off[2], math.tau)
+    return math.sqrt(float(off @ np.linalg.solve(covariance, off)))
 
 
 def rejected(guess: Array, covariance: Array, verdict: MatchStatus) -> ScanMatch:
