@@ -7,8 +7,9 @@ NODE and BAUD must equal ``driver.node`` and ``port.baud`` of the configuration'
 controller as delivered. Of a VESC WORDS are ``AMPERES:ERPM:ID,...``: it is braked by that current until all motors are
 slower than ERPM; an empty ID is the controller that is connected. Steppers (quick stop, then coils off) and boards with
 ROSArduinoBridge (voltage off) have no WORDS, those of a speed controller on a Maestro are ``CHANNEL:QUARTERS`` of its
-neutral pulse. Needs nothing but Python's standard library and the codecs installed with
-it. Exit code 0 once every controller has stopped, 1 if one did not within five seconds, for whatever reason.
+neutral pulse, those of one on a PCA9685 ``ADDRESS:CHANNEL:COUNTS``. Needs nothing but Python's standard library and the
+codecs installed with it. Exit code 0 once every controller has stopped, 1 if one did not within five seconds, for
+whatever reason.
 """
 
 import contextlib
@@ -28,7 +29,9 @@ sys.path += [str(HERE.parents[1] / "drivers"), str(HERE.parents[2])]  # a checko
 
 from monstertruck_drivers.arduino_bridge import protocol as board
 from monstertruck_drivers.epos.protocol import EPOS_BAUD, Frame, FrameError, decode_body, stop_frames
+from monstertruck_drivers.i2c import bus as i2c
 from monstertruck_drivers.maestro import protocol as maestro
+from monstertruck_drivers.pca9685 import protocol as pca9685
 from monstertruck_drivers.steppers import protocol as steppers
 from monstertruck_drivers.vesc import protocol as vesc
 
@@ -73,7 +76,13 @@ def job(argument: str) -> tuple[str, Callable[[], None]]:
     if not colon:
         return port, partial(stop, *drive(argument))
     words, _, baud = rest.partition("@")
-    others = {"vesc": stop_vesc, "steppers": stop_steppers, "arduino_bridge": stop_board, "maestro_esc": stop_esc}
+    others = {
+        "vesc": stop_vesc,
+        "steppers": stop_steppers,
+        "arduino_bridge": stop_board,
+        "maestro_esc": stop_esc,
+        "pca9685_esc": stop_pca9685,
+    }
     return port, partial(others[kind], port, words, int(baud))
 
 
@@ -224,6 +233,26 @@ def stop_esc(port: str, words: str, baud: int) -> None:
         (position,) = maestro.words(receive(line, 2))
     if position != quarters:
         raise NotStoppedError(f"the pulse is {position / 4} us")
+
+
+def stop_pca9685(port: str, words: str, baud: int) -> None:
+    """Send the neutral pulse to the speed controller on a PCA9685, and read it back.
+
+    Raises:
+        OSError: the bus cannot be used, or the chip does not acknowledge.
+        NotStoppedError: the chip sends another pulse.
+    """
+    del baud
+    address, channel, counts = map(int, words.split(":"))
+    bus = os.open(port, os.O_RDWR)
+    try:
+        for i, value in enumerate(pca9685.pulse(channel, counts)[1:]):  # one by one: it may not increment
+            i2c.transfer(bus, address, bytes((pca9685.register_of(channel) + i, value)))
+        present = b"".join(i2c.transfer(bus, address, bytes((pca9685.register_of(channel) + i,)), 1) for i in range(4))
+    finally:
+        os.close(bus)
+    if pca9685.counts_of(present) != counts:
+        raise NotStoppedError(f"the pulse is {pca9685.counts_of(present)} counts")
 
 
 def step_rates(line: int, verb: str) -> list[float]:

@@ -251,8 +251,9 @@ class DeviceKind(Plugin):
     also: Mapping[str, Topic[Any]] = field(default_factory=dict)
     """Topics written in addition to the role's topics, by the driver's parameter. The driver gets None if the topic is
     the main topic of another configured device."""
-    opens: Literal["serial", "video", "computer"] = "serial"
-    """What driver and probe get: a serial ``Port``, a ``FrameSource`` (the probe: a path), or the ``Computer``."""
+    opens: Literal["serial", "i2c", "video", "computer"] = "serial"
+    """What driver and probe get: the ``Port`` of a serial line or of an I2C bus, a ``FrameSource`` (the probe: a path),
+    or the ``Computer``."""
     baud: int | None = None
     """Baud rate of its serial line; None = USB from end to end, any rate works."""
     framing: Framing | None = None
@@ -437,6 +438,26 @@ DEVICES: Final = DeviceCatalog(
         emulator="monstertruck_drivers.maestro.emulator:emulated",
         probe="monstertruck_drivers.maestro.probe:probe",
         usb=UsbIdentity("1ffb:0089", "Pololu Micro Maestro 6-Servo Controller", "ttyACM"),
+    ),
+    DeviceKind(
+        name="pca9685_esc",
+        doc="Radio-control speed controller on a PCA9685 that steers as well",
+        roles=(ACTUATORS,),
+        settings="monstertruck_drivers.pca9685.config:Pca9685EscConfig",
+        implementation="monstertruck_drivers.pca9685.esc_driver:Pca9685EscDriver",
+        emulator="monstertruck_drivers.pca9685.emulator:emulated_esc",
+        probe="monstertruck_drivers.pca9685.probe:probe_esc",
+        opens="i2c",
+    ),
+    DeviceKind(
+        name="pca9685",
+        doc="NXP PCA9685 servo controller on an I2C bus",
+        roles=(STEERING,),
+        settings="monstertruck_drivers.pca9685.config:Pca9685Config",
+        implementation="monstertruck_drivers.pca9685.driver:Pca9685Driver",
+        emulator="monstertruck_drivers.pca9685.emulator:emulated",
+        probe="monstertruck_drivers.pca9685.probe:probe",
+        opens="i2c",
     ),
     DeviceKind(
         name="ax12",

@@ -196,6 +196,13 @@ class _Devices(Schema):
         return self
 
     @model_validator(mode="after")
+    def _buses_by_path(self) -> Self:
+        for role, device in self.present().items():
+            if device.kind.opens == "i2c" and not isinstance(device.port, PortConfig):
+                raise ValueError(f"{role}: a {device.kind.name} is on an I2C bus; expected a path such as /dev/i2c-1")
+        return self
+
+    @model_validator(mode="after")
     def _one_writer_each(self) -> Self:
         owners: dict[str, str] = {}
         for role, device in self.present().items():

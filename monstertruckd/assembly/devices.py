@@ -2,11 +2,13 @@
 
 import asyncio
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from monstertruck_drivers.catalog import DEVICES, Duty, RoleSpec
 from monstertruck_drivers.computer import Computer, Machine
 from monstertruck_drivers.config import AnyPort, Device, TcpPortConfig, kind_of
+from monstertruck_drivers.i2c.port import I2cPort
 from monstertruck_drivers.link import BAUD, Port
 from monstertruck_drivers.tcp import TcpPort
 from monstertruck_drivers.tty import SerialPort
@@ -72,6 +74,10 @@ class Cabling:
         if isinstance(port, TcpPortConfig):
             return TcpPort(port.address, port.tcp)
         return SerialPort(port.path, port.baud or BAUD, dtr=port.dtr, rts=port.rts, framing=port.framing or "8N1")
+
+    def bus(self, role: str) -> Port:
+        """I2C bus of a device."""
+        return self._given.get(role) or I2cPort(Path(self._ports[role].label))
 
     def camera(self, role: str) -> FrameSource:
         """Where a camera's pictures come from."""
@@ -141,6 +147,8 @@ def build_drivers(
         match kind.opens:
             case "serial":
                 where: Any = cabling.port(role.name)
+            case "i2c":
+                where = cabling.bus(role.name)
             case "video":
                 where = cabling.camera(role.name)
             case "computer":

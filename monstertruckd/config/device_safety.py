@@ -15,6 +15,7 @@ from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig, HokuyoLxConfig
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
 from monstertruck_drivers.os4000.config import Os4000Config
+from monstertruck_drivers.pca9685.config import Pca9685Config, Pca9685EscConfig
 from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_drivers.vesc.config import VescConfig
 from monstertruck_schemas.base import Schema
@@ -41,6 +42,7 @@ WEAKER_ABOVE: Final[dict[type[Schema], tuple[str, ...]]] = {
         "watchdog",
     ),
     MaestroConfig: ("answer_timeout", "command_timeout"),
+    Pca9685Config: ("answer_timeout", "command_timeout"),
     HokuyoConfig: ("skip",),
     HokuyoLxConfig: ("skip",),
     Os4000Config: ("delay", "field_tolerance", "gravity_tolerance"),
@@ -69,6 +71,7 @@ WEAKER_BELOW: Final[dict[type[Schema], tuple[str, ...]]] = {
     ArduinoBridgeConfig: ("deceleration", "quick_deceleration", "rate"),
     VescConfig: ("deceleration_rpm_s", "quick_stop_deceleration_rpm_s", "brake_current", "rate", "battery_rate"),
     MaestroConfig: ("poll_rate", "battery_rate"),
+    Pca9685Config: ("poll_rate",),
     HokuyoConfig: (),
     HokuyoLxConfig: (),
     Os4000Config: (),
@@ -83,6 +86,8 @@ UNATTENDED: Final[dict[type[Schema], tuple[str, ...]]] = {
     VescConfig: ("command_timeout", "watchdog"),
     MaestroConfig: ("command_timeout",),
     MaestroEscConfig: ("command_timeout",),
+    Pca9685Config: ("command_timeout",),
+    Pca9685EscConfig: ("command_timeout",),
 }
 """Times in which the truck drives on whatever happens."""
 
@@ -134,7 +139,9 @@ def weakened_devices(devices: Devices, monitors: Monitors) -> Iterator[str]:
             yield from _weaker(place, driver, type(driver)())
         if isinstance(driver, StepperConfig):
             yield f"{place}: steppers report the steps commanded: a wheel that is held or slips is not noticed"
-        if isinstance(driver, MaestroEscConfig):
+        if isinstance(driver, Pca9685Config | Pca9685EscConfig):
+            yield f"{place}: a PCA9685 has no watchdog: it repeats the latest pulses while the computer hangs"
+        if isinstance(driver, MaestroEscConfig | Pca9685EscConfig):
             yield f"{place}: nothing measures the motor: a wheel that is held, slips or rolls on is not noticed"
         if isinstance(driver, ArduinoBridgeConfig):
             yield f"{place}: its lines have no sum: a damaged command runs the motors until the next one"

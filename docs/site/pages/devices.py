@@ -59,12 +59,12 @@ def _page(kind: DeviceKind, habits: str | None) -> Page:
         _without_faults(emulator.__doc__),
         "## Faults",
         _faults(emulator),
-        LINE_FAULTS if kind.opens == "serial" else "",
+        LINE_FAULTS if kind.opens in ("serial", "i2c") else "",
     )
     return Page(f"devices/{kind.name}.md", f"{kind.role.name}: {kind.name}", text)
 
 
-PROBED = {"serial": " --port /dev/...", "video": " --port '/dev/video*'", "computer": ""}
+PROBED = {"serial": " --port /dev/...", "i2c": " --port /dev/i2c-1", "video": " --port '/dev/video*'", "computer": ""}
 
 
 def _facts(kind: DeviceKind) -> str:

@@ -1,55 +1,30 @@
 """Configuration of the Maestro: servo calibration, battery scale and thresholds, deadman."""
 
-import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from monstertruck_drivers.battery.config import PackConfig
 from monstertruck_drivers.maestro.protocol import ADC_MAX, CHANNELS
+from monstertruck_drivers.servos import ServoPulses
 from monstertruck_drivers.shafts import SteeringOutputs
 from monstertruck_schemas.base import Schema
 
 Channel = Annotated[int, Field(ge=0, lt=CHANNELS)]
-Microseconds = Annotated[float, Field(gt=0, le=4000)]
 
 
-class ServoConfig(Schema):
-    """One steering servo: ``pulse_us = centre_us + direction * scale_us_per_deg * servo angle in degrees``."""
+class ServoConfig(ServoPulses):
+    """Steering servo on a channel."""
 
     channel: Channel
-    centre_us: Microseconds = 1439.2
-    """Pulse that steers straight ahead."""
-    scale_us_per_deg: Annotated[float, Field(gt=0)] = 10.48
-    direction: Literal[-1, 1] = -1
-    """+1 where a longer pulse steers left, -1 where it steers right; a matter of how the servo is mounted."""
-    min_us: Microseconds = 1088.0
-    max_us: Microseconds = 1840.0
-    max_angle_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
     speed: Annotated[int, Field(ge=0, le=0x3FFF)] = 100
     """Speed limit of the pulse (0.25 us per 10 ms); 0 = unlimited."""
     acceleration: Annotated[int, Field(ge=0, le=255)] = 0
     """Acceleration limit of the pulse (0.25 us per 10 ms per 80 ms); 0 = unlimited."""
 
-    @model_validator(mode="after")
-    def _centre_within_limits(self) -> Self:
-        if not self.min_us < self.centre_us < self.max_us:
-            raise ValueError(f"min_us {self.min_us} < centre_us {self.centre_us} < max_us {self.max_us} does not hold")
-        return self
-
     def quarters(self, angle: float) -> int:
         """Target in quarter microseconds for a servo angle (rad, left positive), held within all limits."""
-        limit = self.max_angle_deg
-        degrees = min(max(math.degrees(angle), -limit), limit)
-        pulse = self.centre_us + self.direction * self.scale_us_per_deg * degrees
-        return round(4 * min(max(pulse, self.min_us), self.max_us))
-
-    @property
-    def reach(self) -> tuple[float, float]:
-        """Servo angles, rad, to the right (negative) and to the left, that pulses within all limits give."""
-        ends = sorted(self.angle(round(4 * pulse)) for pulse in (self.min_us, self.max_us))
-        limit = math.radians(self.max_angle_deg)
-        return max(ends[0], -limit), min(ends[1], limit)
+        return round(4 * self.pulse_us(angle))
 
     def within_limits(self, quarters: int) -> bool:
         """Whether a pulse (quarter microseconds) can be a target of this driver."""
@@ -58,7 +33,7 @@ class ServoConfig(Schema):
 
     def angle(self, quarters: int) -> float:
         """Servo angle (rad, left positive) of a pulse in quarter microseconds."""
-        return math.radians((quarters / 4 - self.centre_us) * self.direction / self.scale_us_per_deg)
+        return self.angle_of(quarters / 4)
 
 
 class BatteryInputConfig(PackConfig):

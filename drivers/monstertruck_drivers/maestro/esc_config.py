@@ -1,44 +1,23 @@
 """Settings of a radio-control speed controller (ESC) on a channel of a Maestro, which steers as well."""
 
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
-from monstertruck_drivers.maestro.config import BatteryInputConfig, Channel, MaestroConfig, Microseconds
+from monstertruck_drivers.maestro.config import BatteryInputConfig, Channel, MaestroConfig
+from monstertruck_drivers.servos import EscPulses
 from monstertruck_drivers.shafts import MotorLimits, SteeringOutputs
 from monstertruck_schemas.base import Schema
 
 
-class EscConfig(Schema):
-    """Speed controller without feedback: ``pulse_us = neutral_us + direction * reach_us * rate / max_rate``.
-
-    It must reverse without braking first (crawler mode); a car's usual mode takes the first reverse pulse for a brake.
-    """
+class EscConfig(EscPulses):
+    """Speed controller on a channel."""
 
     channel: Channel = 2
-    neutral_us: Microseconds = 1500.0
-    """Pulse at which the motor stands still"""
-    reach_us: Annotated[float, Field(gt=0, le=1000)] = 400.0
-    """Change of the pulse that makes the motor turn at max_rate"""
-    direction: Literal[-1, 1] = 1
-    """+1 where a longer pulse drives forward"""
-    max_rate: Annotated[float, Field(gt=0, le=10_000)] = 300.0
-    """Rate at the end of the pulses, as measured, rad/s; requests are limited to this"""
-    deceleration: Annotated[float, Field(gt=0)] = 400.0
-    """Deceleration by a lower pulse, as measured, rad/s^2"""
-    quick_deceleration: Annotated[float, Field(gt=0)] = 500.0
-    """Deceleration at the neutral pulse, as measured, rad/s^2"""
-    arming: Annotated[float, Field(ge=0, le=10)] = 2.0
-    """Seconds of neutral pulses that it wants before it moves"""
 
     def quarters(self, rate: float) -> int:
         """Target in quarter microseconds for a rate, rad/s, forward positive, held within the limits."""
-        share = min(max(rate / self.max_rate, -1.0), 1.0)
-        return round(4 * (self.neutral_us + self.direction * self.reach_us * share))
-
-    def rate(self, pulse_us: float) -> float:
-        """Rate that a pulse asks for, rad/s, forward positive."""
-        return (pulse_us - self.neutral_us) * self.direction / self.reach_us * self.max_rate
+        return round(4 * self.pulse_us(rate))
 
 
 class MaestroEscConfig(Schema):

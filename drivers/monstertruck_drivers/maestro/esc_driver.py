@@ -5,24 +5,16 @@ make it neutral, as do start and end of a session. The unit's serial time-out is
 channel to the neutral pulse. The motor is not measured: the reported rate is the commanded rate, slowed as configured.
 """
 
-import math
-from typing import Final
-
+from monstertruck_drivers.esc import UnmeasuredMotor
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.maestro.driver import MaestroDriver
 from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
 from monstertruck_drivers.maestro.session import MaestroSession
-from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import ConfigError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_schemas.cmd import DriveAction, DriveCommand, SteeringCommand
-from monstertruck_schemas.sensor import Battery, DriveFeedback, DriveMode, SteeringFeedback
-
-MODES: Final = {
-    DriveAction.RUN: DriveMode.ENABLED,
-    DriveAction.QUICK_STOP: DriveMode.QUICK_STOP,
-    DriveAction.DISABLE: DriveMode.DISABLED,
-}
+from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
+from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
 
 
 class MaestroEscDriver(MaestroDriver):
@@ -73,49 +65,16 @@ class MaestroEscDriver(MaestroDriver):
             raise ConfigError(f"devices.{name}: another device steers; kind maestro_esc does it itself")
         super().__init__(config.unit, port, clock, steering_commands, steering, battery, events, name, drive=drive)
         self._esc = config.esc
-        self._drive_commands = commands
-        self._drive_out = out
-        self._ready_at = 0
-        """When the speed controller has had its neutral pulses, ns."""
-        self._rate = self._turned = 0.0
-        """Estimated rate, rad/s, and angle, rad, at ``_at``."""
-        self._at = 0
+        self._motor = UnmeasuredMotor(config.esc, clock, commands, out, config.command_timeout)
 
     async def run(self, ready: Ready) -> None:
         """Serve one session; raises as ``MaestroDriver.run``."""
-        self._ready_at = self._clock.now() + round(self._esc.arming * SECOND)
+        self._motor.begin()
         await super().run(ready)
 
     def _more(self, session: MaestroSession, *, rest: bool = False) -> list[bytes]:
-        rate = 0.0 if rest else self._wanted(self._clock.now())
-        return [session.encode.set_target(self._esc.channel, self._esc.quarters(rate))]
-
-    def _wanted(self, now: int) -> float:
-        """Rate to ask for, rad/s."""
-        command = self._drive_commands.latest
-        fresh = command is not None and now - command.stamp <= self._config.command_timeout * SECOND
-        if command is None or not fresh or command.action is not DriveAction.RUN or now < self._ready_at:
-            return 0.0
-        limit = self._esc.max_rate
-        return min(max(command.motor_velocity, -limit), limit)
+        pulse = self._esc.neutral_us if rest else self._motor.pulse_us()
+        return [session.encode.set_target(self._esc.channel, round(4 * pulse))]
 
     def _polled(self, stamp: int, received: int) -> None:
-        """Publish the rate that the motor may have: it slows down as configured."""
-        wanted, command = self._wanted(stamp), self._drive_commands.latest
-        dt = min(max((stamp - self._at) / SECOND, 0.0), 1.0) if self._at else 0.0
-        before = self._rate
-        slowest = abs(before) - self._esc.quick_deceleration * dt
-        slows = before * wanted < 0 or abs(wanted) < slowest
-        self._rate = math.copysign(max(slowest, 0.0), before) if slows else wanted
-        self._turned += (before + self._rate) / 2 * dt
-        self._at = stamp
-        self._drive_out.put(
-            DriveFeedback(
-                stamp=stamp,
-                received=received,
-                seq=self._drive_out.next_seq(),
-                position=self._turned,
-                velocity=self._rate,
-                mode=DriveMode.DISABLED if command is None else MODES[command.action],
-            )
-        )
+        self._motor.publish(stamp, received)

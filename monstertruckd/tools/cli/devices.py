@@ -32,7 +32,8 @@ DeviceArgument = Annotated[
 ]
 
 OWN_CLIENTS: Final = {
-    "video": "no video device: only this project's webcam driver, on `port: { path: ... }`, understands what it speaks"
+    "video": "no video device: only this project's webcam driver, on `port: { path: ... }`, understands what it speaks",
+    "i2c": "no I2C bus: only this project's drivers and `probe` understand what it speaks",
 }
 """What an emulator's link is not, by what its driver opens."""
 
@@ -93,6 +94,7 @@ def probe(
     """Handshake with a device and print its identity, state and first samples. Moves nothing."""
     from monstertruck_drivers.catalog import DEVICES
     from monstertruck_drivers.computer import ROOT, Computer
+    from monstertruck_drivers.i2c.port import I2cPort
     from monstertruck_drivers.link import BAUD
     from monstertruck_drivers.tcp import TcpPort, parse_address
     from monstertruck_drivers.tty import SerialPort
@@ -100,7 +102,7 @@ def probe(
     from monstertruck_runtime.errors import InputError, NotFoundError
 
     kind = DEVICES.named(device)
-    if kind.opens == "serial" and port is None:
+    if kind.opens in ("serial", "i2c") and port is None:
         raise InputError(f"{device}: say where it hangs with --port")
     if kind.opens == "computer" and port is not None:
         raise InputError(f"{device}: is the computer's own and hangs on no port; leave out --port")
@@ -109,6 +111,8 @@ def probe(
         where: Any = Computer.at(ROOT, clock)
         if kind.opens == "video":
             where = str(port or "/dev/video*")
+        elif kind.opens == "i2c" and port is not None:
+            where = I2cPort(port)
         elif port is not None and (address := parse_address(str(port))) is not None:
             where = TcpPort(*address)
         elif port is not None:

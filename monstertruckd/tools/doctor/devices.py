@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from monstertruck_drivers.catalog import DeviceKind
-from monstertruck_drivers.config import AnyPort, Device, TcpPortConfig
+from monstertruck_drivers.config import Device, PortConfig, TcpPortConfig
+from monstertruck_drivers.i2c.port import I2cPort
 from monstertruck_drivers.link import BAUD, Port
 from monstertruck_drivers.tcp import TcpPort
 from monstertruck_drivers.usb.config import UsbPortConfig
@@ -19,6 +20,7 @@ from monstertruckd.tools.doctor.context import Finding, HostContext, fail, fine,
 
 MODULES = {"0403": "ftdi_sio", "10c4": "cp210x", "067b": "pl2303"}
 """Kernel modules by vendor; all others are USB-CDC."""
+MODPROBE_I2C: Final = "sudo modprobe i2c-dev"
 SUPPLY: Final = "what hangs there draws too much, or its cable is damaged: use a hub with a supply of its own"
 
 
@@ -36,7 +38,7 @@ def wiring(context: HostContext) -> Iterator[Finding]:
         elif isinstance(device.port, TcpPortConfig):
             yield fine(role, f"at {device.port.label} on the network")
         else:
-            yield _by_path(context, role, device.port)
+            yield _by_path(context, role, device)
     for name, count in tree.over_current.items():
         if count and name in taken:
             yield warn(
@@ -44,10 +46,12 @@ def wiring(context: HostContext) -> Iterator[Finding]:
             )
 
 
-def _by_path(context: HostContext, role: str, port: AnyPort) -> Finding:
-    node = context.node(port)
+def _by_path(context: HostContext, role: str, device: Device[Any]) -> Finding:
+    node = context.node(device.port)
     if node is None:
-        seen = f"{vars(port)['path']}: no such node"
+        seen = f"{device.port.label}: no such node"
+        if device.kind.opens == "i2c":
+            return fail(role, Reason.DEVICE_LOST, f"{seen}; enable the bus in the computer's settings", MODPROBE_I2C)
         return fail(role, Reason.DEVICE_LOST, seen, context.find_port_command(role))
     return fine(role, str(node))
 
@@ -162,6 +166,8 @@ async def _probe(
         return await kind.probe_function()(place, machine.clock, device.driver)
     line: Port
     match port:
+        case PortConfig() if kind.opens == "i2c":
+            line = I2cPort(Path(place))
         case UsbPortConfig():
             line = HubPort(port, machine, lambda *_, **__: None, role=role)
         case TcpPortConfig():

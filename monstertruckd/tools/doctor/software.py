@@ -181,17 +181,20 @@ def rights(context: HostContext) -> Iterator[Finding]:
         seen = "the service's user does not exist"
         yield fail("user", Reason.NOT_PERMITTED, seen, context.install_command())
         return
-    lacking = [group for group in ("dialout", "video") if account.uid and group not in account.groups]
+    devices = context.config.devices.present() if context.config is not None else {}
+    buses = ["i2c"] if any(device.kind.opens == "i2c" for device in devices.values()) else []
+    lacking = [group for group in ("dialout", *buses, "video") if account.uid and group not in account.groups]
     usermod = f"sudo usermod -aG {','.join(lacking)} {account.name}"
     if lacking:
         seen = f"{account.name} is not in {' and '.join(lacking)} (takes effect at the next login)"
         yield fail("user", Reason.NOT_PERMITTED, seen, usermod)
     else:
         yield fine("user", f"{account.name}, groups {', '.join(account.groups) or 'all as root'}")
-    for role, device in context.config.devices.present().items() if context.config is not None else ():
+    for role, device in devices.items():
         node = context.node(device.port, camera=device.kind.opens == "video")
         if node is not None and node.exists() and not account.may_use(node):
-            fix = usermod if lacking else f"sudo chgrp dialout {node} && sudo chmod g+rw {node}"
+            group = "i2c" if device.kind.opens == "i2c" else "dialout"
+            fix = usermod if lacking else f"sudo chgrp {group} {node} && sudo chmod g+rw {node}"
             yield fail(f"{role} rights", Reason.NOT_PERMITTED, f"{account.name} may not use {node}", fix)
     if context.config is not None and context.config.recorder is not None:
         folder = _existing(context.logs())

@@ -77,3 +77,16 @@ async def test_a_sensor_on_the_network_is_reached_by_its_address():
             await asyncio.sleep(0.05)
             cable.device.write(b"there")
             assert (await link.read(2.0)).startswith(b"there")
+
+
+def test_a_bus_is_opened_by_its_path_or_given():
+    steering = SimpleNamespace(port=PortConfig(path=Path("/dev/i2c-1")))
+    config: Any = SimpleNamespace(devices=SimpleNamespace(present=lambda: {"steering": steering}), usb=UsbConfig())
+
+    async def main(clock: VirtualClock) -> None:
+        computer: Any = SimpleNamespace(machine=SimpleNamespace(clock=clock))
+        bus, cable = Bus(clock), MemoryPort("given")
+        assert Cabling(config, computer, bus, {}).bus("steering").name == "/dev/i2c-1"
+        assert Cabling(config, computer, bus, {"steering": cable}).bus("steering") is cable
+
+    run_virtual(main)

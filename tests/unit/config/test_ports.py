@@ -106,3 +106,13 @@ def test_the_shipped_truck_has_everything_on_two_hubs():
     assert set(ports) == {"lidar", "drive", "steering", "compass", "stabiliser", "camera"}
     assert {port.hub for port in ports.values() if isinstance(port, UsbPortConfig)} == {"1-1", "1-2"}
     assert ports["stabiliser"].baud == 1_000_000
+
+
+def test_an_i2c_bus_has_a_path(tmp_path: Path):
+    steering = "devices:\n  steering: {port: %s, driver: {kind: pca9685, rear: {channel: 4}}}\n"
+    config = truck(tmp_path, steering % "{path: /dev/i2c-1}")
+    assert config.devices.steering is not None
+    assert config.devices.steering.port.label == "/dev/i2c-1"
+    assert any("a PCA9685 has no watchdog" in text for text in config.weakened())
+    with pytest.raises(ConfigError, match="steering: a pca9685 is on an I2C bus; expected a path such as /dev/i2c-1"):
+        truck(tmp_path, steering % '{hub: "1-1", port: 1}')

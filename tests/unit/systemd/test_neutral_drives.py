@@ -2,8 +2,10 @@
 
 import asyncio
 import contextlib
+import importlib.util
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,9 @@ from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
 from monstertruck_drivers.maestro.esc_emulator import MaestroEscEmulator
+from monstertruck_drivers.pca9685.config import Pca9685EscConfig
+from monstertruck_drivers.pca9685.emulator import Pca9685Emulator
+from monstertruck_drivers.pca9685.protocol import pulse
 from monstertruck_drivers.steppers.emulator import StepperEmulator
 from monstertruck_drivers.vesc.config import VescConfig, VescMotorConfig
 from monstertruck_drivers.vesc.emulator import VescEmulator
@@ -96,3 +101,27 @@ async def test_a_motor_that_disobeys_and_a_silent_controller_are_reported(tmp_pa
     assert done.returncode == 1
     assert "a motor still turns at 1800 electrical rpm" in done.stderr
     assert "no answer" in done.stderr
+
+
+@pytest.mark.parametrize("disobeys", [False, True])
+def test_a_speed_controller_on_a_pca9685_gets_its_neutral_pulse(tmp_path, monkeypatch, capsys, disobeys):
+    spec = importlib.util.spec_from_file_location("neutral", SCRIPT)
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    config, chip = Pca9685EscConfig(), Pca9685Emulator(WallClock())
+    for data in (b"\x00\x20", pulse(config.esc.channel, 400)):
+        chip.transfer(0x40, data, 0)
+    if disobeys:
+        chip.signals.inject(f"target_{config.esc.channel}", "ignored")
+    bus = tmp_path / "i2c-1"
+    bus.touch()
+    monkeypatch.setattr(script.i2c, "transfer", lambda _, address, data, count=0: chip.transfer(address, data, count))
+    monkeypatch.setattr(script, "TIMEOUT", 0.1)
+    code = script.main([f"{bus}=pca9685_esc:{config.stop_words}@115200"])
+    assert code == disobeys
+    if disobeys:
+        assert "the pulse is 400 counts" in capsys.readouterr().err
+    else:
+        time.sleep(0.001)
+        neutral_us = chip.pulse_us(config.esc.channel, WallClock().now())
+        assert neutral_us == pytest.approx(config.esc.neutral_us * 31 / 122, abs=5), "at the frequency of power-up"

@@ -7,7 +7,8 @@ import pytest
 from monstertruck_drivers.config import PortConfig
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.doctor.context import Level
-from monstertruckd.tools.doctor.devices import wiring
+from monstertruckd.tools.doctor.devices import handshakes, wiring
+from monstertruckd.tools.doctor.software import rights
 from tests.unit.tools.doctor.kit import EmulatedHost, bad, see
 from tests.unit.tools.install.kit import TRUCK
 
@@ -123,3 +124,27 @@ def test_a_device_by_its_path(tmp_path: Path):
     missing = see(tmp_path / "a", wiring, by_path)["lidar"]
     assert (missing.seen, missing.fix) == ("/dev/truck/lidar: no such node", FIND_LIDAR)
     assert see(tmp_path / "b", wiring, linked)["lidar"].level is Level.OK
+
+
+def on_a_bus(emulated: EmulatedHost) -> None:
+    """Steer by a PCA9685."""
+    assert emulated.context.config is not None
+    devices = emulated.context.config.devices.model_dump()
+    devices["steering"] = {"port": {"path": Path("/dev/i2c-1")}, "driver": {"kind": "pca9685", "rear": {"channel": 4}}}
+    emulated.change(devices=devices)
+
+
+def test_a_device_on_an_i2c_bus(tmp_path: Path):
+    found = see(tmp_path / "a", wiring, on_a_bus)["steering"]
+    assert found.seen == "/dev/i2c-1: no such node; enable the bus in the computer's settings"
+    assert found.fix == "sudo modprobe i2c-dev"
+
+    def closed(emulated: EmulatedHost) -> None:
+        on_a_bus(emulated)
+        emulated.put("dev/i2c-1")
+        (emulated.folder / "dev/i2c-1").chmod(0o600)
+
+    found = bad(see(tmp_path / "b", rights, closed))["user"]
+    assert found.fix == "sudo usermod -aG i2c monstertruckd"
+    shaken = see(tmp_path / "c", handshakes, closed)["steering handshake"]
+    assert shaken.reason is Reason.DEVICE_LOST

@@ -61,8 +61,8 @@ def test_state_is_kept_where_it_may_be_written_and_numba_works():
 def test_only_the_trucks_kinds_of_devices_may_be_opened():
     unit = settings(unit_of())
     assert unit["DevicePolicy"] == ["closed"]
-    assert unit["DeviceAllow"] == ["char-ttyACM rw", "char-ttyUSB rw", "char-video4linux rw"]
-    assert unit["SupplementaryGroups"] == ["dialout video"]
+    assert unit["DeviceAllow"] == ["char-ttyACM rw", "char-ttyUSB rw", "char-i2c rw", "char-video4linux rw"]
+    assert unit["SupplementaryGroups"] == ["dialout i2c video"]
     assert filled("modules-load.conf", {}).splitlines()[1:] == ["cdc_acm", "usbserial", "videodev"]
 
 

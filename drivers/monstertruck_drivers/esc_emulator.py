@@ -1,0 +1,59 @@
+"""Emulated speed controller (ESC) that pulses control.
+
+A real one reads a pulse every 20 ms, does not move before it has received neutral pulses for a while, lets the motor
+coast without pulses, and gives no feedback of the motor.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+from monstertruck_drivers.emulation import MotorPlant
+from monstertruck_drivers.servos import EscPulses
+from monstertruck_runtime.clock import SECOND, Clock
+
+NEAR: Final = 10.0
+"""Tolerance around the neutral pulse (us)."""
+
+
+class EscEmulator:
+    """Speed controller with its motor.
+
+    Args:
+        esc: its pulses.
+        clock: time.
+        plant: the motor.
+        pulse: pulse at its input at an instant, ns (us); None without pulses.
+    """
+
+    def __init__(self, esc: EscPulses, clock: Clock, plant: MotorPlant, pulse: Callable[[int], float | None]) -> None:
+        self._esc = esc
+        self._clock = clock
+        self._plant = plant
+        self._pulse = pulse
+        self._neutral_since: int | None = None
+        self._armed = False
+
+    async def run(self) -> None:
+        """Obey the pulses until cancelled."""
+        while True:
+            await self._clock.sleep(0.02)  # seconds between two pulses
+            now = self._clock.now()
+            pulse = self._pulse(now)
+            if pulse is None:
+                self._armed, self._neutral_since = False, None
+                self._plant.command(now, None, 1.0)
+                continue
+            self._arm(pulse, now)
+            rate = self._esc.rate(pulse) if self._armed and abs(pulse - self._esc.neutral_us) > NEAR else 0.0
+            slowing = self._esc.deceleration if rate else self._esc.quick_deceleration
+            rpm = math.tau / 60
+            self._plant.command(now, rate / rpm, slowing / rpm)
+
+    def _arm(self, pulse: float, now: int) -> None:
+        if abs(pulse - self._esc.neutral_us) > NEAR:
+            self._neutral_since = None
+        elif self._neutral_since is None:
+            self._neutral_since = now
+        elif now - self._neutral_since >= self._esc.arming * SECOND / 2:
+            self._armed = True

@@ -1,0 +1,1 @@
+"""I2C buses: of the kernel (``/dev/i2c-N``), and emulated behind a cable."""

@@ -1,0 +1,68 @@
+"""Transfers over an I2C bus of the kernel; needs only the standard library, so that the stop script can use it.
+
+Source: kernel documentation, i2c/dev-interface: ``I2C_RDWR`` joins messages by a repeated start.
+"""
+
+import ctypes
+import fcntl
+from typing import Final
+
+MAJOR: Final = 89
+"""Device number of the kernel's I2C buses."""
+LONGEST: Final = 255
+"""Maximum length of one direction of a transfer (bytes)."""
+I2C_TIMEOUT: Final = 0x0702
+I2C_RDWR: Final = 0x0707
+READ: Final = 0x0001
+PATIENCE: Final = 5
+"""Time limit of the adapter for one transfer (10 ms)."""
+
+
+class I2cMessage(ctypes.Structure):
+    """``struct i2c_msg``."""
+
+    _fields_ = (
+        ("address", ctypes.c_uint16),
+        ("flags", ctypes.c_uint16),
+        ("length", ctypes.c_uint16),
+        ("buffer", ctypes.POINTER(ctypes.c_char)),
+    )
+
+
+class I2cMessages(ctypes.Structure):
+    """``struct i2c_rdwr_ioctl_data``."""
+
+    _fields_ = (("messages", ctypes.POINTER(I2cMessage)), ("count", ctypes.c_uint32))
+
+
+def limit_waits(bus: int) -> None:
+    """Limit the time for which the adapter waits for a device that holds the clock.
+
+    Raises:
+        OSError: not an I2C bus.
+    """
+    fcntl.ioctl(bus, I2C_TIMEOUT, PATIENCE)
+
+
+def transfer(bus: int, address: int, data: bytes, count: int = 0) -> bytes:
+    """Write ``data``, then read ``count`` bytes after a repeated start.
+
+    Args:
+        bus: file descriptor of the bus.
+        address: 7-bit address.
+        data: bytes to write; empty = only read.
+        count: bytes to read; 0 = only write.
+
+    Raises:
+        OSError: ENXIO or EREMOTEIO if the device does not acknowledge, ETIMEDOUT if the bus is held.
+    """
+    written, read = ctypes.create_string_buffer(data, len(data)), ctypes.create_string_buffer(count)
+    parts = [(0, written)] * bool(data) + [(READ, read)] * bool(count)
+    messages = (I2cMessage * len(parts))(
+        *(
+            I2cMessage(address, flags, len(buffer), ctypes.cast(buffer, I2cMessage._fields_[3][1]))
+            for flags, buffer in parts
+        )
+    )
+    fcntl.ioctl(bus, I2C_RDWR, I2cMessages(messages, len(parts)))
+    return read.raw

@@ -1,0 +1,74 @@
+"""Buses of the kernel: transfers run in a thread of the bus, because a device may hold the clock."""
+
+import asyncio
+import errno
+import os
+import queue
+import stat
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+from monstertruck_drivers.i2c import bus
+from monstertruck_drivers.i2c.protocol import I2cAnswer, I2cRequest, Packets
+from monstertruck_drivers.link import Link
+from monstertruck_drivers.tty import SerialPort
+from monstertruck_runtime.errors import DeviceLostError
+
+
+class I2cPort:
+    """An I2C bus by its path, or an emulated one behind a pty. Other programs may use the bus at the same time.
+
+    Args:
+        path: device node, such as /dev/i2c-1.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.name = str(path)
+        self._path = path
+
+    async def open(self) -> Link:
+        """Open the bus; its link carries the packets of ``protocol``.
+
+        Raises:
+            DeviceLostError: no such node, no permission, or not an I2C bus.
+            DeviceWedgedError: see ``SerialPort``.
+            PortBusyError: another process holds the emulated bus.
+        """
+        try:
+            node = self._path.stat()
+            if os.major(node.st_rdev) != bus.MAJOR or not stat.S_ISCHR(node.st_mode):
+                return await SerialPort(self._path).open()
+            return serve(self.name, os.open(self._path, os.O_RDWR | os.O_CLOEXEC))
+        except OSError as error:
+            hint = ": the user must be in the group 'i2c'" if error.errno == errno.EACCES else ""
+            raise DeviceLostError(f"{self.name}: {error.strerror}{hint}") from error
+
+
+def serve(name: str, file: int) -> Link:
+    """Return a link to the bus open as ``file``, which its thread closes after the link."""
+    loop = asyncio.get_running_loop()
+    waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+    link = Link(name, waiting.put, lambda: waiting.put(None))
+
+    def work() -> None:
+        packets = Packets(I2cRequest)
+        try:
+            with suppress(OSError):
+                bus.limit_waits(file)
+            while (data := waiting.get()) is not None:
+                answers = b"".join(bytes(_done(file, request)) for request in packets.feed(data))
+                with suppress(RuntimeError):  # the loop was closed meanwhile
+                    loop.call_soon_threadsafe(link.feed, answers)
+        finally:
+            os.close(file)
+
+    threading.Thread(target=work, name=f"i2c {name}", daemon=True).start()
+    return link
+
+
+def _done(file: int, request: I2cRequest) -> I2cAnswer:
+    try:
+        return I2cAnswer(request.number, 0, bus.transfer(file, request.address, request.data, request.size))
+    except OSError as error:
+        return I2cAnswer(request.number, error.errno or errno.EIO, b"")

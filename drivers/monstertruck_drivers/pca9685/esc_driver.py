@@ -1,0 +1,79 @@
+"""Driver of a PCA9685 with a speed controller (ESC) on one of its channels: drives and steers.
+
+The pulse follows every command that the gate sends to the servos, so a stop waits for the next tick. Stale commands
+make it neutral, as do start and end of a session. While the computer hangs the chip repeats the latest pulse: it has no
+watchdog. The motor is not measured: the reported rate is the commanded rate, slowed as configured.
+"""
+
+from monstertruck_drivers.esc import UnmeasuredMotor
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.pca9685.config import Pca9685EscConfig
+from monstertruck_drivers.pca9685.driver import Pca9685Driver
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import ConfigError
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
+from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
+from monstertruck_schemas.sensor import Battery, DriveFeedback, SteeringFeedback
+
+
+class Pca9685EscDriver(Pca9685Driver):
+    """Sends the speed controller's pulse along with the servos'.
+
+    Args:
+        config: speed controller and chip.
+        port: the I2C bus.
+        clock: time.
+        commands: ``cmd/drive``.
+        commands_2: not used; there is one motor.
+        commands_3: not used.
+        commands_4: not used.
+        steering_commands: ``cmd/steering``.
+        drive: not used.
+        out: ``sensor/drive``: the rate commanded.
+        out_2: not used.
+        out_3: not used.
+        out_4: not used.
+        steering: pulses being sent, as servo angles.
+        battery: not used.
+        events: where faults of the chip are reported.
+        name: of the service.
+    """
+
+    def __init__(
+        self,
+        config: Pca9685EscConfig,
+        port: Port,
+        clock: Clock,
+        *,
+        commands: Subscription[DriveCommand],
+        commands_2: Subscription[DriveCommand],
+        commands_3: Subscription[DriveCommand],
+        commands_4: Subscription[DriveCommand],
+        steering_commands: Subscription[SteeringCommand],
+        drive: Subscription[DriveFeedback],
+        out: Publisher[DriveFeedback],
+        out_2: Publisher[DriveFeedback],
+        out_3: Publisher[DriveFeedback],
+        out_4: Publisher[DriveFeedback],
+        steering: Publisher[SteeringFeedback] | None,
+        battery: Publisher[Battery] | None,
+        events: EventSink,
+        name: str = "actuators",
+    ) -> None:
+        if steering is None:
+            raise ConfigError(f"devices.{name}: another device steers; kind pca9685_esc does it itself")
+        super().__init__(config.unit, port, clock, steering_commands, steering, battery, events, name, drive=drive)
+        self._esc = config.esc
+        self._motor = UnmeasuredMotor(config.esc, clock, commands, out, config.command_timeout)
+
+    async def run(self, ready: Ready) -> None:
+        """Serve one session; raises as ``Pca9685Driver.run``."""
+        self._motor.begin()
+        await super().run(ready)
+
+    def _more(self, *, rest: bool = False) -> dict[int, int]:
+        pulse_us = self._esc.neutral_us if rest else self._motor.pulse_us()
+        return {self._esc.channel: self._config.counts(pulse_us)}
+
+    def _polled(self, stamp: int, received: int) -> None:
+        self._motor.publish(stamp, received)

@@ -1,0 +1,102 @@
+"""Registers of one PCA9685 on an open bus; shared by driver and probe."""
+
+from monstertruck_drivers.i2c.host import I2cBus
+from monstertruck_drivers.link import Link
+from monstertruck_drivers.pca9685.protocol import (
+    MODE2_RESET,
+    OWN_ADDRESSES,
+    WAKE_UP,
+    PwmMode1,
+    PwmRegister,
+    counts_of,
+    register_of,
+)
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import WrongDeviceError
+
+AWAKE = PwmMode1.AI
+"""``MODE1`` while serving: outputs run, and the chip answers at its own address alone."""
+
+
+class Pca9685Session:
+    """One session.
+
+    Args:
+        link: open link to the bus.
+        clock: time.
+        address: of the chip.
+        timeout: timeout of one transfer (s).
+    """
+
+    def __init__(self, link: Link, clock: Clock, address: int, timeout: float) -> None:
+        self.name = f"{link.name} address 0x{address:02x}"
+        self._bus = I2cBus(link, clock, timeout)
+        self._clock = clock
+        self._address = address
+
+    async def write(self, data: bytes) -> None:
+        """Write registers, the first byte being the address of the first one.
+
+        Raises:
+            DeviceLostError: the bus is gone.
+            DeviceTimeoutError: the chip does not acknowledge.
+        """
+        await self._bus.transfer(self._address, data)
+
+    def send(self, data: bytes) -> None:
+        """Write registers without waiting for the acknowledgement.
+
+        Raises:
+            DeviceLostError: the bus is gone.
+        """
+        self._bus.send(self._address, data)
+
+    async def read(self, register: int) -> int:
+        """Read a register, whether or not the chip increments; raises as ``write``."""
+        return (await self._bus.transfer(self._address, bytes((register,)), 1))[0]
+
+    async def counts(self, channel: int) -> int:
+        """Read the length of a channel's pulse, in counts; raises as ``write``."""
+        return counts_of(await self._bus.transfer(self._address, bytes((register_of(channel),)), 4))
+
+    async def identify(self) -> tuple[PwmMode1, int]:
+        """Make sure that a PCA9685 answers, without writing to it.
+
+        Returns:
+            ``MODE1`` and the prescaler.
+
+        Raises:
+            DeviceLostError: the bus is gone.
+            DeviceTimeoutError: nothing at this address.
+            WrongDeviceError: a device without the sub-addresses of a PCA9685.
+        """
+        found = bytes([await self.read(PwmRegister.SUBADR1 + i) for i in range(len(OWN_ADDRESSES))])
+        if found != OWN_ADDRESSES:
+            raise WrongDeviceError(
+                f"{self.name}: no PCA9685: registers 2 to 5 are {found.hex(' ')}, expected {OWN_ADDRESSES.hex(' ')}"
+            )
+        return PwmMode1(await self.read(PwmRegister.MODE1)), await self.read(PwmRegister.PRE_SCALE)
+
+    async def set_up(self, prescaler: int) -> None:
+        """Let the outputs run at the wanted frequency; pulses that do already are not interrupted.
+
+        Raises:
+            DeviceLostError: the bus is gone.
+            DeviceTimeoutError: nothing at this address.
+            WrongDeviceError: not a PCA9685.
+        """
+        mode, present = await self.identify()
+        if present != prescaler:
+            await self.write(bytes((PwmRegister.MODE1, AWAKE | PwmMode1.SLEEP)))
+            await self.write(bytes((PwmRegister.PRE_SCALE, prescaler)))
+        await self.write(bytes((PwmRegister.MODE2, MODE2_RESET)))
+        await self.write(bytes((PwmRegister.MODE1, AWAKE)))
+        if present != prescaler or mode & PwmMode1.SLEEP:
+            await self._clock.sleep(WAKE_UP)
+
+    async def is_set_up(self, prescaler: int) -> bool:
+        """Whether mode and frequency are those of ``set_up``; raises as ``write``."""
+        present = [
+            await self.read(register) for register in (PwmRegister.MODE1, PwmRegister.MODE2, PwmRegister.PRE_SCALE)
+        ]
+        return present == [AWAKE, MODE2_RESET, prescaler]

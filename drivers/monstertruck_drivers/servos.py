@@ -1,0 +1,78 @@
+"""Settings of servos and speed controllers that pulses control, on any controller."""
+
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from monstertruck_schemas.base import Schema
+
+Microseconds = Annotated[float, Field(gt=0, le=4000)]
+
+
+class ServoPulses(Schema):
+    """One steering servo: ``pulse_us = centre_us + direction * scale_us_per_deg * servo angle in degrees``."""
+
+    centre_us: Microseconds = 1439.2
+    """Pulse that steers straight ahead."""
+    scale_us_per_deg: Annotated[float, Field(gt=0)] = 10.48
+    direction: Literal[-1, 1] = -1
+    """+1 where a longer pulse steers left, -1 where it steers right; a matter of how the servo is mounted."""
+    min_us: Microseconds = 1088.0
+    max_us: Microseconds = 1840.0
+    max_angle_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
+
+    @model_validator(mode="after")
+    def _centre_within_limits(self) -> Self:
+        if not self.min_us < self.centre_us < self.max_us:
+            raise ValueError(f"min_us {self.min_us} < centre_us {self.centre_us} < max_us {self.max_us} does not hold")
+        return self
+
+    def pulse_us(self, angle: float) -> float:
+        """Pulse (us) for a servo angle (rad, left positive), held within all limits."""
+        limit = self.max_angle_deg
+        degrees = min(max(math.degrees(angle), -limit), limit)
+        pulse = self.centre_us + self.direction * self.scale_us_per_deg * degrees
+        return min(max(pulse, self.min_us), self.max_us)
+
+    def angle_of(self, pulse_us: float) -> float:
+        """Servo angle (rad, left positive) of a pulse (us)."""
+        return math.radians((pulse_us - self.centre_us) * self.direction / self.scale_us_per_deg)
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Servo angles, rad, to the right (negative) and to the left, that pulses within all limits give."""
+        ends = sorted(self.angle_of(pulse) for pulse in (self.min_us, self.max_us))
+        limit = math.radians(self.max_angle_deg)
+        return max(ends[0], -limit), min(ends[1], limit)
+
+
+class EscPulses(Schema):
+    """Speed controller without feedback: ``pulse_us = neutral_us + direction * reach_us * rate / max_rate``.
+
+    It must reverse without braking first (crawler mode); a car's usual mode takes the first reverse pulse for a brake.
+    """
+
+    neutral_us: Microseconds = 1500.0
+    """Pulse at which the motor stands still"""
+    reach_us: Annotated[float, Field(gt=0, le=1000)] = 400.0
+    """Change of the pulse that makes the motor turn at max_rate"""
+    direction: Literal[-1, 1] = 1
+    """+1 where a longer pulse drives forward"""
+    max_rate: Annotated[float, Field(gt=0, le=10_000)] = 300.0
+    """Rate at the end of the pulses, as measured, rad/s; requests are limited to this"""
+    deceleration: Annotated[float, Field(gt=0)] = 400.0
+    """Deceleration by a lower pulse, as measured, rad/s^2"""
+    quick_deceleration: Annotated[float, Field(gt=0)] = 500.0
+    """Deceleration at the neutral pulse, as measured, rad/s^2"""
+    arming: Annotated[float, Field(ge=0, le=10)] = 2.0
+    """Seconds of neutral pulses that it wants before it moves"""
+
+    def pulse_us(self, rate: float) -> float:
+        """Pulse (us) for a rate, rad/s, forward positive, held within the limits."""
+        share = min(max(rate / self.max_rate, -1.0), 1.0)
+        return self.neutral_us + self.direction * self.reach_us * share
+
+    def rate(self, pulse_us: float) -> float:
+        """Rate that a pulse asks for, rad/s, forward positive."""
+        return (pulse_us - self.neutral_us) * self.direction / self.reach_us * self.max_rate
