@@ -58,11 +58,9 @@ def transfer(bus: int, address: int, data: bytes, count: int = 0) -> bytes:
     """
     written, read = ctypes.create_string_buffer(data, len(data)), ctypes.create_string_buffer(count)
     parts = [(0, written)] * bool(data) + [(READ, read)] * bool(count)
+    pointer = ctypes.POINTER(ctypes.c_char)
     messages = (I2cMessage * len(parts))(
-        *(
-            I2cMessage(address, flags, len(buffer), ctypes.cast(buffer, I2cMessage._fields_[3][1]))
-            for flags, buffer in parts
-        )
+        *(I2cMessage(address, flags, len(buffer), ctypes.cast(buffer, pointer)) for flags, buffer in parts)
     )
     fcntl.ioctl(bus, I2C_RDWR, I2cMessages(messages, len(parts)))
     return read.raw

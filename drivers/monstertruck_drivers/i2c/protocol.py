@@ -1,6 +1,6 @@
 """Packets of one I2C transfer: a link carries them to the kernel's bus or to an emulated one.
 
-I2cRequest: mark, number, address, bytes to read, bytes written, those bytes. I2cAnswer: mark, number, error number of the
+Request: mark, number, address, bytes to read, bytes written, those bytes. Answer: mark, number, error number of the
 kernel, bytes read, those bytes. A CRC-16 ends each.
 """
 
