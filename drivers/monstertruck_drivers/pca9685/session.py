@@ -96,7 +96,5 @@ class Pca9685Session:
 
     async def is_set_up(self, prescaler: int) -> bool:
         """Whether mode and frequency are those of ``set_up``; raises as ``write``."""
-        present = [
-            await self.read(register) for register in (PwmRegister.MODE1, PwmRegister.MODE2, PwmRegister.PRE_SCALE)
-        ]
-        return present == [AWAKE, MODE2_RESET, prescaler]
+        registers = PwmRegister.MODE1, PwmRegister.MODE2, PwmRegister.PRE_SCALE
+        return [await self.read(register) for register in registers] == [AWAKE, MODE2_RESET, prescaler]
