@@ -63,7 +63,7 @@ def test_only_the_trucks_kinds_of_devices_may_be_opened():
     assert unit["DevicePolicy"] == ["closed"]
     assert unit["DeviceAllow"] == ["char-ttyACM rw", "char-ttyUSB rw", "char-i2c rw", "char-video4linux rw"]
     assert unit["SupplementaryGroups"] == ["dialout i2c video"]
-    assert filled("modules-load.conf", {}).splitlines()[1:] == ["cdc_acm", "usbserial", "videodev"]
+    assert filled("modules-load.conf", {}).splitlines()[1:] == ["cdc_acm", "i2c_dev", "usbserial", "videodev"]
 
 
 def test_every_shaft_is_stopped(tmp_path: Path):
