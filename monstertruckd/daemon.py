@@ -130,7 +130,7 @@ class Daemon:
         self.bus.listen(topics.EVENT, self.gate.observe_event)
         self.bus.listen(topics.HEALTH, self.gate.observe_health)
         self.bus.listen(topics.EVENT, self._board.observe_event)
-        if config.planner is None:
+        if config.own_planner is None:
             self.bus.listen(topics.REQ_GOAL, self._refuse_goal)
         self.peers = PeerService(clock, self.bus.publisher(topics.PEERS, Writer.ESTIMATION)) if config.peers else None
         """Publishes the poses received from other robots."""
@@ -352,7 +352,10 @@ class Daemon:
         self.gate.configure(config.gate, config.weakened())
 
     def _refuse_goal(self, request: GoalRequest) -> None:
-        text = f"goal of {request.source} refused: this robot follows paths, it has no planner that finds one"
+        why = "this robot follows paths, it has no planner that finds one"
+        if self.config.planner is not None:
+            why = "ROS 2 plans for this robot (planner.mode ros2): send the goal to Nav2"
+        text = f"goal of {request.source} refused: {why}"
         self._events(Reason.NOT_SUPPORTED, Severity.WARNING, "daemon", text)
 
     # Building

@@ -21,6 +21,7 @@ from monstertruck_estimation.points.service import READER_START_TIMEOUT as READE
 from monstertruck_estimation.points.service import TARGET as READER
 from monstertruck_estimation.points.service import PointFolders, PointInputs, PointService
 from monstertruck_estimation.slam.outside import OutsideLocalisation
+from monstertruck_estimation.slam.outside_map import OutsideMap
 from monstertruck_estimation.slam.service import SlamService
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount, quaternion_from_rpy
 from monstertruck_kinematics.chassis import Chassis
@@ -177,10 +178,10 @@ def _build_consistency(
 def _build_ground(config: TruckConfig, bus: Bus, clock: Clock, run: str) -> GroundService | None:
     """Where routes are planned by a robot that feels its tilt."""
     devices, slam = config.devices, config.slam
-    if config.ground is None or config.planner is None or devices.compass is None:
+    if config.ground is None or config.own_planner is None or devices.compass is None:
         return None
     lidar = devices.lidar
-    known = config.planner.map if slam is None or slam.mode == "ros2" else slam.map
+    known = config.own_planner.map if slam is None or slam.mode == "ros2" else slam.map
     geometry = config.geometry
     return GroundService(
         config.ground,
@@ -212,7 +213,7 @@ def _build_points(
     camera, slam = config.devices.camera, config.slam
     if camera is not None and find_spec("cv2") is None:
         raise not_installed("points: opencv", "vision")
-    planned = None if config.planner is None else config.planner.map
+    planned = None if config.own_planner is None else config.own_planner.map
     known = planned if slam is None or slam.mode == "ros2" else slam.map
     folder = _folder(known)
     mapping = slam is not None and slam.mode == "mapping"
@@ -248,6 +249,16 @@ def build_slam(config: TruckConfig, bus: Bus, clock: Clock, run: str = "") -> Sl
     """Build what makes a map, localises in one, or follows a client. ``run`` names this run in saved maps."""
     devices = config.devices
     if config.slam is not None and config.slam.mode == "ros2":
+        planner, maps = config.own_planner, None
+        if planner is None or planner.map is None:
+            maps = OutsideMap(
+                clock,
+                bus.subscribe(topics.REQ_MAP, latest()),
+                bus.subscribe(topics.GATE, latest()),
+                bus.publisher(topics.MAP, Writer.ESTIMATION),
+                bus.event_sink(),
+                inline if isinstance(clock, VirtualClock) else in_thread,
+            )
         return OutsideLocalisation(
             config.slam,
             clock,
@@ -258,6 +269,7 @@ def build_slam(config: TruckConfig, bus: Bus, clock: Clock, run: str = "") -> Sl
             health=bus.publisher(topics.SLAM, Writer.ESTIMATION),
             events=bus.event_sink(),
             max_age=config.gate.max_request_age,
+            maps=maps,
         )
     if config.slam is None or devices.lidar is None:
         return None

@@ -88,14 +88,14 @@ def build_planners(
             config.gate.max_request_age,
         )
         yield _build_tracker(config, tracker, bus, clock, body, requests, actors)
-        if config.planner is not None:
+        if config.own_planner is not None:
             goals = build_goals(
-                config, config.planner, bus, clock, body.chassis, body.footprint, paths, requests, actors
+                config, config.own_planner, bus, clock, body.chassis, body.footprint, paths, requests, actors
             )
             yield goals
-            if config.planner.map is not None and (config.slam is None or config.slam.mode == "ros2"):
+            if config.own_planner.map is not None and (config.slam is None or config.slam.mode == "ros2"):
                 yield KnownMapService(
-                    config.planner.map,
+                    config.own_planner.map,
                     frame,
                     clock,
                     bus.publisher(topics.MAP, Writer.ESTIMATION),
@@ -249,7 +249,7 @@ def _build_explorer(
     config: TruckConfig, explorer: ExplorerConfig, bus: Bus, clock: Clock, body: Body, goals: GoalService,
     actors: ActorFactory, save_map: Callable[[], bool] | None,
 ) -> ExplorerService:  # fmt: skip
-    planner, lidar, camera = config.planner, config.devices.lidar, config.devices.camera
+    planner, lidar, camera = config.own_planner, config.devices.lidar, config.devices.camera
     assert planner is not None
     assert lidar is not None
     planner = _within_reach(planner, body.chassis.reached_angle)

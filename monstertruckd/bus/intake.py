@@ -29,6 +29,7 @@ from monstertruck_schemas.topics import (
     REQ_CONTROL,
     REQ_DRIVE,
     REQ_LOCALISATION,
+    REQ_MAP,
     REQ_PATH,
     STAND_POSE,
     Topic,
@@ -62,9 +63,10 @@ LIMITS: Final = {
     REQ_CONTROL.name: Limit(rate=None),
     REQ_PATH.name: Limit(size=131_072),
     REQ_LOCALISATION.name: Limit(rate=20.0),
+    REQ_MAP.name: Limit(size=524_288, rate=1.0),
 }
 """All others: ``Limit()``. What an order asks is known once it is decoded: see ``ORDER_RATE``. A path of 2000 poses
-fits."""
+fits, and the map of a building: at the edges of its rooms a cell takes about one bit."""
 
 ORDER_RATE: Final = 5.0
 """Orders a second of one owner, those that stop not counted."""

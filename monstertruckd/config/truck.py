@@ -187,6 +187,11 @@ class TruckConfig(Schema):
             raise ValueError(f"{MOVE}: expected kind move, which the command of this name starts")
         return moves
 
+    @property
+    def own_planner(self) -> PlannerConfig | None:
+        """Settings of the planner that the robot itself runs; None if it has none, or ROS 2 plans."""
+        return None if self.planner is None or self.planner.mode == "ros2" else self.planner
+
     def chassis(self) -> Chassis:
         """The body's kinematics.
 
@@ -274,7 +279,7 @@ class TruckConfig(Schema):
         self._check_planner()
         if self.behaviours.keys() - {MOVE} and (lack := self.missing_actuators()):
             raise ValueError(f"behaviours need {lack}")
-        if self.explorer is not None and (self.planner is None or self.slam is None or self.slam.mode != "mapping"):
+        if self.explorer is not None and (self.own_planner is None or self.slam is None or self.slam.mode != "mapping"):
             raise ValueError("an explorer needs a planner, which drives to its goals, and slam in mode mapping")
         for name, behaviour in self.behaviours.items():
             if isinstance(behaviour, FollowConfig) and behaviour.leader not in self.peers:
@@ -343,9 +348,15 @@ class TruckConfig(Schema):
         planner = self.planner
         if planner is None:
             return
+        if planner.mode == "ros2":
+            if not self.gate.remote_trackers:
+                raise ValueError(
+                    "planner.mode ros2 needs gate.remote_trackers: the node that drives, such as ros2:velocity_smoother"
+                )
+            return
         if self.tracker is None:
             raise ValueError("a planner needs a tracker, which follows its routes")
-        if (self.slam is None or self.slam.mode == "ros2") and planner.map is None:
+        if self.slam is None and planner.map is None:
             raise ValueError("a planner needs a map: planner.map, or slam that makes or has one")
         if planner.angle > self.tracker.angle:
             raise ValueError(f"planner.angle {planner.angle} rad: expected at most tracker.angle, {self.tracker.angle}")

@@ -38,6 +38,10 @@ FRAMES: Final = {"base": "base_link", "lidar": "laser"}
 """Frames that ROS calls otherwise."""
 
 
+FOOTPRINT: Final = "base_footprint"
+"""Projection of base onto the ground, which base is on already."""
+
+
 def _own_name(frame: str) -> str:
     return frame
 

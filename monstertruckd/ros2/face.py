@@ -33,6 +33,7 @@ from monstertruck_schemas.topics import Topic
 from monstertruckd.ros2 import convert
 from monstertruckd.ros2.cdr import RosMessage
 from monstertruckd.ros2.facts import RobotFacts, renamed_links
+from monstertruckd.ros2.localisation import RosLocalisation, RosMaps
 from monstertruckd.ros2.navigation import GoalPose, Navigation
 from monstertruckd.ros2.node import RosArrival, RosNode, RosSender
 from monstertruckd.ros2.operators import LEASE, Operators, check_age, check_header, frame_in, planar_twist
@@ -61,8 +62,6 @@ class FaceOptions:
     """Publish ``/clock``."""
     drives: bool = True
     """Whether ROS 2 nodes may ask for anything but an emergency stop."""
-    plans: bool = True
-    """Whether the robot's own planner serves goals; False where Nav2 does and drives by ``cmd_vel``."""
 
 
 class RosFace:
@@ -98,8 +97,7 @@ class RosFace:
         """Whether there is dead reckoning: it moves base in odom more often than the frame tree does."""
         self._fixed: list[Any] = []
         """Fixed transforms as published last."""
-        self._localised_at = 0
-        """When a correction of the pose was passed on last, ns."""
+        self._localisation: RosLocalisation | None = None
         self._map: Grid | None = None
         self._steering: SteeringFeedback | None = None
         self._stabiliser: StabiliserFeedback | None = None
@@ -121,7 +119,7 @@ class RosFace:
         navigation = None
         if self._options.drives:
             RosParameters(self._node, self._operators, self._client)
-            if self._options.plans:
+            if self._facts.plans:
                 arguments = self._goal_in, lambda: self._names, self._clock
                 navigation = Navigation(self._node, self._operators, self._client, *arguments)
         try:
@@ -159,8 +157,7 @@ class RosFace:
             (t.ODOMETRY, self._odometry_message),
             (t.TRANSFORMS, self._transforms),
             (t.POSE, self._pose),
-            (t.MAP, self._whole_map),
-            (t.MAP_TILES, self._tile),
+            *(((t.MAP, self._whole_map), (t.MAP_TILES, self._tile)) if self._facts.mapped else ()),
             (t.GROUND, self._ground),
             (t.SEEN, self._seen),
             (t.PATH, self._path),
@@ -196,6 +193,8 @@ class RosFace:
 
     def _odometry_message(self, message: Odometry) -> None:
         self._odometry = True
+        if self._localisation is not None:
+            self._localisation.observe(message)
         values = convert.odometry(message, self._names)
         self._publish("odom", "nav_msgs/msg/Odometry", values)
         if self._options.odom_to_base:
@@ -343,13 +342,15 @@ class RosFace:
         self._node.subscribe("cmd_vel", "geometry_msgs/msg/Twist", self._twist)
         self._node.subscribe("cmd_vel", "geometry_msgs/msg/TwistStamped", self._twist_stamped)
         self._node.subscribe("ackermann_cmd", "ackermann_msgs/msg/AckermannDriveStamped", self._ackermann)
-        if self._options.plans:
+        if self._facts.plans:
             self._node.subscribe("goal_pose", "geometry_msgs/msg/PoseStamped", self._goal)
         if self._facts.localised:
             interface = "geometry_msgs/msg/PoseWithCovarianceStamped"
             self._node.subscribe("initialpose", interface, self._initial_pose)
         else:
-            self._node.subscribe("/tf", "tf2_msgs/msg/TFMessage", self._localise)
+            self._localisation = RosLocalisation(self._node, self._operators, lambda: self._names, self._clock)
+        if not self._facts.mapped:
+            RosMaps(self._node, self._operators, lambda: self._names)
 
     async def _order(self, order: Order, _: RosMessage, sender: RosSender | None) -> Mapping[str, Any]:
         if order is Order.ESTOP:
@@ -369,7 +370,7 @@ class RosFace:
         self._operators.run(node, "estop", self._client.order(Order.ESTOP))
 
     def _base_frames(self) -> tuple[str, ...]:
-        return tuple(self._names.frame(frame) for frame in ("base", FOOTPRINT))
+        return tuple(self._names.frame(frame) for frame in ("base", convert.FOOTPRINT))
 
     def _twist(self, arrival: RosArrival) -> None:
         self._drive_twist(arrival, arrival.message, lambda _: None)
@@ -421,38 +422,18 @@ class RosFace:
         yaw = yaw_of((orientation["x"], orientation["y"], orientation["z"], orientation["w"]))
         return (position["x"], position["y"], yaw), frames[frame]
 
-    def _localise(self, arrival: RosArrival) -> None:
-        """Pass on where odom is in map; ``amcl`` dates it ahead, so only the time of sending is checked."""
-        ends = self._names.frame("map"), self._names.frame("odom")
-        rows = [
-            row
-            for row in arrival.message["transforms"]
-            if (row["header"]["frame_id"].lstrip("/"), row["child_frame_id"].lstrip("/")) == ends
-        ]
-        now, period = self._clock.now(), SECOND // 10  # between two corrections that are passed on, ns
-        if not rows or now - self._localised_at < period:
-            return
-        sender = self._operators.accepted("/tf", arrival, lambda _: None)
-        if sender is not None:
-            self._localised_at = now
-            place, turn = rows[-1]["transform"]["translation"], rows[-1]["transform"]["rotation"]
-            correction = place["x"], place["y"], yaw_of((turn["x"], turn["y"], turn["z"], turn["w"]))
-            self._operators.drive(sender, "/tf", lambda client: client.localise(correction))
-
     def _initial_pose(self, arrival: RosArrival) -> None:
         node = "an unknown publisher" if arrival.sender is None else arrival.sender.node
         self._operators.refuse(node, "initialpose", "the robot finds its place by its own scans")
 
 
-FOOTPRINT: Final = "base_footprint"
-"""Projection of base onto the ground, which base is on already."""
 OPTICAL: Final = "camera_optical"
 """The camera's frame by the convention of pictures: z forward, x right, y down."""
 
 
 def _further_frames(fixed: Iterable[Any]) -> list[Any]:
     """Fixed transforms that ROS 2 expects besides."""
-    frames = [mount(FOOTPRINT, (0.0, 0.0, 0.0))]
+    frames = [mount(convert.FOOTPRINT, (0.0, 0.0, 0.0))]
     if any(row.child == "camera" for row in fixed):
         half = math.pi / 2  # x forward, y left, z up to z forward, x right, y down
         frames.append(mount(OPTICAL, (0.0, 0.0, 0.0), (-half, 0.0, -half), parent="camera"))

@@ -33,6 +33,10 @@ class RobotFacts:
     joints: "WheelJoints | None" = None
     localised: bool = True
     """Whether the robot finds its place by itself; False where it takes map to odom from ROS 2."""
+    mapped: bool = True
+    """Whether the map is the robot's own; False where it takes ``map`` from ROS 2."""
+    plans: bool = True
+    """Whether the robot's own planner serves goals; False where Nav2 does and drives by ``cmd_vel``."""
 
 
 @dataclass(frozen=True, slots=True)

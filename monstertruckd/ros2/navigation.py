@@ -222,7 +222,9 @@ class FollowPath(RobotAction[Path]):
 
     async def drive(self, driver: TruckClient, work: Path, show: Callable[[RosValues], None]) -> tuple[Reason, str]:
         """Send the path and wait for its end."""
-        arrival = await follow(driver, self._clock, work, arm=False, report=_FeedbackReport(self._feedback, show))
+        report = _FeedbackReport(self._feedback, show)
+        # 10.0: seconds without progress after which Nav2's controller server gives up by default
+        arrival = await follow(driver, self._clock, work, arm=False, report=report, disarmed_for=10.0)
         return arrival.reason, arrival.text
 
     def _feedback(self) -> RosValues:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from monstertruckd.ros2.cdr import RosMessage
-from monstertruckd.ros2.rmw import RosQos
+from monstertruckd.ros2.rmw import RELIABLE, RosQos
 
 Publish = Callable[[Mapping[str, Any]], None]
 """Publishes one message; to be called on the event loop."""
@@ -50,8 +50,8 @@ class RosNode(Protocol):
     def publisher(self, topic: str, interface: str, qos: RosQos) -> Publish:
         """Offer a topic; ``topic`` is absolute, or relative to the node's namespace."""
 
-    def subscribe(self, topic: str, interface: str, take: Take) -> None:
-        """Receive a topic: of every publisher the newest message, and none from before the subscription."""
+    def subscribe(self, topic: str, interface: str, take: Take, qos: RosQos = RELIABLE) -> None:
+        """Receive a topic: the newest message of every publisher, also an earlier one if ``qos`` is latched."""
 
     def serve(self, service: str, interface: str, answer: Answer) -> None:
         """Offer a service; requests are answered in parallel."""

@@ -29,7 +29,7 @@ from monstertruck_runtime.threads import in_daemon_thread, in_thread
 from monstertruckd.ros2.cdr import decode, encode
 from monstertruckd.ros2.interfaces import DISTRIBUTIONS, wire_name
 from monstertruckd.ros2.node import Answer, Publish, RosArrival, RosSender, Take
-from monstertruckd.ros2.rmw import RosQos
+from monstertruckd.ros2.rmw import RELIABLE, RosQos
 
 CLIENTS: Final = RosSender("/service_clients", "clients")
 """All clients of services."""
@@ -183,7 +183,7 @@ class RclpyNode:
         publisher = self._node_for(topic, interface).create_publisher(kind, topic, _profile(qos))
         return lambda message: publisher.publish(encode(interface, message))
 
-    def subscribe(self, topic: str, interface: str, take: Take) -> None:
+    def subscribe(self, topic: str, interface: str, take: Take, qos: RosQos = RELIABLE) -> None:
         """Receive a topic; see ``RosNode``."""
         kind = self._interface(interface)
         if kind is None:
@@ -201,7 +201,7 @@ class RclpyNode:
             self._loop.call_soon_threadsafe(take, arrival)
 
         # A queue of 1: of messages that wait only the newest counts.
-        profile = _profile(RosQos(depth=1, reliable=False))
+        profile = _profile(RosQos(depth=1, reliable=qos.latched, latched=qos.latched))
         self._node_for(topic, interface).create_subscription(kind, topic, receive, profile, raw=True)
 
     def _publisher_of(self, topic: str) -> tuple[RosSender | None, bytes]:

@@ -220,7 +220,7 @@ class ZenohNode:
 
         return publish
 
-    def subscribe(self, topic: str, interface: str, take: Take) -> None:
+    def subscribe(self, topic: str, interface: str, take: Take, qos: RosQos = RELIABLE) -> None:
         """Receive a topic; see ``RosNode``."""
         name = self.qualified(topic)
         newest: dict[bytes, tuple[Attachment, bytes]] = {}
@@ -258,10 +258,17 @@ class ZenohNode:
                 sender = self._sender(attachment.gid, name, interface, EntityKind.PUBLISHER)
                 take(RosArrival(message, sender, attachment.gid, attachment.sequence, attachment.stamp))
 
-        self._token(EntityKind.SUBSCRIPTION, name, interface)
-        handler = in_network_thread(receive)
+        self._token(EntityKind.SUBSCRIPTION, name, interface, qos)
+        key, handler = self._key(name, interface), in_network_thread(receive)
+        if qos.latched:
+            history = ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth)
+            subscriber = ext.declare_advanced_subscriber(
+                self._session, key, handler, history=history, subscriber_detection=True
+            )
+            self._kept.append(subscriber)
+            return
         others = zenoh.Locality.REMOTE  # not this node's own messages
-        self._kept.append(self._session.declare_subscriber(self._key(name, interface), handler, allowed_origin=others))
+        self._kept.append(self._session.declare_subscriber(key, handler, allowed_origin=others))
 
     # Services
 

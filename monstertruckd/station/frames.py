@@ -110,7 +110,7 @@ def facts(config: dict[str, Any], versions: dict[str, str]) -> str:
         geometry=config.get("geometry"),
         gate={name: config["gate"][name] for name in ("speed", "reverse_speed", "angle", "tilt", "leases")},
         devices=sorted(devices),
-        goals=config.get("planner") is not None,
+        goals=(config.get("planner") or {}).get("mode", "ros2") != "ros2",
         mapping=bool(config.get("slam") or (config.get("planner") or {}).get("map")),
         explores=config.get("explorer") is not None,
         tracks=config.get("tracker") is not None,

@@ -41,6 +41,7 @@ from monstertruck_schemas.req import (
     ExploreOrder,
     GoalOrder,
     LocalisationRequest,
+    MapRequest,
     MissionOrder,
     Order,
     PathRequest,
@@ -54,6 +55,7 @@ from monstertruck_schemas.topics import (
     REQ_CONTROL,
     REQ_DRIVE,
     REQ_LOCALISATION,
+    REQ_MAP,
     REQ_PATH,
     SOURCE_NAME,
     STAND_POSE,
@@ -503,6 +505,21 @@ class TruckClient(Operator):
         x, y, yaw = map_from_odom
         correction = Pose2D(x=x, y=y, yaw=yaw)
         self._put(REQ_LOCALISATION, LocalisationRequest(**await self.header(lease), correction=correction))
+
+    async def send_map(self, packed: bytes, size: tuple[int, int], resolution: float, origin: Pose2D) -> None:
+        """Send a map to a robot with ``slam.mode: ros2``. Raises as ``drive`` does.
+
+        Args:
+            packed: see ``MapRequest.packed``.
+            size: width and height in cells.
+            resolution: m.
+            origin: of the corner of the first cell in map.
+        """
+        width, height = size
+        request = MapRequest(
+            **await self.header(), resolution=resolution, width=width, height=height, origin=origin, packed=packed
+        )
+        self._put(REQ_MAP, request)
 
     def _put(self, topic: Topic[M], message: M, key: Callable[[str, str], str] | None = None) -> None:
         assert topic.writer is Writer.OUTSIDE

@@ -5,6 +5,7 @@ arms the robot if it may, follows the reports and stops what it started when it 
 """
 
 import asyncio
+import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -205,10 +206,26 @@ async def taken_back(undo: Callable[[], Awaitable[object]]) -> AsyncIterator[Non
         raise
 
 
-async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, report: DriveReport = SILENT) -> Arrival:
+async def follow(
+    driver: TruckClient,
+    clock: Clock,
+    path: Path,
+    *,
+    arm: bool,
+    report: DriveReport = SILENT,
+    disarmed_for: float = math.inf,
+) -> Arrival:
     """Send a path and wait for its end; cancelled or without an answer, it stops the truck, but not on another path.
 
     Then the path is withdrawn: whoever arms the truck later does not have it driven.
+
+    Args:
+        driver: who sends it.
+        clock: time.
+        path: what is to be driven.
+        arm: arm a robot that is disarmed.
+        report: gets progress.
+        disarmed_for: seconds without arming after which the path is given up.
 
     Raises:
         RequestRefusedError: the path or the arming was refused, the tracker failed, or the robot restarted.
@@ -237,7 +254,9 @@ async def follow(driver: TruckClient, clock: Clock, path: Path, *, arm: bool, re
             async with reported(stand, clock, report):
                 return await _watched(
                     driver, stand, ServiceName.TRACKER, arm=arm, undo=stop,
-                    end=lambda: _path_end(clock, states, present, path.name, report),
+                    end=lambda: _first(
+                        _path_end(clock, states, present, path.name, report), _disarmed(clock, stand, disarmed_for)
+                    ),
                 )  # fmt: skip
         finally:
             if _followed(present, path.name):
@@ -367,12 +386,15 @@ async def _until_followed(clock: Clock, present: Mailbox[Path], name: str) -> No
         raise NoAnswerError(f"the path {name!r} did not come within {ACCEPT_TIMEOUT:g} s") from None
 
 
-async def _disarmed(clock: Clock, stand: StandstillMonitor) -> Arrival:
-    """The end of a path that is over once the robot is disarmed."""
-    begin = clock.now()
-    while (state := stand.gate.latest) is None or state.mode.active:
+async def _disarmed(clock: Clock, stand: StandstillMonitor, timeout: float = 0.0) -> Arrival:
+    """The end of a path that is over once the robot has been disarmed for ``timeout`` seconds."""
+    begin = active = clock.now()
+    while (state := stand.gate.latest) is None or state.mode.active or clock.now() - active < timeout * SECOND:
+        if state is None or state.mode.active:
+            active = clock.now()
         await clock.sleep(STAND_LOOK_PERIOD)
-    return Arrival(state.worst, f"disarmed on the way: {state.why}", 0.0, (clock.now() - begin) / SECOND)
+    waited = f" for {timeout:g} s" if timeout else " on the way"
+    return Arrival(state.worst, f"disarmed{waited}: {state.why}", 0.0, (clock.now() - begin) / SECOND)
 
 
 async def _first(*ends: Coroutine[Any, Any, Arrival]) -> Arrival:

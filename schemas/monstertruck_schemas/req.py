@@ -7,9 +7,9 @@ for each source, and a lease: the time for which the request stands without a ne
 
 import math
 from enum import StrEnum
-from typing import Annotated, Final, Self
+from typing import Annotated, ClassVar, Final, Self
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from monstertruck_schemas.base import Message, Nanoseconds, Pose2D, Schema
 from monstertruck_schemas.mission import Mission
@@ -325,6 +325,21 @@ class LocalisationRequest(Request):
     """Pose of odom in map, found by a localisation off board; it stands for the lease."""
 
     correction: Pose2D
+
+
+class MapRequest(Request):
+    """Occupancy grid in map, made off board."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(ser_json_bytes="base64", val_json_bytes="base64")
+
+    resolution: Annotated[float, Field(gt=0)]
+    """Metres per cell."""
+    width: Annotated[int, Field(gt=0, le=2048)]
+    height: Annotated[int, Field(gt=0, le=2048)]
+    origin: Pose2D
+    """Pose of the outer corner of cell (0, 0); its yaw is 0."""
+    packed: bytes
+    """Cells as ``Grid.cells``, a signed byte each, compressed by zlib."""
 
 
 class PathStart(Request):

@@ -44,6 +44,7 @@ from monstertruck_schemas.req import (
     GoalControl,
     GoalRequest,
     LocalisationRequest,
+    MapRequest,
     PathRequest,
 )
 from monstertruck_schemas.sensor import (
@@ -344,6 +345,7 @@ REQ_PATH: Final = Topic("req/path", PathRequest, W.OUTSIDE, "A path computed off
 REQ_LOCALISATION: Final = Topic(
     "req/localisation", LocalisationRequest, W.OUTSIDE, "Pose of odom in map, by a localisation off board"
 )
+REQ_MAP: Final = Topic("req/map", MapRequest, W.OUTSIDE, "Map made off board")
 
 STAND_POSE: Final = Topic(
     "stand/pose",

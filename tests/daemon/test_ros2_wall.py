@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import WallClock
@@ -15,7 +16,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.health import LocalisationStatus
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.state import GateMode
-from monstertruckd.ros2.rmw import RELIABLE
+from monstertruckd.ros2.rmw import LATCHED, RELIABLE
 from monstertruckd.ros2.zenoh_node import ZenohNode, session_settings
 from tests.daemon.wall_kit import end, free_endpoint, robot
 
@@ -33,6 +34,7 @@ class Nav2:
         self.odom: tuple[float, float, float] | None = None
         self._cmd_vel = node.publisher("cmd_vel", "geometry_msgs/msg/Twist", RELIABLE)
         self._tf = amcl.publisher("/tf", "tf2_msgs/msg/TFMessage", RELIABLE)
+        self._map = amcl.publisher("map", "nav_msgs/msg/OccupancyGrid", LATCHED)
         self.children: set[str] = set()
         """Moving frames that the face publishes."""
         node.subscribe("odom", "nav_msgs/msg/Odometry", self._take)
@@ -53,6 +55,10 @@ class Nav2:
         assert self.odom is not None
         return math.dist((self.odom[0] + OFFSET[0], self.odom[1] + OFFSET[1]), self.goal)
 
+    def map(self) -> None:
+        info = {"resolution": 0.05, "width": 400, "height": 300, "origin": {"orientation": {"w": 1.0}}}
+        self._map({"header": {"frame_id": "map"}, "info": info, "data": np.zeros(120_000, np.int8)})
+
     def localise(self) -> None:
         transform = {"translation": {"x": OFFSET[0], "y": OFFSET[1]}, "rotation": {"w": 1.0}}
         row = {"header": {"frame_id": "map"}, "child_frame_id": "odom", "transform": transform}
@@ -69,6 +75,7 @@ class Nav2:
 async def test_a_node_localises_and_drives_the_robot_as_its_planner_and_mapper(tmp_path: Path):
     overlay = {
         "slam": {"mode": "ros2"},
+        "planner": {"mode": "ros2"},
         "path": None,
         "tracker": None,
         "map": None,
@@ -79,7 +86,7 @@ async def test_a_node_localises_and_drives_the_robot_as_its_planner_and_mapper(t
         await made.start_daemon()
         ros = free_endpoint()
         async with made.client() as client:
-            face = await made.spawn("ros2", "--robot", f"truck@{made.endpoint}", "--listen", ros, "--planner", "ros2")
+            face = await made.spawn("ros2", "--robot", f"truck@{made.endpoint}", "--listen", ros)
             try:
                 await drive_by_nodes(client, ros)
             finally:
@@ -111,6 +118,7 @@ async def drive_by_nodes(client, ros: str) -> None:
         assert health.latest.standing is LocalisationStatus.SEARCHING
         x, y, yaw = nav.odom
         nav.goal = x + OFFSET[0] + 0.8 * math.cos(yaw), y + OFFSET[1] + 0.8 * math.sin(yaw)
+        nav.map()
         localising = asyncio.create_task(every(0.05, nav.localise))
         try:
             async with asyncio.timeout(20):
@@ -129,6 +137,8 @@ async def drive_by_nodes(client, ros: str) -> None:
         assert math.dist((place.x, place.y), nav.goal) < 0.35
         holders = {(state.holder, state.role) for state in gates.drain() if state.holder is not None}
         assert holders == {("ros2:nav2", Role.TRACKER)}
+        known = await client.get_retained(topics.MAP)
+        assert (known.width, known.height, known.frame) == (400, 300, "map")
         assert nav.children == {"base_link"}
         async with asyncio.timeout(20):  # without a driver and without corrections
             while health.latest.standing is not LocalisationStatus.LOST or gates.latest.mode.moving:

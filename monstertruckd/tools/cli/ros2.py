@@ -25,13 +25,6 @@ class Face(StrEnum):
     RCLPY = "rclpy"
 
 
-class Planning(StrEnum):
-    """Who plans."""
-
-    ROBOT = "robot"
-    ROS2 = "ros2"
-
-
 class Distribution(StrEnum):
     """ROS 2 distributions by their type hashes."""
 
@@ -79,10 +72,6 @@ def ros2(
     odom_to_base: Annotated[
         bool, typer.Option(help="Publish odom to base_link; off where robot_localization does.")
     ] = True,
-    planner: Annotated[
-        Planning,
-        typer.Option("--planner", help="ros2: Nav2 serves goals and drives by cmd_vel, so no action is offered here."),
-    ] = Planning.ROBOT,
     clock: Annotated[bool, typer.Option("--clock", help="Publish /clock, for nodes with use_sim_time.")] = False,
     drive: Annotated[
         bool, typer.Option(help="Let ROS 2 nodes drive, arm and send goals; the emergency stop they always may.")
@@ -106,7 +95,7 @@ def ros2(
 
     address = RobotAddress.default() if robot is None else RobotAddress.parse(robot)
     own = free_endpoint(listen)
-    options = FaceOptions(prefix, map_to_odom, odom_to_base, clock, drive, planner is Planning.ROBOT)
+    options = FaceOptions(prefix, map_to_odom, odom_to_base, clock, drive)
     hashed = distribution is not Distribution.HUMBLE
 
     node = (address.name, namespace)
@@ -146,4 +135,14 @@ def robot_facts(config: "TruckConfig") -> "RobotFacts":
         wheels = WheelJoints(config.chassis(), geometry.track, geometry.drive_ratio)
     lens = None if camera is None else getattr(camera.driver, "lens", None)
     localised = config.slam is None or config.slam.mode != "ros2"
-    return RobotFacts(geometry.length, geometry.width, lens, description, wheels, localised)
+    planner = config.planner
+    return RobotFacts(
+        geometry.length,
+        geometry.width,
+        lens,
+        description,
+        wheels,
+        localised=localised,
+        mapped=localised or (config.own_planner is not None and config.own_planner.map is not None),
+        plans=planner is None or planner.mode != "ros2",
+    )

@@ -207,7 +207,7 @@ class _Leg:
         self._clock = clock
         self._rng = np.random.default_rng([leg.seed, leg.number, 1])
         base = wired(SimulatedTruckConfig.model_validate(leg.config))
-        driven = base.tracker is not None and (base.path is not None or base.planner is not None)
+        driven = base.tracker is not None and (base.path is not None or base.own_planner is not None)
         # one truck in this many is driven by its tracker, along its path or to goals of its planner if it has one
         follows = 4
         self._follows = driven and leg.number % follows == follows - 1

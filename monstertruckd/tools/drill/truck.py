@@ -348,7 +348,7 @@ class DrillTruck:
         async with rig.running():
             observing = asyncio.create_task(watching.run(), name="observer")
             operators = [] if truck.station is None else [truck.station.run()]
-            if wander is not None and not by_hand and config.planner is not None:
+            if wander is not None and not by_hand and config.own_planner is not None:
                 operators.append(GoalGiver(truck, wander.spawn(1)[0]).run())
             asking = [asyncio.create_task(operator, name="operator") for operator in operators]
             try:

@@ -108,20 +108,20 @@ def outputs_of(config: TruckConfig) -> frozenset[str]:
         names.add(topics.PLAN_STABILISER.name)
     if config.tracker is not None:
         names |= set(TICKS["tracker"])
-        if config.planner is not None:
+        if config.own_planner is not None:
             names |= {topics.GOAL.name, topics.PATH.name}
     return frozenset(names)
 
 
 def why_no_goals(own: TruckConfig, used: TruckConfig, log: GoalRecord) -> str | None:
     """What keeps the planner of a robot from being computed again; None = nothing does, or it has none."""
-    if own.planner is None or used.planner is None:
-        return None if own.planner is used.planner else "only one of the two configurations has a planner"
+    if own.own_planner is None or used.own_planner is None:
+        return None if own.own_planner is used.own_planner else "only one of the two configurations has a planner"
     if not log.reports:
         return "the log holds no report on goals"
-    if used.slam is None and used.planner.map is not None and not used.planner.map.is_file():
-        return f"planner.map: {used.planner.map}: no such file, and the log does not hold it"
-    if log.unknown_waypoints(period_of(own.planner)):
+    if used.slam is None and used.own_planner.map is not None and not used.own_planner.map.is_file():
+        return f"planner.map: {used.own_planner.map}: no such file, and the log does not hold it"
+    if log.unknown_waypoints(period_of(own.own_planner)):
         return "waypoints came by remote call, which no log holds"
     return None
 
@@ -139,9 +139,9 @@ def period_of(planner: PlannerConfig) -> int:
 def unseen_ticks(config: TruckConfig, log: Survey) -> list[tuple[int, str]]:
     """Ticks that left nothing in the log: when, ns, and whose; in their order."""
     early = [(instant, "odometry") for instant in _early_ticks(config, log)]
-    if config.planner is None or not log.goals.reports:
+    if config.own_planner is None or not log.goals.reports:
         return early
-    return sorted(early + [(instant, "goals") for instant in log.goals.unseen_ticks(period_of(config.planner))])
+    return sorted(early + [(instant, "goals") for instant in log.goals.unseen_ticks(period_of(config.own_planner))])
 
 
 def _early_ticks(config: TruckConfig, log: Survey) -> Iterable[int]:
@@ -176,8 +176,8 @@ class Chain:
         self._clock = clock
         self._ready = log.ready
         self._goal_record, self._book = log.goals, ComputedPaths()
-        self._calls = {} if config.planner is None else log.goals.calls(period_of(config.planner))
-        self._goal_ticks = [] if config.planner is None else log.goals.ticks(period_of(config.planner))
+        self._calls = {} if config.own_planner is None else log.goals.calls(period_of(config.own_planner))
+        self._goal_ticks = [] if config.own_planner is None else log.goals.ticks(period_of(config.own_planner))
         self._called = [one.state.stamp for one in log.goals.reports if one.sequence in self._calls]
         self._asked: Counter[str] = Counter()
         """Newest number of a request for goals, by source."""
@@ -343,7 +343,7 @@ class Chain:
             compared, self.bus, self._clock, body, places, build_slam(compared, self.bus, self._clock)
         )
         planners = build_planners(config, self.bus, self._clock, body, places)
-        wanted = TICKS.keys() if config.planner is None else {*TICKS, PathService.name}
+        wanted = TICKS.keys() if config.own_planner is None else {*TICKS, PathService.name}
         yield from (service for service in planners if service.name in wanted)
 
     async def _run(self, service: Service) -> None:

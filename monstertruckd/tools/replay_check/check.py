@@ -169,7 +169,7 @@ def _inexact(*configs: TruckConfig) -> tuple[frozenset[str], frozenset[str]]:
     loose, shown = frozenset[str](), frozenset[str]()
     if any(config.slam is not None for config in configs):
         loose, shown = RESTS_ON_WORKER, shown | frozenset(WORKER)
-    if any(config.planner is not None for config in configs):
+    if any(config.own_planner is not None for config in configs):
         loose, shown = loose | RESTS_ON_GOALS, shown | GOALS
     return loose, shown
 

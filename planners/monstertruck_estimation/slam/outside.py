@@ -6,6 +6,7 @@ import numpy as np
 
 from monstertruck_estimation.correction import SmoothedCorrection
 from monstertruck_estimation.slam.config import SlamConfig
+from monstertruck_estimation.slam.outside_map import OutsideMap
 from monstertruck_estimation.slam.service import carried_on
 from monstertruck_estimation.transforms import planar
 from monstertruck_kinematics.se2 import Pose2
@@ -40,6 +41,7 @@ class OutsideLocalisation:
         health: ``health/slam``.
         events: receives refusals, and pose lost and found.
         max_age: see ``GateConfig.max_request_age`` (s).
+        maps: publishes maps of clients; None if the robot has its own.
     """
 
     name = ServiceName.SLAM.value
@@ -56,11 +58,12 @@ class OutsideLocalisation:
         health: Publisher[SlamHealth],
         events: EventSink,
         max_age: float,
+        maps: OutsideMap | None = None,
     ) -> None:
         self._clock = clock
         self._requests, self._gate, self._odometry = requests, gate, odometry
         self._pose, self._health, self._events = pose, health, events
-        self._max_age = max_age
+        self._max_age, self._maps = max_age, maps
         self._sequences = Sequences(max_age)
         self._correction = SmoothedCorrection(config.slew, config.jump)
         deviation, turn = config.deviation
@@ -88,6 +91,8 @@ class OutsideLocalisation:
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._take_corrections())
             tasks.create_task(self._follow())
+            if self._maps is not None:
+                tasks.create_task(self._maps.run())
 
     async def _take_corrections(self) -> None:
         async for request in self._requests:

@@ -75,6 +75,9 @@ class LocalConfig(Schema):
 class PlannerConfig(Schema):
     """Driving to goals."""
 
+    mode: Literal["robot", "ros2"] = "robot"
+    """`ros2`: Nav2 serves goals and drives by `cmd_vel`, as a source in `gate.remote_trackers`; no route is planned
+    here"""
     route: AnyRoutePlanner = HybridConfig(margin=0.04, unknown="blocked", reverse_cost=2.0)
     """Route planner; its margin must exceed the side clearance of the gate; the lidar sees nothing behind"""
     steering: Literal["2ws", "counter", "4ws"] = "4ws"

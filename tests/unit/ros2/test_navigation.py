@@ -21,7 +21,6 @@ from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import Transforms
 from monstertruckd.ros2.actions import GoalStatus
 from monstertruckd.ros2.cdr import decode
-from monstertruckd.ros2.face import FaceOptions
 from monstertruckd.ros2.interfaces import action_edition
 from monstertruckd.ros2.navigation import NavigateThroughPoses, path_in
 from monstertruckd.ros2.rmw import RELIABLE, data_key
@@ -335,7 +334,7 @@ async def test_a_robot_that_ros_2_localises_gets_map_to_odom_and_publishes_none(
 
 
 async def test_where_nav2_plans_no_goal_is_taken_from_ros_2():
-    async with scene(FaceOptions(plans=False)) as found, found.node("rviz") as node, asking(found) as client:
+    async with scene(facts=replace(FACTS, plans=False)) as found, found.node("rviz") as node, asking(found) as client:
         publish = node.publisher("goal_pose", "geometry_msgs/msg/PoseStamped", RELIABLE)
         await asyncio.sleep(0.3)
         publish(pose(1.0))
