@@ -3,7 +3,8 @@
 One row for each format: producers (excerpts of published files, examples of documentation, and files that another
 package writes here), values that differ, and damaged files that are not refused with their name. ``--lerobot PYTHON``
 is an interpreter with the package `lerobot-dataset`, which reads the exported data set. ``memory`` is the peak of
-reading logs of 25 and 75 MB, and what follows for 10 GB. The last line is JSON.
+reading a log of 200 MB, at its middle and at its end, and what follows from its growth for 10 GB. The last line is
+JSON.
 
     python benchmarks/files.py [--lerobot PYTHON] [--no-memory]
 """
@@ -38,7 +39,7 @@ from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruckd import open_log
 from monstertruckd.tools.logs.arrow import export_parquet
 from monstertruckd.tools.logs.lerobot import export_lerobot
-from monstertruckd.tools.logs.pose_files import export_tum
+from monstertruckd.tools.logs.pose_files import export_kitti, export_tum
 from tests.unit.tools.logs.log_kit import Writer, odometry
 from tests.unit.tools.logs.test_lerobot import write as write_drive
 
@@ -198,6 +199,17 @@ def lenses() -> dict[str, list[Example]]:
         "k: [500.0, 0.0, 320.0, 0.0, 501.0, 240.0, 0.0, 0.0, 1.0]\n---\n"
     )
 
+    vins = (
+        "cam0:\n  cam_overlaps: []\n  camera_model: pinhole\n"
+        "  distortion_coeffs: [-0.2879529995338575, 0.0781311194952221, 0.00021265916642721963,"
+        " -0.0001221450347654466]\n"
+        "  distortion_model: radtan\n"
+        "  intrinsics: [458.9432286546919, 457.5637533402653, 367.0272509347057, 249.3128033381081]\n"
+        "  resolution: [752, 480]\n  rostopic: /cam0/image_raw\n"
+    )
+    euroc = [458.9432286546919, 457.5637533402653, 367.0272509347057, 249.3128033381081]
+    euroc += [-0.2879529995338575, 0.0781311194952221, 0.00021265916642721963, -0.0001221450347654466, 0.0]
+
     def stored(names: tuple[str, str]) -> str:
         storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
         storage.write(names[0], np.array([[500.0, 0, 320], [0, 501, 240], [0, 0, 1]]))
@@ -220,6 +232,7 @@ def lenses() -> dict[str, list[Example]]:
         ],
         "kalibr": [
             ("camera chain, one camera", kalibr, numbers, chain),
+            ("kalibr_calibrate_cameras, EuRoC", vins, numbers, euroc),
             ("camera chain, second of two", stereo, lambda text: numbers(text, camera="cam1"), [457.587, *chain[1:]]),
         ],
         "opencv": [
@@ -268,9 +281,24 @@ def logs(lerobot: str | None) -> dict[str, dict[str, Any]]:
         found = [pd.read_parquet(file)["pose.x"], pl.read_parquet(file)["pose.x"], pq.read_table(file)["pose.x"]]
         wrong = sum(not np.allclose(np.asarray(values), x) for values in found)
         rows["parquet, read by pandas, polars and pyarrow"] = {"producers": 3, "wrong": wrong, "unnamed": 0}
-        tum = np.loadtxt(export_tum(log, folder / "poses")["state/odometry"])
-        rows["tum poses, read by numpy"] = {"producers": 1, "wrong": int(not np.allclose(tum[:, 1], x)), "unnamed": 0}
+        for form, export, column in (("tum", export_tum, 1), ("kitti", export_kitti, 3)):
+            file = export(log, folder / form)["state/odometry"]
+            found = [
+                np.loadtxt(file)[:, column],
+                pd.read_csv(file, sep=" ", header=None)[column],
+                pl.read_csv(file, separator=" ", has_header=False)[:, column],
+            ]
+            wrong = sum(not np.allclose(np.asarray(values, float), x) for values in found)
+            rows[f"{form} poses, read by numpy, pandas and polars"] = {"producers": 3, "wrong": wrong, "unnamed": 0}
         export_lerobot(log, folder / "set")
+        file = folder / "set/data/chunk-000/file-000.parquet"
+        found = [
+            pd.read_parquet(file)["action"][5],
+            pl.read_parquet(file)["action"][5],
+            pq.read_table(file)["action"][5].as_py(),
+        ]
+        wrong = sum(not np.allclose(np.asarray(values, float), [0.1, 0.05, -0.05]) for values in found)
+        rows["lerobot rows, read by pandas, polars and pyarrow"] = {"producers": 3, "wrong": wrong, "unnamed": 0}
         read = "from ledataset.datasets.lerobot_dataset import LeRobotDataset as D\n" + (
             f"rows = D('local/drive', root={str(folder / 'set')!r}, video_backend='pyav')\n"
             "print(len(rows), *rows[5]['action'].tolist(), 255 * float(rows[5]['observation.images.camera'].mean()))\n"
@@ -279,47 +307,63 @@ def logs(lerobot: str | None) -> dict[str, dict[str, Any]]:
             done = subprocess.run([lerobot, "-c", read], capture_output=True, text=True, check=False)
             values = [float(word) for word in done.stdout.split()] or [math.nan] * 5
             same = np.allclose(values, [30, 0.1, 0.05, -0.05, 40], atol=[0, 1e-6, 1e-6, 1e-6, 4])
-            rows["lerobot data set, read by lerobot-dataset"] = {"producers": 1, "wrong": int(not same), "unnamed": 0}
+            rows["lerobot data set and video, read by lerobot-dataset"] = {"wrong": int(not same), "unnamed": 0}
     return rows
 
 
-def peak(what: str, megabytes: int) -> float:
-    """Peak of the memory of a process that reads a log of that size, MB."""
-    done = subprocess.run(
-        [sys.executable, __file__, "--one", what, str(megabytes)], capture_output=True, text=True, check=True
-    )
-    return float(done.stdout.split()[-1])
+SIZE = 200
+"""Size of the log whose reading is measured, MB."""
 
 
-def one(what: str, megabytes: int) -> None:
-    """Write a log and read it; prints the peak of this process, MB."""
-    with tempfile.TemporaryDirectory() as name:
-        file, rng, seq = Path(name) / "run.mcap", np.random.default_rng(1), 0
-        writer = Writer(file)
-        scan: dict[str, Any] = {"start_angle": -2.0, "end_angle": 2.0, "time_increment": 1e-4, "scan_time": 0.1}
-        scan |= {"range_min": 0.1, "range_max": 10.0, "codes": np.full(1081, VALID_BEAM, np.uint8)}
-        while not file.exists() or file.stat().st_size < megabytes * 1e6:
-            now = 10**9 + seq * 10**8
-            writer.put(t.ODOMETRY, odometry(now, seq))
-            head = {"stamp": now, "received": now, "seq": seq, "ranges": rng.uniform(0.2, 9.0, 1081)}
-            writer.put(t.SCAN, LaserScan.model_validate(head | scan))
-            seq += 1
-        writer.log.finish()
-        if what == "parquet":
-            export_parquet(file, Path(name) / "out")
-        else:
-            for _ in open_log(file).frames("scan", "odometry", library="polars"):
-                pass
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000)
+def write_log(file: Path) -> None:
+    """Write scans of 1081 beams and odometry, of which no two scans are equal."""
+    ranges, writer, seq = np.random.default_rng(1).uniform(0.2, 9.0, 1081), Writer(file), 0
+    scan: dict[str, Any] = {"start_angle": -2.0, "end_angle": 2.0, "time_increment": 1e-4, "scan_time": 0.1}
+    scan |= {"range_min": 0.1, "range_max": 10.0, "codes": np.full(1081, VALID_BEAM, np.uint8)}
+    while not file.exists() or file.stat().st_size < SIZE * 1e6:
+        now = 10**9 + seq * 10**8
+        for turn in range(5):
+            writer.put(t.ODOMETRY, odometry(now + turn * 2 * 10**7, 5 * seq + turn))
+        head = {"stamp": now, "received": now, "seq": seq, "ranges": np.roll(ranges, seq) * (1.0 + 1e-7 * seq)}
+        writer.put(t.SCAN, LaserScan.model_validate(head | scan))
+        seq += 1
+    writer.log.finish()
+
+
+def read_log(what: str, file: Path) -> None:
+    """Read a log; prints the peaks of this process's memory at half of it and at the end, MB."""
+    half: list[float] = []
+
+    def peak() -> float:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+
+    def seen(position: int) -> None:
+        if not half and position > SIZE * 0.5e6:
+            half.append(peak())
+
+    if what == "parquet":
+        export_parquet(file, file.parent / "out", progress=seen)
+    else:
+        log = open_log(file)
+        for table in log.frames("scan", "odometry", library="polars"):
+            del table
+            seen(log._reader.position)  # noqa: SLF001
+    print(half[0], peak())
 
 
 def memory() -> dict[str, dict[str, Any]]:
-    """Peaks of two sizes, and what follows for 10 GB; MB."""
+    """Peaks at half of a log and at its end, and what follows for 10 GB; MB."""
     rows = {}
-    for what in ("parquet", "frames"):
-        small, large = peak(what, 25), peak(what, 75)
-        slope = max(large - small, 0.0) / 50
-        rows[f"memory, {what}"] = {"mb_25": small, "mb_75": large, "memory_10gb_mb": round(large + slope * 10_000, 1)}
+    with tempfile.TemporaryDirectory() as name:
+        file = Path(name) / "run.mcap"
+        write_log(file)
+        for what in ("parquet", "frames"):
+            words = [sys.executable, __file__, "--read", what, str(file)]
+            done = subprocess.run(words, capture_output=True, text=True, check=True)
+            half, whole = map(float, done.stdout.split())
+            growth = 2.0 * (whole - half) / SIZE
+            row = {"mb_at_half": half, "mb_at_end": whole, "memory_10gb_mb": round(whole + growth * (10_000 - SIZE), 1)}
+            rows[f"memory, {what}"] = row
     return rows
 
 
@@ -328,10 +372,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--lerobot", help="interpreter with the package lerobot-dataset")
     parser.add_argument("--no-memory", action="store_true")
-    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--read", nargs=2, help=argparse.SUPPRESS)
     given = parser.parse_args()
-    if given.one:
-        one(given.one[0], int(given.one[1]))
+    if given.read:
+        read_log(given.read[0], Path(given.read[1]))
         return 0
     rows = {name: judged(examples) for name, examples in (paths() | waypoints() | lenses()).items()}
     rows |= logs(given.lerobot)

@@ -191,6 +191,9 @@ FOREIGN = {
     "python3 -m monstertruckd.bootstrap check": "runs this very test",
     "python3 systemd/debian/build.py": "benchmarks/package.py builds the package and installs it in a Debian",
     "python3 -m monstertruckd.bootstrap sync": "sets up .venv; tests/unit/test_bootstrap.py checks what it runs",
+    "python3 systemd/supervise.py .venv/bin/monstertruckd run --config configs/truck_emulated.yaml": (
+        "tests/unit/systemd/test_supervise.py supervises other programs"
+    ),
     "python docs/site/build.py": "test_site.py builds it into another folder",
     "python -m benchmarks.thesis --only 5.1 5.5": "drives for minutes; slowness and scores have their tests",
     "pip install '.[ros2]'": "needs a package index; the extra is looked up",
