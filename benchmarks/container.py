@@ -1,0 +1,113 @@
+"""The steps of ``systemd/container/Dockerfile`` in a minimal Debian, where no container program builds it.
+
+    python benchmarks/container.py [--keep FOLDER]
+
+Each step runs by ``chroot`` in a root that ``mmdebstrap`` makes (needs root, Debian's packages and a package index);
+then the emulated truck drives its lap there as the image's user. The last line is JSON.
+"""
+
+import argparse
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from benchmarks.service_parts.machine import PASSED_ON  # noqa: E402
+
+FILE = ROOT / "systemd" / "container" / "Dockerfile"
+CERTIFICATES = Path("/etc/ssl/certs")
+GOALS = {"failed_steps": 0, "lap": "path driven to its end"}
+
+
+def steps(text: str) -> Iterator[tuple[str, str]]:
+    """Instruction and arguments of each step, without comments, lines joined."""
+    plain = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
+    for line in plain.replace("\\\n", " ").splitlines():
+        name, _, rest = line.partition(" ")
+        if name:
+            yield name, rest.strip()
+
+
+class Image:
+    """A root folder, and what the steps so far say of the next command.
+
+    Args:
+        folder: of the root.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._environment = {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root"}
+        self._passed = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
+        self._place, self._user = "/", "0"
+
+    def step(self, name: str, rest: str) -> int:
+        """Carry out a step; returns the exit code of its command."""
+        match name:
+            case "FROM":
+                suite = rest.removeprefix("debian:").removesuffix("-slim")
+                words = ["mmdebstrap", "--quiet", "--variant=minbase", suite, str(self.folder)]
+                code = subprocess.run(words, check=False).returncode
+                for file in (Path("/etc/resolv.conf"), CERTIFICATES / "ca-certificates.crt"):
+                    (self.folder / file.relative_to("/")).parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copy(file, self.folder / file.relative_to("/"))
+                return code
+            case "RUN":
+                return self.run(rest).returncode
+            case "COPY":
+                listed = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, capture_output=True, check=True).stdout
+                words = ["tar", "--extract", "--directory", str(self.folder / self._place.lstrip("/"))]
+                return subprocess.run(words, input=listed, check=False).returncode
+            case "WORKDIR":
+                self._place = rest
+                (self.folder / rest.lstrip("/")).mkdir(parents=True, exist_ok=True)
+            case "ENV":
+                for key, value in re.findall(r"(\w+)=(\S+)", rest):
+                    self._environment[key] = value.replace("$PATH", self._environment["PATH"])
+            case "USER":
+                self._user = rest
+        return 0
+
+    def run(self, command: str) -> "subprocess.CompletedProcess[str]":
+        """Run a shell command as the present user in the present folder."""
+        return subprocess.run(
+            ["chroot", f"--userspec={self._user}:{self._user}", str(self.folder), "/bin/sh", "-c",
+             f"cd {self._place} && {command}"],
+            env=self._environment | self._passed, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+
+
+def main() -> int:
+    """Measure; 0 = all goals are met."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--keep", metavar="FOLDER", type=Path, help="empty folder for the root, which is kept")
+    given = parser.parse_args()
+    figures: dict[str, Any] = {"failed_steps": 0, "seconds": {}}
+    with TemporaryDirectory(prefix="container-", ignore_cleanup_errors=True) as name:
+        image = Image(given.keep or Path(name))
+        for number, (instruction, rest) in enumerate(steps(FILE.read_text(encoding="utf-8")), 1):
+            begin = time.monotonic()
+            code = image.step(instruction, rest)
+            figures["failed_steps"] += code != 0
+            figures["seconds"][f"{number} {instruction}"] = round(time.monotonic() - begin, 1)
+            print(f"{number} {instruction}: {code}", file=sys.stderr, flush=True)
+        done = image.run("monstertruckd demo --fast --output /tmp/lap")
+        found = re.search(r"outcome\s+(.*)", done.stdout)
+        figures["lap"] = found[1].strip() if found else (done.stderr or done.stdout).strip()[-500:]
+    met = all(figures[name] == goal for name, goal in GOALS.items())
+    print(json.dumps({"bench": "container", "figures": figures, "goals": GOALS, "met": met}))
+    return 0 if met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
