@@ -337,7 +337,7 @@ def read_log(what: str, file: Path) -> None:
     def peak() -> float:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
 
-    def seen(position: int) -> None:
+    def seen(position: float) -> None:
         if not half and position > SIZE * 0.5e6:
             half.append(peak())
 

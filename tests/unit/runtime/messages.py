@@ -164,6 +164,7 @@ FIELDS: dict[t.Topic[Any], dict[str, Any]] = {
         )
     },
     t.REQ_LOCALISATION: {"correction": poses},
+    t.REQ_MAP: {"origin": poses, "packed": st.binary(max_size=64)},
     t.SLAM: {"overlap": st.floats(0, 1)},
     t.SCAN_MOTION: {"motion": poses, "covariance": hnp.arrays(np.float64, 9, elements=number)},
     t.STOP: {"number": st.integers(1, 2**40), "causes": st.lists(causes, min_size=1, max_size=3).map(tuple)},
