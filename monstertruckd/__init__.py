@@ -10,7 +10,11 @@ def open_log(path: Any) -> Any:
     """Open a recorded log for analysis (extra ``tables``); see ``monstertruckd.tools.logs.opened.OpenedLog``.
 
     Raises:
+        NotInstalledError: the extra is not installed.
         NotFoundError: no such file.
         InputError: not an MCAP file.
     """
-    return import_module("monstertruckd.tools.logs.opened").OpenedLog(path)  # loaded on use: `--help` stays light
+    # Loaded on use: `--help` stays light.
+    with import_module("monstertruck_runtime.extras").needs_extra("tables"):
+        opened = import_module("monstertruckd.tools.logs.opened")
+    return opened.OpenedLog(path)

@@ -8,6 +8,7 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import metadata
 from typing import Final, NamedTuple
 from urllib.parse import unquote, urlparse
@@ -92,3 +93,18 @@ def not_installed(what: str, extra: str) -> NotInstalledError:
     else:
         command = pip_command(sys.executable, lacking(extra))
     return NotInstalledError(f"{what} is not installed; the extra {extra!r} contains it: {command}")
+
+
+@contextmanager
+def needs_extra(name: str) -> Iterator[None]:
+    """Name the extra of the distribution that contains a missing library.
+
+    Raises:
+        NotInstalledError: an import inside failed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("monstertruck"):
+            raise
+        raise not_installed(error.name, name) from None

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT, robot_on_host
+from monstertruck_runtime.extras import needs_extra
 from monstertruckd.config.wizards import WIZARDS, WizardKind, WizardOption, WizardRun
 from monstertruckd.tools.cli.connection import robot_config, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, bundled, complete_config, with_parameters
 from monstertruckd.tools.cli.output import (
     JsonOption,
     command_group,
-    needs_extra,
     on_terminal,
     print_json,
     print_table,

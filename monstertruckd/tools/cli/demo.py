@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruck_runtime.errors import ConfigError, InputError
+from monstertruck_runtime.extras import needs_extra
 from monstertruck_runtime.small_files import require_place
 from monstertruckd.tools.cli.options import SimulatedOption
 from monstertruckd.tools.cli.output import (
     JsonOption,
     console,
     finish,
-    needs_extra,
     on_terminal,
     print_json,
     print_table,

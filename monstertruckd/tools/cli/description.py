@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.extras import needs_extra
 from monstertruckd.tools.cli.options import ConfigArgument
-from monstertruckd.tools.cli.output import needs_extra
 
 if TYPE_CHECKING:
     from monstertruck_kinematics.description import Description, Mechanics

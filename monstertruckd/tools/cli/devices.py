@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from monstertruck_runtime.extras import needs_extra
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.options import complete_device
 from monstertruckd.tools.cli.output import (
     JsonOption,
     finish,
-    needs_extra,
     print_json,
     print_table,
     print_words,

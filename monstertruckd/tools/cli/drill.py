@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from monstertruck_runtime.extras import needs_extra
 from monstertruckd.tools.cli.options import SimulatedOption
-from monstertruckd.tools.cli.output import JsonOption, console, needs_extra, print_json, print_table, progress
+from monstertruckd.tools.cli.output import JsonOption, console, print_json, print_table, progress
 from monstertruckd.tools.shipped import shipped
 
 if TYPE_CHECKING:

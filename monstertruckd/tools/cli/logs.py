@@ -12,19 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.extras import needs_extra
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_topic
-from monstertruckd.tools.cli.output import (
-    JsonOption,
-    command_group,
-    finish,
-    needs_extra,
-    print_json,
-    print_table,
-    progress,
-    remark,
-)
+from monstertruckd.tools.cli.output import JsonOption, command_group, finish, print_json, print_table, progress, remark
 
 if TYPE_CHECKING:
     from monstertruckd.recorder.reader import LogReader

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.extras import needs_extra
 from monstertruckd.tools.cli.connection import not_ready, with_robot
 from monstertruckd.tools.cli.logs import finish_log
 from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption, with_parameters
-from monstertruckd.tools.cli.output import JsonOption, command_group, finish, needs_extra, print_json, progress, remark
+from monstertruckd.tools.cli.output import JsonOption, command_group, finish, print_json, progress, remark
 
 if TYPE_CHECKING:
     from monstertruck_estimation.slam.storage import SavedMap

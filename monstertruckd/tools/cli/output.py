@@ -23,7 +23,6 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from monstertruck_runtime.errors import RequestRefusedError, TruckError, disk_reason
-from monstertruck_runtime.extras import not_installed
 from monstertruck_schemas.reasons import Reason
 
 if TYPE_CHECKING:
@@ -201,21 +200,6 @@ def progress(what: str, total: float | None = None) -> Iterator[Bar]:
     with Progress(console=console(error=True), transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done, now=None: bar.update(task, completed=done, description=now)
-
-
-@contextmanager
-def needs_extra(name: str) -> Iterator[None]:
-    """Name the extra of the distribution that contains a missing library.
-
-    Raises:
-        NotInstalledError: an import inside failed.
-    """
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.startswith("monstertruck"):
-            raise
-        raise not_installed(error.name, name) from None
 
 
 REMEDIES: Final = {

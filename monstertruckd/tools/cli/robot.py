@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.extras import needs_extra
 from monstertruckd.tools.cli.options import ConfigOption, EndpointOption, RobotOption
-from monstertruckd.tools.cli.output import JsonOption, needs_extra, print_json, print_table, until_stopped
+from monstertruckd.tools.cli.output import JsonOption, print_json, print_table, until_stopped
 
 if TYPE_CHECKING:
     from monstertruck_runtime.clock import Clock

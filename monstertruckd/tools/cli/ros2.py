@@ -7,7 +7,8 @@ import typer
 
 from monstertruck_runtime.endpoints import is_endpoint
 from monstertruck_runtime.errors import InputError
-from monstertruckd.tools.cli.output import needs_extra, remark, until_stopped
+from monstertruck_runtime.extras import needs_extra
+from monstertruckd.tools.cli.output import remark, until_stopped
 
 if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager

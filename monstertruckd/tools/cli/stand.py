@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
+from monstertruck_runtime.extras import needs_extra
 from monstertruckd.tools.cli.logs import finish_log, reading_log
 from monstertruckd.tools.cli.options import EndpointOption
-from monstertruckd.tools.cli.output import JsonOption, command_group, needs_extra, print_json, print_table, remark
+from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
 
 if TYPE_CHECKING:
     from monstertruckd.tools.stand.analysis import EstimateError

@@ -8,8 +8,9 @@ import typer
 
 from monstertruck_runtime.endpoints import is_endpoint
 from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.extras import needs_extra
 from monstertruck_schemas.roles import AccessRole
-from monstertruckd.tools.cli.output import needs_extra, remark, until_stopped
+from monstertruckd.tools.cli.output import remark, until_stopped
 
 if TYPE_CHECKING:
     from ssl import SSLContext

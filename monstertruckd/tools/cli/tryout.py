@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from monstertruck_runtime.extras import needs_extra
 from monstertruckd.tools.cli.demo import fresh
 from monstertruckd.tools.cli.options import complete_config
-from monstertruckd.tools.cli.output import needs_extra, print_words, remark, until_stopped
+from monstertruckd.tools.cli.output import print_words, remark, until_stopped
 
 if TYPE_CHECKING:
     from monstertruck_runtime.clock import WallClock

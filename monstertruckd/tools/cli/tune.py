@@ -7,9 +7,10 @@ import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.extras import needs_extra
 from monstertruckd.tools.cli.connection import require_section, with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
-from monstertruckd.tools.cli.output import command_group, needs_extra, print_table, remark
+from monstertruckd.tools.cli.output import command_group, print_table, remark
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient

@@ -197,7 +197,7 @@ FOREIGN = {
     "python docs/site/build.py": "test_site.py builds it into another folder",
     "python -m benchmarks.thesis --only 5.1 5.5": "drives for minutes; slowness and scores have their tests",
     "pip install '.[ros2]'": "needs a package index; the extra is looked up",
-    "pip install '.[tables]'": "needs a package index; the extra is looked up",
+    "pip install '.[tables,plot]'": "needs a package index; the extra is looked up",
     "pip install '.[view]'": "needs a package index; the extra is looked up",
     "systemctl status monstertruckd": "needs an installed service; the unit's name is looked up",
     "journalctl -u monstertruckd -f": "needs an installed service; the unit's name is looked up",

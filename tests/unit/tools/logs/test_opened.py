@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import sys
 import warnings
 
 import numpy as np
@@ -14,7 +15,7 @@ from PIL import Image
 
 import monstertruckd
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import InputError, NotFoundError
+from monstertruck_runtime.errors import InputError, NotFoundError, NotInstalledError
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import Event, Severity
@@ -230,3 +231,10 @@ def test_trajectories_have_a_line_per_pose(file, tmp_path):
     assert matrices[4].tolist() == pytest.approx([1, 0, 0, 0.4, 0, 1, 0, 0, 0, 0, 1, 0])
     with pytest.raises(InputError, match="sensor/scan has no poses: expected some of state/odometry"):
         export_tum(file, tmp_path, Selection(("sensor/scan",)))
+
+
+def test_without_its_extra_the_packages_to_install_are_named(monkeypatch):
+    monkeypatch.delitem(sys.modules, "monstertruckd.tools.logs.opened", raising=False)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(NotInstalledError, match=r"pyarrow is not installed; the extra 'tables' contains it: "):
+        monstertruckd.open_log("run.mcap")

@@ -13,12 +13,12 @@ from typer.testing import CliRunner
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import CommandFailedError, InputError, NotFoundError, NotInstalledError
+from monstertruck_runtime.extras import needs_extra
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.event import LogLevel, LogRecord
 from monstertruck_schemas.state import Ground
 from monstertruckd.tools.cli.logs import app
-from monstertruckd.tools.cli.output import needs_extra
 from monstertruckd.tools.logs.messages import Selection
 from monstertruckd.tools.logs.rerun_view import TIMELINE, convert, environment, show
 from tests.unit.recorder.conftest import scan
