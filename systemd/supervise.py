@@ -33,7 +33,7 @@ PAUSE = 1.0
 
 
 class Supervisor:
-    """Runs a command until told to end.
+    """Runs a command until it has to end.
 
     Args:
         command: its words.
@@ -50,7 +50,7 @@ class Supervisor:
         self._ending = True
 
     def run(self) -> int:
-        """Return the exit code of the command that was told to end."""
+        """Return the exit code of the command that had to end."""
         code = 0
         while not self._ending:
             code = self._once()
@@ -76,17 +76,17 @@ class Supervisor:
 
     def _watch(self, process: "subprocess.Popen[bytes]", news: socket.socket) -> None:
         """Return once the process has ended or was killed."""
-        due, told = time.monotonic() + START, False
+        due, ending = time.monotonic() + START, False
         while process.poll() is None:
             words = _words(news)
-            if not told and words & {b"READY=1", b"WATCHDOG=1"}:
+            if not ending and words & {b"READY=1", b"WATCHDOG=1"}:
                 due = time.monotonic() + self._watchdog
-            if self._ending and not told:
-                told, due = True, time.monotonic() + STOP
+            if self._ending and not ending:
+                ending, due = True, time.monotonic() + STOP
                 process.terminate()
             if time.monotonic() < due:
                 continue
-            if not told:
+            if not ending:
                 print(f"supervise: {self._command[0]} is silent: aborted", flush=True)
                 process.send_signal(signal.SIGABRT)
                 with contextlib.suppress(subprocess.TimeoutExpired):
