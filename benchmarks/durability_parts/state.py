@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any, Final
 
 from benchmarks.durability_parts.subject import Death, Subject
-from monstertruck_planners.missions.progress import MissionProgress
+from monstertruck_planners.missions.progress import Frame, MissionProgress
 from monstertruck_planners.missions.service import MissionInputs, MissionService
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.small_files import SCRATCH, remove_leftovers
@@ -98,7 +98,7 @@ def _write_missions(folder: Path, seed: int) -> Iterator[str]:
         number += 1
         steps = [{"do": "wait", "seconds": 1.0 + seed % 7}] * number
         mission = Mission.model_validate({"version": 2, "name": f"m{number}", "steps": steps})
-        asyncio.run(service._save(MissionProgress(mission, (0.0, 0.0, 0.0), number - 1)))  # noqa: SLF001
+        asyncio.run(service._save(MissionProgress(mission, (0.0, 0.0, 0.0), (Frame(index=number - 1),))))  # noqa: SLF001
         yield str(number)
         if number % 5 == 0:
             asyncio.run(service._forget())  # noqa: SLF001
@@ -109,9 +109,9 @@ def _write_missions(folder: Path, seed: int) -> Iterator[str]:
 def _check_missions(folder: Path, acknowledged: list[str], _: Death) -> str | None:
     wrong = _tidy(folder / "state")
     saved = missions(folder / "state" / "mission.json")._load()  # noqa: SLF001 - as the service's start does
-    if saved is not None and saved.mission.name != f"m{saved.index + 1}":
-        return f"mixed: {saved.mission.name} at step {saved.index + 1}"
-    found = 0 if saved is None else saved.index + 1
+    found = 0 if saved is None else saved.stack[0].index + 1
+    if saved is not None and saved.mission.name != f"m{found}":
+        return f"mixed: {saved.mission.name} at step {found}"
     numbers = [int(line) for line in acknowledged]
     under_way = {0, max(numbers, default=0) + 1} if not numbers or numbers[-1] % 5 == 0 else {numbers[-1] + 1}
     allowed = {numbers[-1] if numbers else 0} | under_way

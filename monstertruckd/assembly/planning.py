@@ -41,6 +41,7 @@ from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import Writer
 from monstertruckd.assembly.estimation import Body
 from monstertruckd.bus.local import Bus
+from monstertruckd.config.device_safety import packs
 from monstertruckd.config.truck import PathConfig, TruckConfig
 from monstertruckd.recorder.picture import MapService
 
@@ -311,6 +312,8 @@ def _build_missions(config: TruckConfig, bus: Bus, clock: Clock, parts: MissionP
             explore=bus.subscribe(topics.EXPLORE, latest()),
             points=None if config.points is None else bus.subscribe(topics.POINTS, latest()),
             slam=None if config.slam is None else bus.subscribe(topics.SLAM, latest()),
+            battery=bus.subscribe(topics.BATTERY, latest()) if list(packs(config.devices, config.monitors)) else None,
+            lidar=config.devices.lidar is not None,
         ),
         state=bus.publisher(topics.MISSION, Writer.PLANNER),
         events=bus.event_sink(),

@@ -1,8 +1,11 @@
-"""Missions: steps that a robot does one after the other."""
+"""Missions: steps that a robot does one after the other, and steps that decide which of others are done.
 
-from typing import Annotated, Literal
+The steps that contain others, and conditions, are named like the nodes of behaviour trees (BehaviorTree.CPP, py_trees).
+"""
 
-from pydantic import Field
+from typing import Annotated, Final, Literal, Self
+
+from pydantic import Field, model_validator
 
 from monstertruck_schemas.base import Name, Schema
 
@@ -10,19 +13,56 @@ Coordinate = Annotated[float, Field(ge=-10_000, le=10_000)]
 Seconds = Annotated[float, Field(gt=0, le=86_400)]
 
 Policy = Literal["abort", "continue", "return"]
-"""After a step that failed: end the mission; continue with the next step; drive back to where it began, and end."""
+"""After a step that failed: fail the step that contains it, or end the mission; continue with the next step; drive back
+to where the mission began, and end."""
+
+
+PointName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
+Percent = Annotated[float, Field(ge=0, le=100)]
+
+MOST_STEPS: Final = 500
+"""Maximum number of steps of a mission, nested ones included."""
+DEEPEST: Final = 8
+"""Maximum depth of nested steps."""
+
+
+class Condition(Schema):
+    """A state of the robot; it holds if all its keys do. What the robot does not know does not hold."""
+
+    battery_below: Percent | None = None
+    """Charge of the battery below this value, %"""
+    battery_above: Percent | None = None
+    """Charge of the battery above this value, %"""
+    after: Seconds | None = None
+    """Time since the mission was started or resumed, s"""
+    point: PointName | None = None
+    """A point of interest of this name is known"""
+    tags: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    """At least this many tags are known"""
+    obstacle: Seconds | None = None
+    """An obstacle has stopped the robot for this time, s"""
+    any_of: Annotated[tuple["Condition", ...], Field(min_length=1, max_length=16, strict=False)] | None = None
+    """At least one of these conditions holds"""
+    unless: "Condition | None" = None
+    """This condition does not hold"""
+
+    @model_validator(mode="after")
+    def _says_something(self) -> Self:
+        if all(value is None for value in self.__dict__.values()):
+            raise ValueError(f"an empty condition: expected one of {', '.join(type(self).model_fields)}")
+        return self
 
 
 class MissionStep(Schema):
-    """What all steps have; each adds its ``do``."""
+    """Common keys of all steps; each adds its ``do``."""
 
     do: str
     retries: Annotated[int, Field(ge=0, le=20)] = 0
     """How often it is tried again before it has failed"""
     on_failure: Policy | None = None
-    """What follows then; null = as the mission says"""
+    """What follows then; null = as the mission says, or abort within another step"""
     limit: Seconds | None = None
-    """Seconds after which it has failed; null = none but its own"""
+    """Seconds after which an attempt has failed; null = none but its own"""
 
 
 class GoToStep(MissionStep):
@@ -43,7 +83,7 @@ class PointStep(MissionStep):
     """Drive before a tag that the camera found, or to a place that was marked."""
 
     do: Literal["goto_point"]
-    point: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
+    point: PointName
     """Name of the point of interest"""
     distance: Annotated[float, Field(ge=0, le=5)] = 0.7
     """Metres before a tag"""
@@ -111,6 +151,81 @@ class ReturnStep(MissionStep):
     do: Literal["return"]
 
 
+class ConditionStep(MissionStep):
+    """Succeed if a condition holds, else fail."""
+
+    do: Literal["condition"]
+    when: Condition
+
+
+class WaitUntilStep(MissionStep):
+    """Stand until a condition holds."""
+
+    do: Literal["wait_until"]
+    when: Condition
+
+
+class SequenceStep(MissionStep):
+    """Do steps one after the other; fails with the first that fails."""
+
+    do: Literal["sequence"]
+    steps: "Steps"
+
+
+class FallbackStep(MissionStep):
+    """Do steps until one succeeds; fails if all fail."""
+
+    do: Literal["fallback"]
+    steps: "Steps"
+
+
+class RepeatStep(MissionStep):
+    """Repeat a sequence of steps."""
+
+    do: Literal["repeat"]
+    steps: "Steps"
+    times: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["forever"] | None = None
+    """Number of rounds; forever = until the mission is stopped, a watch fires or a step fails"""
+    until: Condition | None = None
+    """Condition that ends it after a round; fails if it does not hold after `times` rounds"""
+
+    @model_validator(mode="after")
+    def _ends(self) -> Self:
+        if self.times is None and self.until is None:
+            raise ValueError("a loop without exit: expected times or until (times: forever if it is meant)")
+        return self
+
+
+class BranchStep(MissionStep):
+    """Do one of two sequences of steps."""
+
+    do: Literal["branch"]
+    when: Condition
+    then: "Steps"
+    """Steps if the condition holds"""
+    otherwise: Annotated[tuple["AnyStep", ...], Field(max_length=MOST_STEPS, strict=False)] = ()
+    """Steps if it does not"""
+
+
+class Watch(Schema):
+    """What interrupts a parallel step as soon as a condition holds."""
+
+    when: Condition
+    then: "Steps"
+    """Steps of the interruption"""
+    after: Literal["resume", "end"] = "resume"
+    """Afterwards: begin the interrupted step again, or end the parallel step as done"""
+
+
+class ParallelStep(MissionStep):
+    """Do steps in sequence while watching conditions."""
+
+    do: Literal["parallel"]
+    steps: "Steps"
+    watch: Annotated[tuple[Watch, ...], Field(min_length=1, max_length=16, strict=False)]
+    """Watched conditions; the first has priority"""
+
+
 AnyStep = Annotated[
     GoToStep
     | PointStep
@@ -120,16 +235,56 @@ AnyStep = Annotated[
     | BehaviourStepOfMission
     | FollowWallStep
     | RecordStep
-    | ReturnStep,
+    | ReturnStep
+    | ConditionStep
+    | WaitUntilStep
+    | SequenceStep
+    | FallbackStep
+    | RepeatStep
+    | BranchStep
+    | ParallelStep,
     Field(discriminator="do"),
 ]
 
 
+Steps = Annotated[tuple[AnyStep, ...], Field(min_length=1, max_length=MOST_STEPS, strict=False)]
+
+
 class Mission(Schema):
-    """A list of steps."""
+    """A sequence of steps."""
 
     version: Literal[2]
     name: Name
     on_failure: Policy = "abort"
-    """What follows a step that failed"""
-    steps: Annotated[tuple[AnyStep, ...], Field(min_length=1, max_length=500, strict=False)]
+    """What follows a step that failed, unless it is within another step"""
+    steps: Steps
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        if (deep := max(map(_depth, self.steps))) > DEEPEST:
+            raise ValueError(f"steps: nested {deep} deep, expected at most {DEEPEST}")
+        if (count := sum(map(_count, self.steps))) > MOST_STEPS:
+            raise ValueError(f"steps: {count} with those within others, expected at most {MOST_STEPS}")
+        return self
+
+
+def blocks(node: "Mission | AnyStep") -> tuple[tuple[tuple[str | int, ...], tuple[AnyStep, ...]], ...]:
+    """Return the sequences of steps within a node, each with the keys that lead to it."""
+    match node:
+        case BranchStep():
+            return (("then",), node.then), (("otherwise",), node.otherwise)
+        case ParallelStep():
+            watched = ((("watch", index, "then"), watch.then) for index, watch in enumerate(node.watch))
+            return (("steps",), node.steps), *watched
+        case Mission() | SequenceStep() | FallbackStep() | RepeatStep():
+            return ((("steps",), node.steps),)
+        case _:
+            return ()
+
+
+def _depth(step: AnyStep) -> int:
+    return 1 + max((_depth(inner) for _, block in blocks(step) for inner in block), default=0)
+
+
+def _count(step: AnyStep) -> int:
+    return 1 + sum(_count(inner) for _, block in blocks(step) for inner in block)

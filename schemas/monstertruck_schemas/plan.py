@@ -273,6 +273,18 @@ class ExplorationState(Message):
         return f"the exploration of {self.source} is running"
 
 
+class MissionLine(Schema):
+    """A step in the list of a mission's steps."""
+
+    number: str
+    """Position, such as 2.1"""
+    depth: Annotated[int, Field(ge=0)]
+    """Number of steps that contain it"""
+    text: str
+    active: bool = False
+    """Whether the present step is this one or within it"""
+
+
 class MissionState(Message):
     """Progress of a mission."""
 
@@ -285,8 +297,12 @@ class MissionState(Message):
     resumable: bool = False
     """Whether an interrupted mission can be resumed."""
     step: Annotated[int, Field(ge=0)] = 0
-    """The present one, counted from 1; 0 = none."""
+    """The present one, counted from 1 without those within others; 0 = none."""
     steps: Annotated[int, Field(ge=0)] = 0
+    node: str = ""
+    """Position of the present step among those within others, such as 2.1"""
+    lines: tuple[MissionLine, ...] = ()
+    """Steps around the present one"""
     doing: str = ""
     """The present step in words."""
     attempt: Annotated[int, Field(ge=0)] = 0

@@ -63,10 +63,11 @@ def test_a_mission_is_driven_and_followed():
     assert_at(rig, 1.0, 3.95, 0.0)
 
 
-def test_the_shipped_mission_is_one():
+def test_the_shipped_missions_are_some():
     from monstertruckd.tools.cli.mission import load
 
-    assert len(load(Path(__file__).resolve().parents[2] / "configs" / "missions" / "rooms.yaml").steps) == 6
+    folder = Path(__file__).resolve().parents[2] / "configs" / "missions"
+    assert {file.stem: len(load(file).steps) for file in folder.glob("*.yaml")} == {"rooms": 6, "patrol": 2}
 
 
 @pytest.mark.parametrize("driven", [0.0, 3.0])

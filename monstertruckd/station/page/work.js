@@ -96,8 +96,9 @@ export class Work {
     byId("mission-stop").hidden = !mission?.running || observer;
     byId("mission-resume").hidden = !mission?.resumable || observer;
     byId("mission-moved").hidden = !this.elsewhere || !mission?.resumable || observer;
-    text("mission-state", mission?.running ? words("task.mission.state", { name: mission.name, step: mission.step, steps: mission.steps, doing: mission.doing })
+    text("mission-state", mission?.running ? words("task.mission.state", { name: mission.name, step: mission.node || mission.step, steps: mission.steps, doing: mission.doing })
       : mission?.number || mission?.resumable ? mission.text || reason(mission.outcome) : words("task.none"));
+    this.showLines(mission?.running || mission?.resumable ? mission.lines ?? [] : []);
     const names = facts?.behaviours ?? [];
     byId("task-behaviours").hidden = !names.length;
     const key = `${names.join()}|${behaviour?.running ? behaviour.behaviour : ""}|${observer}`;
@@ -113,6 +114,22 @@ export class Work {
     text("behaviour-state", behaviour?.running ? words("task.behaviour.state", { name: title(behaviour.behaviour), phase: behaviour.phase, seconds: number(behaviour.elapsed, 0) })
       : behaviour?.number ? behaviour.text || reason(behaviour.outcome) : words("task.none"));
     byId("tasks-none").hidden = Boolean(facts?.explores || facts?.tracks || facts?.goals || names.length);
+  }
+
+  // The steps of the mission around the present one, which is marked, as are the steps that contain it.
+  showLines(lines) {
+    const key = JSON.stringify(lines);
+    if (byId("mission-lines").dataset.shown === key) return;
+    byId("mission-lines").dataset.shown = key;
+    const present = lines.findLastIndex((line) => line.active);
+    byId("mission-lines").replaceChildren(...lines.map((line, index) => {
+      const item = document.createElement("li");
+      item.textContent = `${line.number}  ${line.text}`;
+      item.style.paddingLeft = `${line.depth}em`;
+      if (line.active) item.className = "active";
+      if (index === present) item.ariaCurrent = "step";
+      return item;
+    }));
   }
 
   async startPath() {

@@ -1,5 +1,6 @@
 """``monstertruckd mission``: run lists of steps, check and list them."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,7 @@ from monstertruckd.tools.cli.output import JsonOption, command_group, print_end,
 from monstertruckd.tools.shipped import shipped
 
 if TYPE_CHECKING:
+    from monstertruck_planners.missions.check import Abilities, Key, Mistake
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
     from monstertruck_schemas.mission import Mission
@@ -57,26 +59,40 @@ def run_command(
 
 
 @app.command("check")
-def check_command(file: FileArgument, json_output: JsonOption = False) -> None:
-    """Check a mission's file: every mistake with its line. Prints its steps."""
-    from monstertruck_planners.missions.progress import in_words
+def check_command(
+    file: FileArgument,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", "-c", help="Also check what this robot has.", show_default=False),
+    ] = None,
+    map_folder: Annotated[
+        Path | None,
+        typer.Option("--map", help="Also check points of interest against this saved map.", show_default=False),
+    ] = None,
+    json_output: JsonOption = False,
+) -> None:
+    """Check a mission's file: every mistake with its line, steps that are never reached. Prints its steps."""
+    from monstertruck_planners.missions.check import lacking, steps_of
 
-    mission = load(file)
+    mission, line_of = read(file)
+    if config is not None or map_folder is not None:
+        require_none(lacking(mission, abilities(config, map_folder)), line_of)
     if json_output:
         print_json(mission.model_dump(mode="json"))
         return
+    from monstertruck_planners.missions.outline import in_words
+
     rows = [
         (
-            str(number),
-            str(step.retries),
-            "-" if step.limit is None else f"{step.limit:g}",
-            step.on_failure or mission.on_failure,
-            in_words(step),
+            place.number,
+            str(place.step.retries),
+            "-" if place.step.limit is None else f"{place.step.limit:g}",
+            place.step.on_failure or (mission.on_failure if "." not in place.number else "abort"),
+            "  " * place.number.count(".") + in_words(place.step),
         )
-        for number, step in enumerate(mission.steps, 1)
+        for place in steps_of(mission)
     ]
-    numbers = ("step", "retries", "limit s")
-    print_table((*numbers, "on failure", "what"), rows, right=numbers)
+    print_table(("step", "retries", "limit s", "on failure", "what"), rows, right=("retries", "limit s"))
 
 
 @app.command("list")
@@ -120,12 +136,21 @@ def stop_command(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAUL
 
 
 def load(file: Path) -> "Mission":
+    """Read a mission, see ``read``."""
+    return read(file)[0]
+
+
+def read(file: Path) -> "tuple[Mission, Callable[[Key], str]]":
     """Read a mission, or a file of waypoints as one that drives to each of them.
+
+    Returns:
+        The mission, and a function that returns file and line of a key.
 
     Raises:
         ConfigError: one line per mistake, each naming file, line, key and what was expected.
         InputError: a waypoint is invalid, or the file cannot be read.
     """
+    from monstertruck_planners.missions.check import dead_ends
     from monstertruck_runtime.outside import text_of
     from monstertruck_runtime.path_files import has_waypoints, mission_from
     from monstertruck_runtime.yaml_files import LARGEST_YAML
@@ -133,5 +158,58 @@ def load(file: Path) -> "Mission":
     from monstertruckd.config.load import load_config
 
     if file.is_file() and has_waypoints(text := text_of(file, "a mission", LARGEST_YAML, ConfigError)):
-        return mission_from(text, file)
-    return load_config(file, Mission)[0]
+        return mission_from(text, file), lambda _: str(file)
+    mission, tree = load_config(file, Mission)
+
+    def line_of(key: "Key") -> str:
+        return str(tree.origin(key) or file)
+
+    require_none(dead_ends(mission), line_of)
+    return mission, line_of
+
+
+def require_none(mistakes: "list[Mistake]", line_of: "Callable[[Key], str]") -> None:
+    """Require a mission without mistakes.
+
+    Raises:
+        ConfigError: one line per mistake, with file, line and step.
+    """
+    if mistakes:
+        raise ConfigError("\n".join(f"{line_of(one.key)}: step {one.number}: {one.text}" for one in mistakes))
+
+
+def abilities(config: Path | None, map_folder: Path | None) -> "Abilities":
+    """Return what the robot of a configuration has, and the points of a saved map.
+
+    Raises:
+        ConfigError: the configuration is invalid.
+        NotFoundError: the map has no points.
+    """
+    from dataclasses import replace
+
+    from monstertruck_planners.missions.check import Abilities
+
+    able = Abilities()
+    if config is not None:
+        from monstertruckd.config.device_safety import packs
+        from monstertruckd.config.load import load_truck
+
+        robot, _ = load_truck(config)
+        names = robot.behaviours.keys()
+
+        def behaviour(name: str, _: object) -> None:
+            if name not in names:
+                raise NotFoundError(f"no behaviour {name!r}: expected one of {', '.join(sorted(names))}")
+
+        able = Abilities(
+            explorer=robot.explorer is not None,
+            points=robot.points is not None,
+            charge=bool(list(packs(robot.devices, robot.monitors))),
+            lidar=robot.devices.lidar is not None,
+            behaviour=behaviour if names else None,
+        )
+    if map_folder is not None:
+        from monstertruck_estimation.points.files import load as load_points
+
+        able = replace(able, known=frozenset(point.name for point, _ in load_points(map_folder)))
+    return able

@@ -119,9 +119,9 @@ async def run_mission(
         if report is None or not state.running:
             return
         lines = [] if before is None else _failed(before, state)
-        if before is None or (state.step, state.attempt, state.doing) != (before.step, before.attempt, before.doing):
+        if before is None or (state.node, state.attempt, state.doing) != (before.node, before.attempt, before.doing):
             again = f", attempt {state.attempt}" if state.attempt > 1 else ""
-            lines.append(f"step {state.step} of {state.steps}: {state.doing}{again}")
+            lines.append(f"step {state.node} of {state.steps}: {state.doing}{again}")
         stands = _why_it_stands(stand)
         trouble = "stands" if stands else state.text  # what is stale comes and goes while it stands
         if trouble and trouble != said:
@@ -145,7 +145,7 @@ async def run_mission(
 
 def _failed(before: MissionState, state: MissionState) -> list[str]:
     """A line on the attempt that has failed between two reports, if one has."""
-    again = state.step == before.step and state.attempt > before.attempt
+    again = state.node == before.node and state.attempt > before.attempt
     return [f"it failed: {state.failed}"] if again or state.failures > before.failures else []
 
 

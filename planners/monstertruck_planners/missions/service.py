@@ -1,4 +1,4 @@
-"""Mission service: does the steps in sequence through the goal, behaviour and exploration services."""
+"""Mission service: does the steps of a mission through the goal, behaviour and exploration services."""
 
 import asyncio
 import contextlib
@@ -13,14 +13,21 @@ from monstertruck_planners.behave.service import BehaviourService
 from monstertruck_planners.explore.service import ExplorerService
 from monstertruck_planners.goals.exchange import pose_of, require_place
 from monstertruck_planners.goals.service import GoalService
+from monstertruck_planners.missions.check import Abilities, dead_ends, lacking
+from monstertruck_planners.missions.conditions import Facts, holds
+from monstertruck_planners.missions.outline import lines, shown
 from monstertruck_planners.missions.progress import (
-    GOOD,
     MissionProgress,
     Next,
     SavedProgress,
     StepEnd,
     after,
+    enter,
+    expired,
+    judge,
     outcome,
+    passed,
+    watched,
 )
 from monstertruck_planners.tasks import R, TaskServer
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
@@ -36,18 +43,33 @@ from monstertruck_schemas.health import SlamHealth
 from monstertruck_schemas.mission import (
     AnyStep,
     BehaviourStepOfMission,
+    BranchStep,
+    ConditionStep,
     ExploreStep,
+    FallbackStep,
     FollowWallStep,
     GoToStep,
     LookStep,
     Mission,
+    ParallelStep,
     PointStep,
     RecordStep,
+    RepeatStep,
     ReturnStep,
+    SequenceStep,
     WaitStep,
+    WaitUntilStep,
 )
-from monstertruck_schemas.plan import BehaviourState, ExplorationState, GoalPhase, GoalState, MissionState, TaskState
-from monstertruck_schemas.points import PointsOfInterest
+from monstertruck_schemas.plan import (
+    BehaviourState,
+    ExplorationState,
+    GoalPhase,
+    GoalState,
+    MissionLine,
+    MissionState,
+    TaskState,
+)
+from monstertruck_schemas.points import PointKind, PointsOfInterest
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import (
     BehaviourOrder,
@@ -62,10 +84,14 @@ from monstertruck_schemas.req import (
     Waypoint,
 )
 from monstertruck_schemas.roles import ServiceName
+from monstertruck_schemas.sensor import Battery
 from monstertruck_schemas.state import GateState, Odometry
-from monstertruck_schemas.topics import ODOMETRY
+from monstertruck_schemas.topics import BATTERY, ODOMETRY
 
 T = TypeVar("T", GoalState, ExplorationState, BehaviourState)
+
+DrivingStep = GoToStep | PointStep | LookStep | ExploreStep | BehaviourStepOfMission | FollowWallStep | ReturnStep
+"""Steps that other services do."""
 
 SOURCE: Final = ServiceName.MISSIONS.value
 """Source of the goals, behaviours and explorations of a mission."""
@@ -73,7 +99,7 @@ OWN: Final = frozenset({SOURCE, ServiceName.EXPLORER.value})
 """Sources of goals that belong to a mission or to an exploration."""
 MISSION_CHECK_RATE: Final = 5.0
 """Checks per second."""
-CHANGES: Final = ("number", "running", "step", "attempt", "outcome", "resumable")
+CHANGES: Final = ("number", "running", "node", "attempt", "outcome", "resumable")
 """Report fields whose change triggers an immediate report."""
 PASSING: Final = frozenset(
     {Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.POSE_LOST, Reason.LEASE_EXPIRED, Reason.BUSY}
@@ -96,6 +122,10 @@ class MissionInputs:
     explore: Subscription[ExplorationState]
     points: Subscription[PointsOfInterest] | None = None
     slam: Subscription[SlamHealth] | None = None
+    battery: Subscription[Battery] | None = None
+    """None if the robot does not estimate its charge."""
+    lidar: bool = False
+    """Whether a lidar sees obstacles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,8 +195,12 @@ class MissionService:
         self._writing = asyncio.Lock()
         self._keeping: asyncio.Task[None] | None = None
         """Writes the changes of the latest request."""
-        self._limit: asyncio.Timeout | None = None
-        """Time limit of the current step."""
+        self._blocked: int | None = None
+        """Time since which an obstacle stops the robot (ns)."""
+        self._known: tuple[PointsOfInterest | None, frozenset[str], int] = (None, frozenset(), 0)
+        """Newest points of interest, their names and the number of tags."""
+        self._lines: tuple[MissionLine, ...] = ()
+        """Steps of the mission in words."""
         self._noted: Pose2 | None = None
         """Pose of the robot that was last stored."""
         self._task: asyncio.Task[None] | None = None
@@ -179,6 +213,7 @@ class MissionService:
         except InputError as error:
             await self._say_damaged(str(error))
         if (saved := self._interrupted) is not None:
+            self._lines = lines(saved.mission)
             text = f"{saved.mission.name} was interrupted {_where(saved)}; it can be resumed"
             self._events(Reason.MISSION_INCOMPLETE, Severity.WARNING, SOURCE, text)
         async with asyncio.TaskGroup() as self._group:
@@ -188,6 +223,7 @@ class MissionService:
             try:
                 while True:
                     await schedule.next()
+                    self._observe_obstacle()
                     self.tasks.report()
                     await self._note_place()
             finally:
@@ -222,10 +258,10 @@ class MissionService:
         assert self._group is not None
         self._source, self._progress = request.source, accepted
         self._began, self._end = self._clock.now(), None
-        self._interrupted, self._failed = None, ""
+        self._interrupted, self._failed, self._lines = None, "", lines(accepted.mission)
         text = f"{accepted.mission.name}, {len(accepted.mission.steps)} steps, asked for by {request.source}"
-        if accepted.index > 0:
-            text += f", from step {accepted.index + 1} on"
+        if accepted.number != "1":
+            text += f", from step {accepted.number} on"
         self._events(Reason.MISSION_STARTED, Severity.INFO, SOURCE, text)
         self._keeping = self._group.create_task(self._save(accepted))
         self._task = self._group.create_task(self._do_all(accepted))
@@ -282,62 +318,67 @@ class MissionService:
         return MissionProgress(request.mission, pose)
 
     def _check(self, mission: Mission) -> None:
-        """Check that the robot has the parts that the steps need, and that its behaviours accept their settings.
+        """Check that all steps can be reached, and that the robot has the parts that they need.
 
         Raises:
             NotFoundError: parts are missing; lists every step and part.
-            InputError: settings are wrong, alone or as well.
+            InputError: settings are wrong or steps cannot be reached, alone or as well.
         """
-        wrong: list[tuple[int, TruckError]] = []
-        for number, step in enumerate(mission.steps, 1):
-            try:
-                self._check_step(step)
-            except TruckError as error:
-                wrong.append((number, error))
-        if wrong:
-            lacks = all(isinstance(error, NotFoundError) for _, error in wrong)
-            raise (NotFoundError if lacks else InputError)("; ".join(f"step {number}: {why}" for number, why in wrong))
+        if wrong := [*dead_ends(mission), *lacking(mission, self._abilities)]:
+            lacks = all(mistake.lacks for mistake in wrong)
+            raise (NotFoundError if lacks else InputError)("; ".join(f"step {one.number}: {one.text}" for one in wrong))
 
-    def _check_step(self, step: AnyStep) -> None:
-        if isinstance(step, ExploreStep) and self._parts.explorer is None:
-            raise NotFoundError("explore: the robot's configuration has no section `explorer`")
-        looks = isinstance(step, PointStep) or (isinstance(step, ExploreStep) and step.find is not None)
-        if looks and self._in.points is None:
-            raise NotFoundError(f"{step.do}: the robot's configuration has no section `points`")
-        if isinstance(step, BehaviourStepOfMission | FollowWallStep):
-            if self._parts.behaviours is None:
-                raise NotFoundError(f"{step.do}: the robot's configuration has no section `behaviours`")
-            self._parts.behaviours.check(step.name, step.settings if isinstance(step, BehaviourStepOfMission) else {})
+    @property
+    def _abilities(self) -> Abilities:
+        behaviours = self._parts.behaviours
+        return Abilities(
+            explorer=self._parts.explorer is not None,
+            points=self._in.points is not None,
+            charge=self._in.battery is not None,
+            lidar=self._in.lidar,
+            behaviour=None if behaviours is None else behaviours.check,
+        )
 
     # Steps
 
     async def _do_all(self, progress: MissionProgress) -> None:
         """Run a mission from its current step."""
         self._parts.goals.hold(SOURCE, on=True)
+        self._progress = progress
         following: Next = "step"
         try:
-            while following in ("step", "again", "return"):
-                self._progress, self._waits = progress, ""
-                self.tasks.report()
-                step = ReturnStep(do="return") if progress.returning else progress.step
-                at = f"step {progress.index + 1} of {len(progress.mission.steps)}: {progress.doing}"
-                self._events(Reason.MISSION_STEP, Severity.INFO, SOURCE, at)
-                end = await self._limited(step, progress)
-                if end.reason not in GOOD:
-                    self._failed = end.text or end.reason.text
-                    self._events(end.reason, Severity.WARNING, SOURCE, f"{at}: {self._failed}")
-                progress, following = after(progress, end)
-                if following in ("step", "again", "return"):
-                    await self._save(progress)
-            self._finish(outcome(progress, following))
+            while following not in ("done", "ended"):
+                if following == "round":  # one that takes no time must not stall the loop
+                    await self._clock.sleep(1.0 / MISSION_CHECK_RATE)
+                following = await self._do_next(self._progress)
+                if following not in ("done", "ended"):
+                    await self._save(self._progress)
+            self._finish(outcome(self._progress, following))
         except asyncio.CancelledError:
             if self._end is None:  # the daemon exits: the progress stays on disk
-                await self._save(progress)
+                await self._save(self._progress)
             raise
         finally:
             self._parts.goals.hold(SOURCE, on=False)
         assert self._group is not None
         self._keeping = self._group.create_task(self._forget())  # not awaited: the next mission may start
+
+    async def _do_next(self, progress: MissionProgress) -> Next:
+        """Run the current step and advance the mission."""
+        self._progress = progress = enter(progress, self._facts())
+        self._waits = ""
+        self.tasks.report()
+        at = f"step {progress.number} of {len(progress.mission.steps)}: {progress.doing}"
+        self._events(Reason.MISSION_STEP, Severity.INFO, SOURCE, at)
+        end, depth = await self._supervised(progress)
+        if end is None:
+            self._events(Reason.MISSION_STEP, Severity.INFO, SOURCE, f"{at}: interrupted by a watch")
+            return "step"
+        if not end.good:
+            self._failed = end.text or end.reason.text
+            self._events(end.reason, Severity.WARNING, SOURCE, f"{at}: {self._failed}")
+        self._progress, following = after(self._progress, end, self._facts(), depth)
+        return following
 
     def _finish(self, end: StepEnd) -> None:
         severity = Severity.INFO if end.reason.exit_code == 0 else Severity.WARNING
@@ -345,55 +386,98 @@ class MissionService:
         self._events(end.reason, severity, SOURCE, end.text)
         self.tasks.report()
 
-    async def _limited(self, step: AnyStep, progress: MissionProgress) -> StepEnd:
-        if step.limit is None:
-            return await self._do(step, progress)
+    async def _supervised(self, progress: MissionProgress) -> tuple[StepEnd | None, int | None]:
+        """Run the current step until it ends, a time limit is over or a watch interrupts it.
+
+        Returns:
+            The outcome, None after an interruption, and the depth of the step whose limit is over, None for this one.
+        """
+        step = ReturnStep(do="return") if progress.returning else progress.step
+        spent = 0.0
+        work: asyncio.Task[StepEnd] | None = None
         try:
-            async with self._clock.deadline(step.limit) as self._limit:
-                return await self._do(step, progress)
-        except TimeoutError:
-            return StepEnd(Reason.TIMEOUT, f"not done within {step.limit:g} s")
+            while True:
+                self._progress, interrupted = watched(progress, self._facts())
+                if interrupted:
+                    return None, None
+                progress = self._progress
+                if (over := expired(progress)) is not None:
+                    return _over(over[1]), over[0]
+                if step.limit is not None and spent >= step.limit:
+                    return _over(step.limit), None
+                work = work or asyncio.create_task(self._do(step, progress))
+                before, paused = self._clock.now(), self._paused
+                await asyncio.wait((work,), timeout=1.0 / MISSION_CHECK_RATE)
+                if not paused:
+                    passing = (self._clock.now() - before) / SECOND
+                    spent, progress = spent + passing, passed(progress, passing)
+                if work.done():
+                    self._progress = progress
+                    return work.result(), None
         finally:
-            self._limit = None
+            if work is not None and not work.done():
+                work.cancel()
+                await asyncio.wait((work,))
 
     async def _do(self, step: AnyStep, progress: MissionProgress) -> StepEnd:
         try:
             match step:
-                case GoToStep(x=x, y=y, yaw=yaw, via=via):
-                    return await self._go(lambda: (x, y, yaw), via)
-                case PointStep():
-                    return await self._go(lambda: self._before(step))
-                case LookStep(x=x, y=y):
-                    return await self._go(lambda: self._towards(x, y))
                 case WaitStep(seconds=seconds):
                     return await self._wait(seconds)
-                case ExploreStep():
-                    return await self._explore(step)
-                case BehaviourStepOfMission(name=name, settings=settings):
-                    return await self._behave(name, dict(settings), None)
-                case FollowWallStep(name=name, distance=distance):
-                    return await self._behave(name, {}, distance)
+                case WaitUntilStep(when=when):
+                    return await self._stand(lambda: None if holds(when, self._facts()) else 1.0 / MISSION_CHECK_RATE)
                 case RecordStep(note=note):
                     self._events(Reason.MISSION_NOTE, Severity.INFO, SOURCE, note)
                     return StepEnd(Reason.OK)
-                case ReturnStep():
-                    return await self._go(lambda: progress.start)
+                case ConditionStep():
+                    return judge(step, self._facts())
+                case BranchStep():  # whose chosen side has no steps
+                    return StepEnd(Reason.OK)
+                case SequenceStep() | FallbackStep() | RepeatStep() | ParallelStep():
+                    raise AssertionError("entered before")
                 case _:
-                    assert_never(step)
+                    return await self._drive(step, progress)
         except RequestRefusedError as error:
             return StepEnd(error.refusal, str(error))
         except TruckError as error:
             return StepEnd(error.reason, str(error))
 
+    async def _drive(self, step: DrivingStep, progress: MissionProgress) -> StepEnd:
+        match step:
+            case GoToStep(x=x, y=y, yaw=yaw, via=via):
+                return await self._go(lambda: (x, y, yaw), via)
+            case PointStep():
+                return await self._go(lambda: self._before(step))
+            case LookStep(x=x, y=y):
+                return await self._go(lambda: self._towards(x, y))
+            case ExploreStep():
+                return await self._explore(step)
+            case BehaviourStepOfMission(name=name, settings=settings):
+                return await self._behave(name, dict(settings), None)
+            case FollowWallStep(name=name, distance=distance):
+                return await self._behave(name, {}, distance)
+            case ReturnStep():
+                return await self._go(lambda: progress.start)
+            case _:
+                assert_never(step)
+
     async def _wait(self, seconds: float) -> StepEnd:
         until = self._clock.now() + round(seconds * SECOND)
-        while (left := until - self._clock.now()) > 0:
+        return await self._stand(lambda: (until - self._clock.now()) / SECOND)
+
+    async def _stand(self, left: Callable[[], float | None]) -> StepEnd:
+        """Stand until no seconds are ``left``.
+
+        Raises:
+            RequestRefusedError: the robot was disarmed.
+        """
+        while (seconds := left()) is not None and seconds > 0.0:
             if (other := self.tasks.other()) is not None:
                 return StepEnd(Reason.CANCELLED, other)
             gate = self._in.gate.latest
             if gate is None or not gate.mode.active:
                 raise does_not_drive(gate)
-            await self._clock.sleep(min(left / SECOND, 1.0 / MISSION_CHECK_RATE))
+            await self._clock.sleep(min(seconds, 1.0 / MISSION_CHECK_RATE))
         return StepEnd(Reason.OK)
 
     def _before(self, step: PointStep) -> Pose2:
@@ -494,7 +578,6 @@ class MissionService:
                 if state is not None and state.number == number and (done := enough(state)) is not None:
                     return done
                 # Count checks, not time: while this process is suspended, as with the computer, no service can report.
-                self._wait_for_resume()
                 silent = silent + 1 if state is newest else 0
                 newest = state
                 if silent > SILENT * MISSION_CHECK_RATE:
@@ -529,13 +612,38 @@ class MissionService:
                 refused = True
             await self._clock.sleep(1.0)  # seconds until the next request
 
-    def _wait_for_resume(self) -> None:
-        """Stop the step's time limit while its goal is paused; called at every check."""
-        goal, limit = self._in.goal.latest, self._limit
-        if goal is None or goal.phase is not GoalPhase.PAUSED or limit is None or limit.expired():
-            return
-        if (when := limit.when()) is not None:
-            limit.reschedule(when + 1.0 / MISSION_CHECK_RATE)
+    @property
+    def _paused(self) -> bool:
+        """Whether the current goal is paused, so that no time limit runs."""
+        goal = self._in.goal.latest
+        return goal is not None and goal.phase is GoalPhase.PAUSED
+
+    def _facts(self) -> Facts:
+        now, battery = self._clock.now(), None if self._in.battery is None else self._in.battery.latest
+        fresh = battery is not None and now - battery.received <= BATTERY.fresh_for() * SECOND
+        charge = battery.charge if battery is not None and fresh else None
+        points = None if self._in.points is None else self._in.points.latest
+        if points is not None and points is not self._known[0]:
+            names = frozenset(point.name for point in points.points)
+            self._known = points, names, sum(point.kind is PointKind.TAG for point in points.points)
+        _, names, tags = self._known
+        return Facts(
+            charge=None if charge is None else 100.0 * charge,
+            elapsed=(now - self._began) / SECOND,
+            points=names,
+            tags=tags,
+            obstacle=0.0 if self._blocked is None else (now - self._blocked) / SECOND,
+        )
+
+    def _observe_obstacle(self) -> None:
+        """Note since when an obstacle stops the robot, or makes its goal wait."""
+        gate, goal = self._in.gate.latest, self._in.goal.latest
+        blocked = gate is not None and Reason.OBSTACLE_STOP in gate.reasons
+        blocked = blocked or (goal is not None and goal.phase is GoalPhase.WAITING)
+        if not blocked:
+            self._blocked = None
+        elif self._blocked is None:
+            self._blocked = self._clock.now()
 
     def _header(self) -> dict[str, Any]:
         self._seq += 1
@@ -601,11 +709,11 @@ class MissionService:
         """Return the report on the latest mission."""
         header: dict[str, Any] = {"stamp": now, "received": now, "seq": 0, "frame": "map", "number": self.tasks.number}
         if self._interrupted is not None:
-            saved = self._interrupted
+            saved, at = self._interrupted, self._interrupted.progress()
             return MissionState(
-                **header, name=saved.mission.name, source=saved.source, resumable=True, step=saved.index + 1,
-                steps=len(saved.mission.steps), doing=saved.progress().doing, failures=saved.failures,
-                outcome=Reason.MISSION_INCOMPLETE, text=f"interrupted {_where(saved)}",
+                **header, name=saved.mission.name, source=saved.source, resumable=True, step=at.index + 1,
+                steps=len(saved.mission.steps), doing=at.doing, node=at.number, lines=shown(self._lines, at.number),
+                failures=saved.failures, outcome=Reason.MISSION_INCOMPLETE, text=f"interrupted {_where(saved)}",
             )  # fmt: skip
         if (progress := self._progress) is None:
             return MissionState(**header)
@@ -613,7 +721,7 @@ class MissionService:
         return MissionState(
             **header, name=progress.mission.name, source=self._source, running=end is None, step=progress.index + 1,
             steps=len(progress.mission.steps), attempt=progress.attempt + 1, failures=progress.failures,
-            doing=progress.doing, failed=self._failed,
+            doing=progress.doing, failed=self._failed, node=progress.number, lines=shown(self._lines, progress.number),
             outcome=Reason.DRIVING if end is None else end.reason, text=self._waits if end is None else end.text,
             elapsed=(now - self._began) / SECOND,
         )  # fmt: skip
@@ -629,5 +737,9 @@ def _end_of(state: TaskState | None, number: int, noun: str) -> StepEnd | None:
 
 
 def _where(saved: SavedProgress) -> str:
-    way_back = f"on the way back, after step {saved.index + 1} had failed"
-    return way_back if saved.returning else f"at step {saved.index + 1}"
+    number = saved.progress().number
+    return f"on the way back, after step {number} had failed" if saved.returning else f"at step {number}"
+
+
+def _over(limit: float) -> StepEnd:
+    return StepEnd(Reason.TIMEOUT, f"not done within {limit:g} s")

@@ -262,8 +262,16 @@ async def a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page: Pa
     assert "3.0 m from where" in await page.inner_text("#refusal")
     assert await press("#mission-moved", ok=True) == {"do": "mission", "order": "resume", "moved": True}
     assert not await page.is_visible("#mission-moved")
-    await say(page, {"kind": "mission", "m": stopped | {"number": 1, "running": True, "resumable": False}})
+    lines = [
+        {"number": "1", "depth": 0, "text": "repeat 3 times", "active": True},
+        {"number": "1.1", "depth": 1, "text": "goto <b>1 2 0", "active": True},
+        {"number": "2", "depth": 0, "text": "return", "active": False},
+    ]
+    running = {"number": 1, "running": True, "resumable": False, "lines": lines}
+    await say(page, {"kind": "mission", "m": stopped | running})
     assert not await page.is_visible("#mission-resume")
+    assert await page.inner_text("#mission-lines [aria-current]") == "1.1 goto <b>1 2 0", "as text"
+    assert await page.locator("#mission-lines li").count() == 3
 
 
 async def a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page: Page) -> None:

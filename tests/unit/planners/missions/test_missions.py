@@ -11,7 +11,8 @@ from types import SimpleNamespace
 import pytest
 from pydantic import ValidationError
 
-from monstertruck_planners.missions.progress import MissionProgress, SavedProgress, StepEnd, after, in_words, outcome
+from monstertruck_planners.missions.outline import in_words
+from monstertruck_planners.missions.progress import MissionProgress, SavedProgress, StepEnd, after, outcome
 from monstertruck_planners.missions.service import SILENT, MissionInputs, MissionParts, MissionService
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
@@ -19,6 +20,7 @@ from monstertruck_runtime.threads import inline
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.plan import BehaviourState, ExplorationPhase, ExplorationState, GoalPhase, GoalState
+from monstertruck_schemas.points import PointKind
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder, GoalControl, GoalOrder, MissionOrder, MissionRequest, Role
 
@@ -170,19 +172,21 @@ class Pretended:
     ) -> None:
         self.tasks = self
         self.clock, self.number, self.reached = clock, 0, [Reason.GOAL_REACHED] * 99
-        topics = ("gate", "pose", "goal", "behaviour", "explore", "points", "slam")
+        topics = ("gate", "pose", "goal", "behaviour", "explore", "points", "slam", "battery")
         self.latest = dict.fromkeys(topics)
         self.reports, self.events, self.goals, self.held = [], [], [], set()
         self.refusals: list[RequestRefusedError] = []
         box = {name: self._box(name) for name in self.latest}
-        dock = SimpleNamespace(name="dock", before=lambda away: Pose2D(x=7.0 - away, y=8.0, yaw=0.0))
+        dock = SimpleNamespace(
+            name="dock", kind=PointKind.TAG, before=lambda away: Pose2D(x=7.0 - away, y=8.0, yaw=0.0)
+        )
         self.latest["points"] = SimpleNamespace(points=(dock,))
         self.latest["gate"] = SimpleNamespace(nonce="n", stamp=0, reasons=(), mode=SimpleNamespace(active=True))
         self.seq, self.placed, self.behaviours = 0, True, Behaviours(self, busy)
         self.service = MissionService(
             MissionParts(self, self.behaviours, None),
             clock, file=file, localised=localised, offload=offload, max_age=5.0,
-            inputs=MissionInputs(**box), state=SimpleNamespace(next_seq=lambda: 1, put=self.reports.append),
+            inputs=MissionInputs(**box, lidar=True), state=SimpleNamespace(next_seq=lambda: 1, put=self.reports.append),
             events=lambda reason, severity, source, text="", **_: self.events.append((reason, text)),
         )  # fmt: skip
 
@@ -260,7 +264,7 @@ def test_a_mission_is_done_step_by_step_and_keeps_the_robot_armed(tmp_path: Path
         assert robot.order(MissionOrder.START, GO, WAIT, {"do": "record", "note": "here"}, {"do": "return"}) == 1
         await robot.clock.sleep(1.0)
         assert robot.held == {"missions"}
-        assert json.loads(file.read_text())["index"] == 0
+        assert json.loads(file.read_text())["stack"][0]["index"] == 0
         with pytest.raises(RequestRefusedError, match="is running"):
             robot.order(MissionOrder.START, GO)
         await robot.clock.sleep(9.0)
@@ -542,7 +546,7 @@ def test_after_a_restart_it_can_be_gone_on_with_at_the_step_that_was_interrupted
         await robot.clock.sleep(3.5)
 
     played(interrupted, file)
-    assert json.loads(file.read_text())["index"] == 1
+    assert json.loads(file.read_text())["stack"][0]["index"] == 1
 
     async def resumed(robot: Pretended) -> None:
         assert robot.reports[-1].resumable
@@ -644,7 +648,7 @@ def test_a_request_is_answered_once_it_outlasts_a_power_cut(tmp_path: Path, late
         for _ in range(2):
             robot.order(MissionOrder.START, GO, WAIT)
             await robot.service.kept()
-            assert json.loads(file.read_text())["index"] == 0
+            assert json.loads(file.read_text())["stack"][0]["index"] == 0
             robot.order(MissionOrder.STOP)
             await robot.service.kept()
             assert not file.exists()
@@ -680,7 +684,7 @@ SAVED = SavedProgress.of(progress(GO), "ann").model_dump_json()
     ("text", "what"),
     [
         ("{", "Invalid JSON"),
-        (SAVED.replace(":0", ":7"), "expected one of 1 steps"),
+        (SAVED.replace('"index":0', '"index":7'), "expected the position of a step"),
         (SAVED.replace('"source"', '"sauce"'), "expected the progress of a mission: source: Field required"),
         (SAVED + " " * 1_000_000, "expected at most 1000000"),
     ],
@@ -769,5 +773,103 @@ def test_a_robot_without_points_of_interest_is_not_sent_to_look_for_them():
         robot.service._in = replace(robot.service._in, points=None)
         with pytest.raises(NotFoundError, match=r"^step 2: explore: .* section `points`$"):
             robot.order(MissionOrder.START, {"do": "explore"}, {"do": "explore", "find": 2})
+
+    played(story)
+
+
+LOW = {"battery_below": 20}
+
+
+def charge(robot: Pretended, share: float) -> None:
+    robot.latest["battery"] = SimpleNamespace(received=robot.clock.now() + 60 * SECOND, charge=share)
+
+
+def test_a_watch_cancels_the_goal_and_the_interrupted_step_begins_again(tmp_path: Path):
+    file, far = tmp_path / "mission.json", {**GO, "x": 9.0}
+    patrol = {"do": "parallel", "steps": [GO, far], "watch": [{"when": LOW, "then": [{**GO, "x": 3.0}, WAIT]}]}
+
+    async def interrupted(robot: Pretended) -> None:
+        charge(robot, 0.9)
+        robot.order(MissionOrder.START, patrol)
+        await robot.clock.sleep(3.0)
+        assert robot.goals == [(1.0, 0.0), (9.0, 0.0)]
+        charge(robot, 0.1)
+        await robot.clock.sleep(0.5)
+        assert robot.goals[2:] == [(3.0, 0.0)]
+        assert robot.reports[-1].node == "1.watch1.1"
+        assert [line.number for line in robot.reports[-1].lines if line.active] == ["1", "1.watch1", "1.watch1.1"]
+
+    played(interrupted, file)
+
+    async def resumed(robot: Pretended) -> None:
+        charge(robot, 0.1)
+        assert robot.reports[-1].text == "interrupted at step 1.watch1.1"
+        robot.order(MissionOrder.RESUME)
+        await robot.clock.sleep(10.0)
+
+    robot = played(resumed, file)
+    assert robot.goals == [(3.0, 0.0), (9.0, 0.0)]
+    assert robot.reports[-1].outcome is Reason.MISSION_DONE
+
+
+def test_the_limit_of_an_outer_step_cancels_what_runs():
+    steps = [{"do": "fallback", "steps": [{"do": "sequence", "limit": 3.5, "steps": [WAIT, GO]}, {**GO, "x": 7.0}]}]
+
+    async def story(robot: Pretended) -> None:
+        robot.order(MissionOrder.START, *steps)
+        await robot.clock.sleep(4.0)
+        assert robot.goals == [(1.0, 0.0), (7.0, 0.0)]
+        await robot.clock.sleep(4.0)
+
+    robot = played(story)
+    assert robot.reports[-1].outcome is Reason.MISSION_DONE
+    assert (Reason.TIMEOUT, "step 1.1.2 of 1: goto 1 0 0: not done within 3.5 s") in robot.events
+
+
+@pytest.mark.parametrize(("change", "reason"), [("points", Reason.MISSION_DONE), ("gate", Reason.DISARMED)])
+def test_it_waits_until_a_condition_holds_unless_it_is_disarmed(change: str, reason: Reason):
+    async def story(robot: Pretended) -> None:
+        robot.latest["points"] = SimpleNamespace(points=())
+        robot.order(MissionOrder.START, {"do": "wait_until", "when": {"point": "dock", "after": 1.0}}, GO)
+        await robot.clock.sleep(3.0)
+        assert robot.goals == []
+        if change == "gate":
+            vars(robot.latest["gate"]).update(mode=SimpleNamespace(active=False), worst=Reason.DISARMED, why="disarmed")
+        else:
+            robot.latest["points"] = SimpleNamespace(points=(SimpleNamespace(name="dock", kind=PointKind.MARK),))
+        await robot.clock.sleep(4.0)
+
+    assert played(story).reports[-1].outcome is reason
+
+
+def test_an_obstacle_that_stays_is_a_condition():
+    watch = {"when": {"obstacle": 2.0}, "then": [{**GO, "x": 3.0}], "after": "end"}
+
+    async def story(robot: Pretended) -> None:
+        robot.order(
+            MissionOrder.START, {"do": "parallel", "steps": [{"do": "wait", "seconds": 60.0}], "watch": [watch]}
+        )
+        for reasons, seconds in (((Reason.OBSTACLE_STOP,), 1.5), ((), 1.0), ((Reason.OBSTACLE_STOP,), 1.5)):
+            robot.latest["gate"].reasons = reasons
+            await robot.clock.sleep(seconds)
+        assert robot.goals == []
+        await robot.clock.sleep(1.0)
+        assert robot.goals == [(3.0, 0.0)]
+        await robot.clock.sleep(3.0)
+
+    assert played(story).reports[-1].outcome is Reason.MISSION_DONE
+
+
+def test_a_loop_whose_steps_take_no_time_leaves_the_loop_to_others():
+    note = {"do": "record", "note": "again"}
+
+    async def story(robot: Pretended) -> None:
+        robot.order(MissionOrder.START, {"do": "repeat", "times": 6, "steps": [note]})
+        await robot.clock.sleep(2.0)
+        noted = [reason for reason, _ in robot.events if reason is Reason.MISSION_NOTE]
+        assert len(noted) == 6
+        assert robot.reports[-1].outcome is Reason.MISSION_DONE
+        with pytest.raises(InputError, match=r"step 1: a loop without exit: no step in it takes time"):
+            robot.order(MissionOrder.START, {"do": "repeat", "times": "forever", "steps": [note]})
 
     played(story)

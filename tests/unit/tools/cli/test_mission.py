@@ -14,6 +14,7 @@ from monstertruck_schemas.topics import GATE, MISSION
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.cli.runs import run_mission
 
+CONFIGS = Path(__file__).resolve().parents[4] / "configs"
 GOOD = """version: 2
 name: round
 steps:
@@ -112,7 +113,7 @@ def followed(*states: dict[str, object], mode: GateMode = GateMode.DRIVING) -> l
 
 
 def test_every_step_and_every_failure_is_a_line():
-    first, second = {"step": 1, "doing": "goto 1 0 0"}, {"step": 2, "doing": "return", "failures": 1}
+    first, second = {"node": "1", "doing": "goto 1 0 0"}, {"node": "2", "doing": "return", "failures": 1}
     missed = {"failed": "it missed"}
     assert followed(first, first, {**first, **missed, "attempt": 2}, {**second, **missed, "elapsed": 12.0}) == [
         "     0 s  step 1 of 2: goto 1 0 0",
@@ -124,7 +125,7 @@ def test_every_step_and_every_failure_is_a_line():
 
 
 def test_what_a_step_waits_for_and_why_the_robot_stands_is_said_once():
-    step = {"step": 1, "doing": "goto 1 0 0"}
+    step = {"node": "1", "doing": "goto 1 0 0"}
     starts = {**step, "text": "the planner is starting"}
     assert followed(starts, starts, step)[1:] == ["     0 s  it waits: the planner is starting"]
     stands = "     0 s  it stands: the robot is disarmed; `monstertruckd arm` lets it drive"
@@ -140,3 +141,47 @@ def test_waypoints_of_nav2_are_a_mission(tmp_path: Path):
     file.write_text("waypoints: [{x: 1}]\n")
     done = CliRunner().invoke(app, ["mission", "check", str(file)])
     assert (done.exit_code, done.stderr) == (3, f"{file}: waypoints 0: expected x and y, position, or pose\n")
+
+
+BRANCHES = """version: 2
+name: patrol
+steps:
+  - do: repeat
+    times: forever
+    steps:
+      - { do: wait, seconds: 1 }
+      - do: fallback
+        steps:
+          - { do: record, note: here }
+          - { do: goto_point, point: dock }
+  - { do: return }
+"""
+
+
+def test_steps_that_are_never_reached_are_named_by_line(tmp_path: Path):
+    file = tmp_path / "patrol.yaml"
+    file.write_text(BRANCHES)
+    done = CliRunner().invoke(app, ["mission", "check", str(file)])
+    assert done.exit_code == Reason.BAD_CONFIG.exit_code
+    assert done.stderr.splitlines() == [
+        f"{file}:11: step 1.2.2: is never reached: step 1.2.1 never fails",
+        f"{file}:12: step 2: is never reached: step 1 never succeeds",
+    ]
+
+
+def test_what_the_robot_lacks_and_points_that_nobody_knows_are_named_by_line(tmp_path: Path):
+    file, saved = tmp_path / "patrol.yaml", tmp_path / "map"
+    file.write_text(
+        "version: 2\nname: patrol\nsteps:\n  - { do: wait, seconds: 1 }\n"
+        "  - do: wait_until\n    when:\n      point: dock\n  - { do: explore }\n"
+    )
+    done = CliRunner().invoke(app, ["mission", "check", str(file), "--config", str(CONFIGS / "goals.yaml")])
+    assert done.exit_code == Reason.BAD_CONFIG.exit_code
+    where = [line.partition("patrol.yaml:")[2].split(": ")[:2] for line in done.stderr.splitlines()]
+    assert where == [["6", "step 2"], ["8", "step 3"]], done.stderr
+    saved.mkdir()
+    file.write_text("version: 2\nname: patrol\nsteps:\n  - do: goto_point\n    point: dock\n")
+    done = CliRunner().invoke(app, ["mission", "check", str(file), "--map", str(saved)])
+    assert (
+        done.stderr == f"{file}:5: step 1: no point of interest 'dock' is known and no step explores: known are none\n"
+    )

@@ -1,0 +1,63 @@
+"""Conditions of missions: what they need to know of the robot, and whether they hold."""
+
+from dataclasses import dataclass
+from typing import Final
+
+from monstertruck_schemas.mission import Condition
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What conditions are about."""
+
+    charge: float | None = None
+    """Charge of the battery (%); None if unknown."""
+    elapsed: float = 0.0
+    """Time since the mission was started or resumed (s)."""
+    points: frozenset[str] = frozenset()
+    """Names of the known points of interest."""
+    tags: int = 0
+    """Number of known tags."""
+    obstacle: float = 0.0
+    """Time for which an obstacle has stopped the robot (s)."""
+
+
+UNKNOWN: Final = Facts()
+"""Facts about a robot that knows nothing."""
+
+
+def holds(condition: Condition, facts: Facts) -> bool:
+    """Return whether all keys of a condition hold."""
+    of, charge = condition, facts.charge
+    return (
+        (of.battery_below is None or (charge is not None and charge < of.battery_below))
+        and (of.battery_above is None or (charge is not None and charge > of.battery_above))
+        and (of.after is None or facts.elapsed >= of.after)
+        and (of.point is None or of.point in facts.points)
+        and (of.tags is None or facts.tags >= of.tags)
+        and (of.obstacle is None or facts.obstacle >= of.obstacle)
+        and (of.any_of is None or any(holds(one, facts) for one in of.any_of))
+        and (of.unless is None or not holds(of.unless, facts))
+    )
+
+
+def in_words(condition: Condition) -> str:
+    """Describe a condition in one line."""
+    of, words = condition, []
+    if of.battery_below is not None:
+        words.append(f"battery below {of.battery_below:g} %")
+    if of.battery_above is not None:
+        words.append(f"battery above {of.battery_above:g} %")
+    if of.after is not None:
+        words.append(f"after {of.after:g} s")
+    if of.point is not None:
+        words.append(f"point {of.point} known")
+    if of.tags is not None:
+        words.append(f"{of.tags} tags known")
+    if of.obstacle is not None:
+        words.append(f"stopped by an obstacle for {of.obstacle:g} s")
+    if of.any_of is not None:
+        words.append(f"any of ({'; '.join(map(in_words, of.any_of))})")
+    if of.unless is not None:
+        words.append(f"not ({in_words(of.unless)})")
+    return " and ".join(words)
