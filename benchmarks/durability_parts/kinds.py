@@ -31,7 +31,7 @@ from monstertruck_estimation.ground.grid import GroundGrid
 from monstertruck_estimation.points import files as points
 from monstertruck_estimation.slam import storage
 from monstertruck_estimation.slam.storage import surface_elements
-from monstertruck_planners.missions.progress import Frame, MissionProgress, SavedProgress
+from monstertruck_planners.missions.progress import MissionFrame, MissionProgress, SavedProgress
 from monstertruck_planners.track.paths import load_path
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import SECOND, WallClock
@@ -379,7 +379,7 @@ def _read_settings(folder: Path) -> None:
 def _progress(folder: Path) -> None:
     _mission(folder)
     mission, _ = load_config(folder / "m.yaml", Mission)
-    progress = SavedProgress.of(MissionProgress(mission, (0.0, 0.0, 0.0), (Frame(index=1),)), "ann")
+    progress = SavedProgress.of(MissionProgress(mission, (0.0, 0.0, 0.0), (MissionFrame(index=1),)), "ann")
     (folder / "m.yaml").unlink()
     (folder / "mission.json").write_text(progress.model_dump_json())
 

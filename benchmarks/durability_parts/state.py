@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any, Final
 
 from benchmarks.durability_parts.subject import Death, Subject
-from monstertruck_planners.missions.progress import Frame, MissionProgress
+from monstertruck_planners.missions.progress import MissionFrame, MissionProgress
 from monstertruck_planners.missions.service import MissionInputs, MissionService
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.small_files import SCRATCH, remove_leftovers
@@ -98,7 +98,7 @@ def _write_missions(folder: Path, seed: int) -> Iterator[str]:
         number += 1
         steps = [{"do": "wait", "seconds": 1.0 + seed % 7}] * number
         mission = Mission.model_validate({"version": 2, "name": f"m{number}", "steps": steps})
-        asyncio.run(service._save(MissionProgress(mission, (0.0, 0.0, 0.0), (Frame(index=number - 1),))))  # noqa: SLF001
+        asyncio.run(service._save(MissionProgress(mission, (0.0, 0.0, 0.0), (MissionFrame(index=number - 1),))))  # noqa: SLF001
         yield str(number)
         if number % 5 == 0:
             asyncio.run(service._forget())  # noqa: SLF001

@@ -165,7 +165,7 @@ class WaitUntilStep(MissionStep):
     when: Condition
 
 
-class SequenceStep(MissionStep):
+class SequenceOfSteps(MissionStep):
     """Do steps one after the other; fails with the first that fails."""
 
     do: Literal["sequence"]
@@ -207,7 +207,7 @@ class BranchStep(MissionStep):
     """Steps if it does not"""
 
 
-class Watch(Schema):
+class MissionWatch(Schema):
     """What interrupts a parallel step as soon as a condition holds."""
 
     when: Condition
@@ -222,7 +222,7 @@ class ParallelStep(MissionStep):
 
     do: Literal["parallel"]
     steps: "Steps"
-    watch: Annotated[tuple[Watch, ...], Field(min_length=1, max_length=16, strict=False)]
+    watch: Annotated[tuple[MissionWatch, ...], Field(min_length=1, max_length=16, strict=False)]
     """Watched conditions; the first has priority"""
 
 
@@ -238,7 +238,7 @@ AnyStep = Annotated[
     | ReturnStep
     | ConditionStep
     | WaitUntilStep
-    | SequenceStep
+    | SequenceOfSteps
     | FallbackStep
     | RepeatStep
     | BranchStep
@@ -276,7 +276,7 @@ def blocks(node: "Mission | AnyStep") -> tuple[tuple[tuple[str | int, ...], tupl
         case ParallelStep():
             watched = ((("watch", index, "then"), watch.then) for index, watch in enumerate(node.watch))
             return (("steps",), node.steps), *watched
-        case Mission() | SequenceStep() | FallbackStep() | RepeatStep():
+        case Mission() | SequenceOfSteps() | FallbackStep() | RepeatStep():
             return ((("steps",), node.steps),)
         case _:
             return ()

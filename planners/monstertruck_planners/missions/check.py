@@ -67,7 +67,7 @@ class Ends(NamedTuple):
     """Whether it takes time whatever its end."""
 
 
-class Place(NamedTuple):
+class StepPlace(NamedTuple):
     """A step and its place in the mission."""
 
     key: Key
@@ -79,12 +79,12 @@ class Place(NamedTuple):
         return Mistake((*self.key, *more), self.number, text, lacks)
 
 
-def steps_of(mission: Mission) -> Iterator[Place]:
+def steps_of(mission: Mission) -> Iterator[StepPlace]:
     """Return all steps, those within others after them."""
     return _steps(mission, (), "")
 
 
-def _steps(node: Container, key: Key, before: str) -> Iterator[Place]:
+def _steps(node: Container, key: Key, before: str) -> Iterator[StepPlace]:
     for places in _blocks(node, key, before):
         for place in places:
             yield place
@@ -92,10 +92,10 @@ def _steps(node: Container, key: Key, before: str) -> Iterator[Place]:
                 yield from _steps(place.step, place.key, f"{place.number}.")
 
 
-def _blocks(node: Container, key: Key, before: str) -> list[list[Place]]:
+def _blocks(node: Container, key: Key, before: str) -> list[list[StepPlace]]:
     return [
         [
-            Place((*key, *keys, index), f"{before}{prefix(node, block)}{index + 1}", step)
+            StepPlace((*key, *keys, index), f"{before}{prefix(node, block)}{index + 1}", step)
             for index, step in enumerate(steps)
         ]
         for block, (keys, steps) in enumerate(blocks(node))
@@ -110,7 +110,7 @@ def dead_ends(mission: Mission) -> list[Mistake]:
     return sorted(found, key=lambda mistake: [str(part).zfill(4) for part in mistake.key])
 
 
-def _sequence(places: list[Place], policy: str, found: list[Mistake]) -> Ends:
+def _sequence(places: list[StepPlace], policy: str, found: list[Mistake]) -> Ends:
     """Return the ends of steps in sequence, and note what is wrong in them."""
     bad, takes_time, before = False, False, None
     for place in places:
@@ -123,7 +123,7 @@ def _sequence(places: list[Place], policy: str, found: list[Mistake]) -> Ends:
     return Ends(before is None, bad, takes_time)
 
 
-def _fallback(places: list[Place], found: list[Mistake]) -> Ends:
+def _fallback(places: list[StepPlace], found: list[Mistake]) -> Ends:
     good, bad, takes_time, before = False, True, True, None
     for place in places:
         if before is not None:
@@ -135,7 +135,7 @@ def _fallback(places: list[Place], found: list[Mistake]) -> Ends:
     return Ends(good, bad, takes_time)
 
 
-def _ends(place: Place, policy: str, found: list[Mistake]) -> Ends:
+def _ends(place: StepPlace, policy: str, found: list[Mistake]) -> Ends:
     """Return the ends of a step as those around it see them: after retries, its limit and its policy."""
     good, bad, takes_time = _own_ends(place, found)
     policy = place.step.on_failure or policy
@@ -145,7 +145,7 @@ def _ends(place: Place, policy: str, found: list[Mistake]) -> Ends:
     return Ends(good or bad, False, takes_time) if policy == "continue" else Ends(good, bad, takes_time)
 
 
-def _own_ends(place: Place, found: list[Mistake]) -> Ends:
+def _own_ends(place: StepPlace, found: list[Mistake]) -> Ends:
     step = place.step
     inner = _blocks(step, place.key, f"{place.number}.") if isinstance(step, Container) else []
     match step:
@@ -174,7 +174,7 @@ def _own_ends(place: Place, found: list[Mistake]) -> Ends:
             return Ends(good=True, bad=True, takes_time=True)
 
 
-def _repeat(place: Place, step: RepeatStep, body: Ends, found: list[Mistake]) -> Ends:
+def _repeat(place: StepPlace, step: RepeatStep, body: Ends, found: list[Mistake]) -> Ends:
     forever = step.until is None and step.times == "forever"
     if not body.takes_time and not isinstance(step.times, int):
         found.append(place.mistake("a loop without exit: no step in it takes time"))

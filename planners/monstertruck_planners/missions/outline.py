@@ -19,14 +19,14 @@ from monstertruck_schemas.mission import (
     RecordStep,
     RepeatStep,
     ReturnStep,
-    SequenceStep,
+    SequenceOfSteps,
     WaitStep,
     WaitUntilStep,
     blocks,
 )
 from monstertruck_schemas.plan import MissionLine
 
-Container = Mission | SequenceStep | FallbackStep | RepeatStep | BranchStep | ParallelStep
+Container = Mission | SequenceOfSteps | FallbackStep | RepeatStep | BranchStep | ParallelStep
 """Nodes that contain steps."""
 
 
@@ -39,7 +39,7 @@ def in_words(step: AnyStep) -> str:
             words = "repeat"
             words += "" if times is None else " forever" if times == "forever" else f" {times} times"
             return words if until is None else f"{words} until {condition_in_words(until)}"
-        case SequenceStep() | FallbackStep() | ParallelStep():
+        case SequenceOfSteps() | FallbackStep() | ParallelStep():
             return step.do
         case _:
             return _leaf_in_words(step)

@@ -60,7 +60,7 @@ class StepEnd:
         return self.reason in GOOD
 
 
-class Frame(Schema):
+class MissionFrame(Schema):
     """Position in the mission or in a step that contains others; stored for a resume."""
 
     block: Annotated[int, Field(ge=0)] = 0
@@ -73,7 +73,7 @@ class Frame(Schema):
     """Completed rounds of a repeat"""
     fired: Annotated[tuple[int, ...], Field(strict=False)] = ()
     """Watches (blocks) whose condition has held ever since they fired"""
-    interrupted: Annotated[tuple["Frame", ...], Field(strict=False)] = ()
+    interrupted: Annotated[tuple["MissionFrame", ...], Field(strict=False)] = ()
     """Position at which a watch interrupted a parallel step: its own frame and those within"""
     spent: Annotated[float, Field(ge=0)] = 0.0
     """Seconds spent in it, pauses left out"""
@@ -86,7 +86,7 @@ class MissionProgress:
     mission: Mission
     start: Pose2
     """Start pose in the map frame."""
-    stack: tuple[Frame, ...] = (Frame(),)
+    stack: tuple[MissionFrame, ...] = (MissionFrame(),)
     """Frames of the mission and of the steps that contain the present one."""
     failures: int = 0
     why: StepEnd = StepEnd(Reason.OK)
@@ -126,7 +126,7 @@ class MissionProgress:
 def enter(progress: MissionProgress, facts: Facts) -> MissionProgress:
     """Descend to the first step that contains no others, or to a branch that has nothing to do."""
     while isinstance(step := progress.step, Container):
-        frame = Frame(block=int(not holds(step.when, facts))) if isinstance(step, BranchStep) else Frame()
+        frame = MissionFrame(block=int(not holds(step.when, facts))) if isinstance(step, BranchStep) else MissionFrame()
         if not _block(step, frame):
             return progress
         progress = replace(progress, stack=(*progress.stack, frame))
@@ -183,8 +183,8 @@ def after(
 
 
 def _onward(
-    node: Container, frame: Frame, end: StepEnd, facts: Facts
-) -> tuple[tuple[Frame, ...], StepEnd, Next | None]:
+    node: Container, frame: MissionFrame, end: StepEnd, facts: Facts
+) -> tuple[tuple[MissionFrame, ...], StepEnd, Next | None]:
     """Continue within a node after one of its steps; without frames, the node has ended as returned."""
     following = (frame.model_copy(update={"index": frame.index + 1, "attempt": 0}),)
     more = frame.index + 1 < len(_block(node, frame))
@@ -220,7 +220,7 @@ def watched(progress: MissionProgress, facts: Facts) -> tuple[MissionProgress, b
         new = next((block for block in holding if block not in fired), None) if frame.block == 0 else None
         if new is not None:
             update = {"block": new, "fired": (*fired, new), "interrupted": tuple(stack[depth:])}
-            begun = Frame(spent=frame.spent).model_copy(update=update)
+            begun = MissionFrame(spent=frame.spent).model_copy(update=update)
             return replace(progress, stack=(*stack[:depth], begun)), True
         if fired != frame.fired:
             stack[depth] = frame.model_copy(update={"fired": fired})
@@ -253,7 +253,7 @@ def judge(step: ConditionStep, facts: Facts) -> StepEnd:
     )
 
 
-def _nodes(mission: Mission, stack: tuple[Frame, ...]) -> list[Mission | AnyStep]:
+def _nodes(mission: Mission, stack: tuple[MissionFrame, ...]) -> list[Mission | AnyStep]:
     """Return the nodes of all frames and the step at which the last one is."""
     nodes: list[Mission | AnyStep] = [mission]
     for frame in stack:
@@ -263,7 +263,7 @@ def _nodes(mission: Mission, stack: tuple[Frame, ...]) -> list[Mission | AnyStep
     return nodes
 
 
-def _block(node: Container, frame: Frame) -> tuple[AnyStep, ...]:
+def _block(node: Container, frame: MissionFrame) -> tuple[AnyStep, ...]:
     return blocks(node)[frame.block][1]
 
 
@@ -300,7 +300,7 @@ class SavedProgress(Schema):
     mission: Mission
     source: str
     start: Pose2D
-    stack: Annotated[tuple[Frame, ...], Field(min_length=1, strict=False)]
+    stack: Annotated[tuple[MissionFrame, ...], Field(min_length=1, strict=False)]
     """Position in the mission"""
     failures: Annotated[int, Field(ge=0)]
     at: Pose2D | None = None
@@ -346,7 +346,7 @@ class SavedProgress(Schema):
         return 0.0 if self.at is None else math.dist(pose[:2], (self.at.x, self.at.y))
 
 
-def _fits(mission: Mission, stack: tuple[Frame, ...]) -> bool:
+def _fits(mission: Mission, stack: tuple[MissionFrame, ...]) -> bool:
     """Return whether a stored position exists in the mission, the interrupted ones included."""
     node: Mission | AnyStep = mission
     for depth, frame in enumerate(stack):

@@ -56,7 +56,7 @@ from monstertruck_schemas.mission import (
     RecordStep,
     RepeatStep,
     ReturnStep,
-    SequenceStep,
+    SequenceOfSteps,
     WaitStep,
     WaitUntilStep,
 )
@@ -365,8 +365,11 @@ class MissionService:
 
     async def _do_next(self, progress: MissionProgress) -> Next:
         """Run the current step and advance the mission."""
-        self._progress = progress = enter(progress, self._facts())
-        self._waits = ""
+        facts = self._facts()
+        self._progress, interrupted = watched(enter(progress, facts), facts)
+        if interrupted:
+            return "step"
+        progress, self._waits = self._progress, ""
         self.tasks.report()
         at = f"step {progress.number} of {len(progress.mission.steps)}: {progress.doing}"
         self._events(Reason.MISSION_STEP, Severity.INFO, SOURCE, at)
@@ -407,7 +410,8 @@ class MissionService:
                     return _over(step.limit), None
                 work = work or asyncio.create_task(self._do(step, progress))
                 before, paused = self._clock.now(), self._paused
-                await asyncio.wait((work,), timeout=1.0 / MISSION_CHECK_RATE)
+                left = math.inf if step.limit is None else step.limit - spent
+                await asyncio.wait((work,), timeout=min(1.0 / MISSION_CHECK_RATE, left))
                 if not paused:
                     passing = (self._clock.now() - before) / SECOND
                     spent, progress = spent + passing, passed(progress, passing)
@@ -433,7 +437,7 @@ class MissionService:
                     return judge(step, self._facts())
                 case BranchStep():  # whose chosen side has no steps
                     return StepEnd(Reason.OK)
-                case SequenceStep() | FallbackStep() | RepeatStep() | ParallelStep():
+                case SequenceOfSteps() | FallbackStep() | RepeatStep() | ParallelStep():
                     raise AssertionError("entered before")
                 case _:
                     return await self._drive(step, progress)
