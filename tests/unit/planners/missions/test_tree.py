@@ -39,7 +39,7 @@ def mission(*steps: dict, on_failure: str = "abort") -> Mission:
 
 
 class Run:
-    """A mission whose steps end as told."""
+    """Mission whose steps end with the given outcomes."""
 
     def __init__(self, *steps: dict, facts: Facts = FULL, **more) -> None:
         self.facts, self.next = facts, "step"
