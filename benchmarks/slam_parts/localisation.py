@@ -23,7 +23,7 @@ from monstertruck_estimation.slam.scans import prepare, prepare_input
 from monstertruck_estimation.slam.storage import SavedGraph, SavedMap, trinary
 from monstertruck_estimation.slam.worker_io import ScanInput, SlamEstimate
 from monstertruck_kinematics.se2 import between
-from monstertruck_schemas.health import LocalisationStatus
+from monstertruck_schemas.health import MATCHED, LocalisationStatus
 from slam_parts.logs import Log, load
 
 STRETCHES = ((0.0, 0.25), (0.3, 0.55))
@@ -38,7 +38,7 @@ ON_MAP = 0.9
 """A scan overlaps by this at its true pose where the place is on the map."""
 OFF_MAP = 0.7
 STARTS, QUICK_STARTS = 25, 5
-PLACED = (LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE, LocalisationStatus.LOST)
+PLACED = MATCHED | {LocalisationStatus.LOST}
 GOALS = {"localise.wrong": 0, "localise.right_share": 0.85, "localise.outside_share": 0.9}
 AT_LEAST = ("localise.right_share", "localise.outside_share")
 

@@ -29,7 +29,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between, compose, interpolate, inverse
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.health import LocalisationStatus
+from monstertruck_schemas.health import MATCHED, LocalisationStatus
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import ScanMotion
 from monstertruck_sim.world.config import SimTruckConfig
@@ -200,7 +200,7 @@ def _judge_match(run: Run, matching: Matching, drive: Drive, stamp: int, truth: 
     run.standings[estimate.status] += 1
     if drive.carried is None or stamp <= drive.carried or run.found is not None:
         return
-    if estimate.status in (LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE):
+    if estimate.status in MATCHED:
         off = np.array(estimate.pose) - _at(truth, stamp / SECOND)
         if math.hypot(off[0], off[1]) < 0.1:
             run.found = (stamp - drive.carried) / SECOND

@@ -110,6 +110,8 @@ class LocalisationStatus(StrEnum):
     """The scans fit the saved map."""
     DEGENERATE = "degenerate"
     """Scans fit, but do not determine one direction, in which the pose is odometry."""
+    UNCERTAIN = "uncertain"
+    """The pose in map is known worse than ``UNCERTAIN_DEVIATION``; its covariance says how well."""
     LOST = "lost"
     """Scans have not fitted for a while: the pose is odometry."""
     SEARCHING = "searching"
@@ -118,8 +120,13 @@ class LocalisationStatus(StrEnum):
     """What is seen fits no place of the saved map: the robot is outside it. The search goes on."""
 
 
+UNCERTAIN_DEVIATION: Final = 0.1
+"""Standard deviation of the position in map beyond which it is uncertain, m: as far as robots keep from
+obstacles."""
 PLACELESS: Final = frozenset({LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
 """States in which the pose in map means nothing."""
+MATCHED: Final = frozenset(LocalisationStatus) - PLACELESS - {LocalisationStatus.LOST}
+"""States in which the robot is on the map."""
 NO_PLACE: Final = PLACELESS | {LocalisationStatus.LOST}
 """States in which no place is to be derived from it."""
 

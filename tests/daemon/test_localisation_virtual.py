@@ -13,7 +13,7 @@ from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.map_files import load_map
 from monstertruck_runtime.map_folders import SAVES
 from monstertruck_schemas import topics
-from monstertruck_schemas.health import LocalisationStatus, ServiceState
+from monstertruck_schemas.health import MATCHED, LocalisationStatus, ServiceState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
@@ -22,7 +22,7 @@ from tests.daemon.slam_kit import CONFIGS, Drive, driven, lap
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
-PLACED = {LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE, LocalisationStatus.LOST}
+PLACED = MATCHED | {LocalisationStatus.LOST}
 
 
 def localised_in(map_name: str) -> Drive:

@@ -331,11 +331,12 @@ def localise(
     """Localise a log's scans in a saved map, from an unknown start."""
     from monstertruck_estimation.slam.config import SlamConfig
     from monstertruck_estimation.slam.worker import SlamWorker
+    from monstertruck_schemas.health import MATCHED
     from monstertruckd.tools.logs.trajectory import LINES, write_trajectory
 
     saved, scans = _load(place), _read(log, options)
     facts, estimates = _run(SlamWorker(), scans, SlamConfig(mode="localisation", map=place))
-    known = [estimate for estimate in estimates if estimate.status.value in ("localised", "degenerate")]
+    known = [estimate for estimate in estimates if estimate.status in MATCHED]
     facts |= {"map": place, "localised": len(known)}
     if known:
         first = known[0]

@@ -37,6 +37,7 @@ from monstertruck_estimation.slam.scan_matcher import (
     PlanarMatcher,
     ScanMatch,
     ScanMatcher,
+    deviations,
     off_guess,
     rejected,
 )
@@ -46,7 +47,7 @@ from monstertruck_estimation.slam.worker_io import GridPatch, ScanIncrement, Sca
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, Twist2, between, compose, compose_jacobians, inverse
 from monstertruck_runtime.clock import SECOND
-from monstertruck_schemas.health import LocalisationStatus, OdometryUse
+from monstertruck_schemas.health import MATCHED, UNCERTAIN_DEVIATION, LocalisationStatus, OdometryUse
 
 UNKNOWN: Final = np.diag((100.0**2, 100.0**2, math.pi**2))
 """Covariance of a lost robot's pose."""
@@ -581,8 +582,10 @@ def estimate(
     moved: ScanIncrement | None = None,
     odometry: OdometryUse = OdometryUse.NONE,
 ) -> SlamEstimate:
-    """Return plain numbers of a match; ``placed`` are pose, covariance and odom in map."""
+    """Return plain numbers of a match; ``placed`` are pose, covariance and odom in map. A pose whose covariance is large is UNCERTAIN."""
     pose, covariance, correction = placed
+    if status in MATCHED and deviations(covariance)[0] > UNCERTAIN_DEVIATION:
+        status = LocalisationStatus.UNCERTAIN
     return SlamEstimate(
         stamp=stamp,
         pose=plain(pose),

@@ -32,7 +32,7 @@ from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.health import PLACELESS, LocalisationStatus, OdometryUse, SlamHealth
+from monstertruck_schemas.health import MATCHED, PLACELESS, LocalisationStatus, OdometryUse, SlamHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
@@ -47,7 +47,6 @@ CORRECTIONS: Final = {
     "parted": (Reason.JOIN_UNDONE, Severity.WARNING, "what was seen since then contradicts it"),
 }
 """Event text of a step that has corrected the map; {} is the number of closures."""
-MATCHED: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE})
 
 
 class SlamService:

@@ -17,11 +17,11 @@ from monstertruck_estimation.slam.worker_io import ScanInput, SlamEstimate
 from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.map_files import FREE, OCCUPIED, UNKNOWN, WorldMap
-from monstertruck_schemas.health import LocalisationStatus
+from monstertruck_schemas.health import MATCHED, LocalisationStatus
 from tests.unit.estimation.slam.kit import LIDAR, ROOM, box, ranges, rounds
 from tests.unit.estimation.slam.test_map_evidence import ORIGIN, drawn
 
-PLACED = {LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE, LocalisationStatus.LOST}
+PLACED = MATCHED | {LocalisationStatus.LOST}
 ACCEPTED = MatchStatus.ACCEPTED
 EMPTY = [*ROOM[:4], *ROOM[8:]]
 """The same room without the box in its middle."""
@@ -157,7 +157,7 @@ def test_a_wrong_place_is_refuted_within_metres():
     inside = [estimate.status for estimate in estimates[:60]]
     assert set(inside) <= PLACED
     beyond = [k for k, pose in enumerate(truth) if pose[0] > 4.0]
-    assert estimates[-1].status not in {LocalisationStatus.LOCALISED, LocalisationStatus.DEGENERATE}
+    assert estimates[-1].status not in MATCHED
     assert any(estimates[k].status not in PLACED for k in beyond)
 
 
@@ -266,6 +266,11 @@ def test_the_covariance_is_that_of_the_motion_along_a_corridor_and_where_half_of
     assert deviations[44, 0] == pytest.approx(0.07 * math.sqrt(len(vague)), rel=0.05)
     assert deviations[19, 0] < 0.02
     assert deviations[45, 0] < 0.02
+    assert [estimates[k].status for k in (19, 44, 45)] == [
+        LocalisationStatus.LOCALISED,
+        LocalisationStatus.UNCERTAIN,
+        LocalisationStatus.LOCALISED,
+    ]
 
 
 MAPPED = [
@@ -308,6 +313,6 @@ def test_by_scans_alone_the_velocity_lasts_in_a_corridor():
     estimates = followed(saved, walls, truth, odom=False, start=tuple(truth[0].tolist()))
     along = np.array([estimate.pose[0] for estimate in estimates])
     deviation = np.sqrt([estimate.covariance[0] for estimate in estimates])
-    assert estimates[-1].status is LocalisationStatus.DEGENERATE
+    assert estimates[-1].status is LocalisationStatus.UNCERTAIN
     assert (np.abs(along - truth[:, 0]) < 2.0 * deviation + 0.1).all()
     assert np.abs(np.diff(along)).max() < 0.2
