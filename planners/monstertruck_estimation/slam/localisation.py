@@ -86,6 +86,8 @@ class LocalisationEstimator:
         """Covariance of the pose from the matches alone; it sets the window of the next match."""
         self._published_covariance = self._covariance
         """Published covariance: the predicted motion's for invalid matches and along a match's weak direction."""
+        self._unmeasured = np.zeros(2)
+        """Displacement in map since a match last measured the whole position, shape (2,) (m)."""
         self._stamp: int | None = None
         self._misfits = 0
         """Number of invalid matches in a row."""
@@ -143,15 +145,18 @@ class LocalisationEstimator:
                 events = ("refuted",)
         alone = odom is None or self.odometry is not OdometryUse.USED
         moved = self._scan_odometry.take(stamp, match, match.pose, alone=alone)
+        self._unmeasured = self._unmeasured + match.pose[:2] - self._pose[:2]
         self._pose, self._covariance = match.pose, match.covariance
         if match.information is not None and not self._misfits:
+            if not match.degenerate:
+                self._unmeasured = np.zeros(2)
             published = np.linalg.inv(constrained(match, match.information) + np.linalg.inv(published))
         self._published_covariance = published
         if inputs.odom is not None and match.accepted:
             self._offset.add(stamp, float(match.pose[2]), inputs.odom[2])
         odom_now = self._motion.odom
         correction = None if odom is None or odom_now is None else compose(self._pose, inverse(odom_now))
-        placed = (self._pose, published, correction)
+        placed = (self._pose, self._with_scale_error(published), correction)
         return estimate(stamp, placed, match, status, events, self._offset.offset, moved, self.odometry)
 
     def changes(self) -> tuple[list[GridPatch], bool]:
@@ -241,6 +246,16 @@ class LocalisationEstimator:
         if not (good and fits(match)):
             return match, False
         return _without_weak_direction(match, guess, published), True
+
+    def _with_scale_error(self, covariance: Array) -> Array:
+        """Return ``covariance``, shape (3, 3), with that of the scale of a displacement that no match measured.
+
+        Its errors do not average out: wheels that slip do so all along a corridor.
+        """
+        result = covariance.copy()
+        shift = self._config.odometry_distance * self._unmeasured
+        result[:2, :2] += np.outer(shift, shift)
+        return result
 
     def _search_anew(self) -> GlobalLocaliser:
         return GlobalLocaliser(self._submap, self._evidence, self._config)

@@ -582,7 +582,7 @@ def estimate(
     moved: ScanIncrement | None = None,
     odometry: OdometryUse = OdometryUse.NONE,
 ) -> SlamEstimate:
-    """Return plain numbers of a match; ``placed`` are pose, covariance and odom in map. A pose whose covariance is large is UNCERTAIN."""
+    """Return plain numbers of a match; ``placed`` are pose, covariance and odom in map."""
     pose, covariance, correction = placed
     if status in MATCHED and deviations(covariance)[0] > UNCERTAIN_DEVIATION:
         status = LocalisationStatus.UNCERTAIN

@@ -298,19 +298,38 @@ def test_a_robot_with_wheels_that_leaves_the_map_along_a_corridor_is_not_moved_b
     assert estimates[-1].status not in PLACED
 
 
-def test_by_scans_alone_the_velocity_lasts_in_a_corridor():
-    """The ends of the visible walls move along with the robot: a velocity taken from them runs away."""
-    length = 20.0
-    walls = [*box(0.0, -1.0, length, 1.0), *box(1.6, 0.6, 2.0, 1.0), *box(2.6, -1.0, 3.0, -0.7)]
-    cells = np.full((80, round((length + 2.0) / 0.05)), UNKNOWN, np.int8)
+LONG = [*box(0.0, -1.0, 20.0, 1.0), *box(1.6, 0.6, 2.0, 1.0), *box(2.6, -1.0, 3.0, -0.7)]
+"""A corridor with two pillars at its beginning."""
+
+
+def long_corridor() -> SavedMap:
+    cells = np.full((80, 440), UNKNOWN, np.int8)
     cells[20:60, 20:-20] = FREE
-    for (x0, y0), (x1, y1) in walls:
+    for (x0, y0), (x1, y1) in LONG:
         share = np.linspace(0.0, 1.0, 2000)
         rows, columns = (y0 + share * (y1 - y0) + 2.0) / 0.05, (x0 + share * (x1 - x0) + 1.0) / 0.05
         cells[rows.astype(int), columns.astype(int)] = OCCUPIED
+    return SavedMap(WorldMap(cells, 0.05, (-1.0, -2.0)), None)
+
+
+def test_the_covariance_covers_wheels_that_slip_in_a_corridor():
+    """For 2.5 s they measure twice the distance, and nothing shows it."""
+    truth = np.column_stack((np.arange(2.0, 9.0, 0.07), np.zeros((100, 2))))
+    slip = 0.07 * np.clip(np.arange(100) - 60, 0, 25)
+    wheels = truth + np.column_stack((slip, np.zeros((100, 2))))
+    estimates = followed(long_corridor(), LONG, truth, start=tuple(truth[0].tolist()), wheels=wheels)
+    off = np.array([estimate.pose[0] for estimate in estimates]) - truth[:, 0]
+    deviation = np.sqrt([estimate.covariance[0] for estimate in estimates])
+    assert off[-1] > 1.5
+    assert (np.abs(off) < 3.0 * deviation + 0.05).all()
+    assert all(estimate.status is LocalisationStatus.UNCERTAIN for estimate in estimates[-20:])
+    assert estimates[5].status is LocalisationStatus.LOCALISED
+
+
+def test_by_scans_alone_the_velocity_lasts_in_a_corridor():
+    """The ends of the visible walls move along with the robot: a velocity taken from them runs away."""
     truth = np.column_stack((np.arange(1.0, 12.0, 0.05), np.zeros((220, 2))))
-    saved = SavedMap(WorldMap(cells, 0.05, (-1.0, -2.0)), None)
-    estimates = followed(saved, walls, truth, odom=False, start=tuple(truth[0].tolist()))
+    estimates = followed(long_corridor(), LONG, truth, odom=False, start=tuple(truth[0].tolist()))
     along = np.array([estimate.pose[0] for estimate in estimates])
     deviation = np.sqrt([estimate.covariance[0] for estimate in estimates])
     assert estimates[-1].status is LocalisationStatus.UNCERTAIN
