@@ -369,6 +369,8 @@ class MissionService:
         self._progress, interrupted = watched(enter(progress, facts), facts)
         if interrupted:
             return "step"
+        if self._progress.stack != progress.stack:
+            await self._save(self._progress)  # a restart must not decide a branch again
         progress, self._waits = self._progress, ""
         self.tasks.report()
         at = f"step {progress.number} of {len(progress.mission.steps)}: {progress.doing}"

@@ -873,3 +873,22 @@ def test_a_loop_whose_steps_take_no_time_leaves_the_loop_to_others():
             robot.order(MissionOrder.START, {"do": "repeat", "times": "forever", "steps": [note]})
 
     played(story)
+
+
+def test_a_restart_does_not_decide_a_branch_again(tmp_path: Path):
+    file = tmp_path / "mission.json"
+
+    async def interrupted(robot: Pretended) -> None:
+        charge(robot, 0.1)
+        robot.order(MissionOrder.START, {"do": "branch", "when": LOW, "then": [GO], "otherwise": [WAIT]})
+        await robot.clock.sleep(1.0)
+        assert len(json.loads(file.read_text())["stack"]) == 2, "also if it is killed now"
+
+    played(interrupted, file)
+
+    async def resumed(robot: Pretended) -> None:
+        charge(robot, 0.9)
+        robot.order(MissionOrder.RESUME)
+        await robot.clock.sleep(3.0)
+
+    assert played(resumed, file).goals == [(1.0, 0.0)]
