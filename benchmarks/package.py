@@ -22,11 +22,10 @@ from service import READY_GOAL, Bench, checkout, copy_tree, deaths, emulated_tru
 from service_parts.machine import Machine, Output, install_tools, until
 
 from monstertruckd import __version__
-from monstertruckd.bootstrap import find_uv
+from monstertruckd.bootstrap import EXTRAS, find_uv
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
-DEMO_EXTRAS = ("sim", "slam", "planning")
 CHECKERS = ("twine", "check-wheel-contents")
 EMULATED = Path("/opt/emulated")
 """Checkout inside the machine that emulates the truck's devices."""
@@ -119,7 +118,7 @@ def environment(bench: Packages, uv: str, wheel: str, python: str, resolution: s
     program = place / "bin/monstertruckd"
     done = tried(program, "--help", cwd=place)
     bench.holds(f"{name}_help", done.returncode == 0, done.stderr)
-    done = tried(*install, "--resolution", resolution, f"{wheel}[{','.join(DEMO_EXTRAS)}]")
+    done = tried(*install, "--resolution", resolution, f"{wheel}[{','.join(EXTRAS['demo'])}]")
     bench.holds(f"{name}_demo_installs", done.returncode == 0, done.stderr)
     done = tried(program, "demo", "--fast", cwd=place)
     bench.holds(f"{name}_demo", done.returncode == 0, done.stdout[-500:] + done.stderr[-1500:])

@@ -4,7 +4,7 @@ Uses nothing but Python's standard library: no pip, no venv module, no root. It 
 package index (checked by sha256), lets it build ``.venv`` next to ``pyproject.toml`` from the committed lock file,
 and runs the command there. A second run finds everything in place.
 
-    python3 -m monstertruckd.bootstrap demo     the truck drives a lap
+    python3 -m monstertruckd.bootstrap demo     the truck maps an unknown room, finds a tag and drives home
     python3 -m monstertruckd.bootstrap try      emulated truck, mapping, planner and page at once
     python3 -m monstertruckd.bootstrap check    lint, types, import contracts, all tests
     python3 -m monstertruckd.bootstrap sync     all packages, nothing run
@@ -22,7 +22,6 @@ import urllib.parse
 import urllib.request
 import zipfile
 from pathlib import Path
-from subprocess import DEVNULL
 
 if sys.version_info < (3, 11):  # noqa: UP036  # here, because older versions cannot evaluate the annotations below
     print(f"Python 3.11 or newer is needed; this is {platform.python_version()}.", file=sys.stderr)
@@ -54,11 +53,18 @@ TWO = ("-n", "2")
 ALONE = ("-n", "0")
 FAILED_ALONE = (*ALONE, "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
 KERNELS: tuple[Path, str, str] = (VENV / "bin" / "python", "-m", "monstertruckd.tools.install.kernels")
-"""Compiles what goals and maps need: after the first lap in the background, for nobody should wait for it before."""
+"""Compiles what goals and maps need, and names each part."""
 BYTECODE = ("-m", "compileall", "-q", "-j", "2", "monstertruckd", "drivers", "planners", "schemas", "tests")
 """Python's arguments that compile our own packages and the tests, once for the hundreds of processes that the tests
 start: where PYTHONDONTWRITEBYTECODE is set none of them would leave its work to the next."""
-EXTRAS = {"demo": ("sim",), "try": ("sim", "slam", "planning", "station"), "check": ("dev",), "sync": ("dev",)}
+EXTRAS = {
+    "demo": ("sim", "slam", "planning", "vision"),
+    "try": ("sim", "slam", "planning", "station"),
+    "check": ("dev",),
+    "sync": ("dev",),
+}
+OWN_CONFIG = frozenset({"--config", "-c"})
+"""Options of a demo of another configuration: a lap starts at once, for it needs no kernels."""
 
 
 def main(arguments: list[str]) -> int:
@@ -68,22 +74,19 @@ def main(arguments: list[str]) -> int:
         return 0 if arguments[:1] in ([], ["-h"], ["--help"]) else 2
     command, *rest = arguments
     sync(EXTRAS[command])
-    if command == "demo":
-        code = run(VENV / "bin" / "monstertruckd", "demo", *rest)
-        background = (*KERNELS, "--background")
-        subprocess.Popen(background, cwd=ROOT, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL, start_new_session=True)
-        return code
     if command == "check":
         return check(rest)
-    if command == "try":
+    if command == "sync":
+        return compile_kernels()
+    if command == "try" or not OWN_CONFIG.intersection(rest):
         compile_kernels()
-        return run(VENV / "bin" / "monstertruckd", "try", *rest)
-    return compile_kernels()
+    print(f"Step 3 of 3: monstertruckd {' '.join((command, *rest))}", file=sys.stderr)
+    return run(VENV / "bin" / "monstertruckd", command, *rest)
 
 
 def compile_kernels() -> int:
     """Compile what goals and maps need; the exit code."""
-    print("Compiling the kernels of planners and mapping: seconds, the first time a minute or two ...", file=sys.stderr)
+    print("Step 2 of 3: kernels of planners and mapping: seconds, the first time a minute or two ...", file=sys.stderr)
     return run(*KERNELS)
 
 
@@ -100,7 +103,6 @@ def sync(extras: tuple[str, ...]) -> None:
         "--frozen",
         "--inexact",
         "--compile-bytecode",
-        *(() if sys.stderr.isatty() else ("--quiet",)),
         "--system-certs",
         "--python",
         sys.executable,
@@ -108,8 +110,8 @@ def sync(extras: tuple[str, ...]) -> None:
     ]
     environment = {name: value for name, value in os.environ.items() if name != "VIRTUAL_ENV"}
     if not VENV.exists():
-        size = "a gigabyte or two" if extras == EXTRAS["sync"] else "about 570 MB"
-        print(f"Setting up {VENV}: {size}, the first time only ...", file=sys.stderr)
+        size = "a gigabyte or two" if extras == EXTRAS["sync"] else "about 800 MB"
+        print(f"Step 1 of 3: packages into {VENV}: {size}, the first time only ...", file=sys.stderr)
     code = subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
     if code:
         raise SystemExit(f"uv could not set up {VENV}: the reason is above; the command can be run again.")

@@ -80,7 +80,7 @@ async def test_a_probe_that_needs_a_port_and_an_emulator_that_needs_none_say_so(
 
 async def test_the_demo_drives_prints_and_leaves_log_and_picture(tmp_path: Path):
     run = tmp_path / "run"
-    done = await command("demo", "--config", str(short_lap(tmp_path)), "--output", str(run), "--json", timeout=90)
+    done = await command("demo", "--real-time", "-c", str(short_lap(tmp_path)), "-o", str(run), "--json", timeout=90)
     assert done.returncode == 0, done.stderr + (run / "daemon.txt").read_text()
     figures = json.loads(done.stdout)
     assert figures["outcome"] == "goal_reached"

@@ -76,6 +76,7 @@ def test_bytecode_is_compiled_with_the_environment(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(bootstrap.subprocess, "run", run)
     bootstrap.sync(("dev",))
     assert "--compile-bytecode" in commands[0]
+    assert "--quiet" not in commands[0], "minutes without a word look like a hang"
 
 
 def test_packages_that_cannot_be_had_are_one_sentence(monkeypatch: pytest.MonkeyPatch):
@@ -119,31 +120,37 @@ def test_python_3_6_reads_as_far_as_the_message_about_its_version(
     ("command", "expected"),
     [
         ("sync", ["compile"]),
-        ("demo", ["demo", "compile in the background"]),
+        ("demo", ["compile", "demo"]),
         ("try", ["compile", "try"]),
         ("check", ["check"]),
     ],
 )
-def test_kernels_are_compiled_at_installation_and_never_before_the_first_lap(
-    command: str, expected: list[str], monkeypatch: pytest.MonkeyPatch
-):
+def test_kernels_are_compiled_at_installation(command: str, expected: list[str], monkeypatch: pytest.MonkeyPatch):
     done: list[str] = []
 
     def run(program: Path, *arguments: str) -> int:
         done.append(arguments[0] if arguments[1:] == ("--fast",) else "compile")
         return 3
 
-    def popen(command: tuple[str, ...], **settings: object) -> None:
-        assert command == (*bootstrap.KERNELS, "--background"), "with what the computer has left"
-        assert settings["start_new_session"]
-        done.append("compile in the background")
-
     monkeypatch.setattr(bootstrap, "sync", lambda _: None)
     monkeypatch.setattr(bootstrap, "run", run)
-    monkeypatch.setattr(bootstrap.subprocess, "Popen", popen)
     monkeypatch.setattr(bootstrap, "check", lambda _: done.append("check") or 3)
     assert bootstrap.main([command, "--fast"]) == 3
     assert done == expected
+
+
+def test_a_lap_waits_for_no_kernels_and_every_step_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    ran: list[tuple[str, ...]] = []
+    monkeypatch.setattr(bootstrap, "sync", lambda _: None)
+    monkeypatch.setattr(bootstrap, "run", lambda _, *words: ran.append(words) or 0)
+    bootstrap.main(["demo", "--config", "lap"])
+    assert ran == [("demo", "--config", "lap")]
+    bootstrap.main(["demo"])
+    shown = capsys.readouterr().err
+    assert "Step 2 of 3: kernels" in shown
+    assert shown.endswith("Step 3 of 3: monstertruckd demo\n")
 
 
 @pytest.fixture

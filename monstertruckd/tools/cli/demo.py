@@ -3,6 +3,8 @@
 import itertools
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,27 +29,34 @@ from monstertruckd.tools.shipped import configuration, shipped
 
 if TYPE_CHECKING:
     from monstertruck_runtime.clock import Clock
+    from monstertruckd.tools.demo.exploring import Report
 
-DEMO_CONFIG = shipped("configs/demo.yaml")
+DEMO_CONFIG = shipped("configs/room.yaml")
+SIMULATED_CONFIG = shipped("configs/demo.yaml")
 
 
 @needs_extra("sim")
 def demo(
-    fast: Annotated[bool, typer.Option("--fast", help="Virtual clock: as fast as it computes, reproducible.")] = False,
+    fast: Annotated[
+        bool,
+        typer.Option(
+            "--fast/--real-time", help="Virtual clock, as fast as it computes and reproducible; or real time, to watch."
+        ),
+    ] = True,
     seed: Annotated[int | None, typer.Option(help="Seed of world and devices; default: the configuration's.")] = None,
     config: SimulatedOption = DEMO_CONFIG,
     output: Annotated[Path, typer.Option("--output", "-o", help="New folder for log, map and outputs.")] = Path(
         "runs/demo"
     ),
     film: Annotated[
-        Path | None, typer.Option(help="With --fast and engine mujoco: moving picture of the lap, FILE.gif.")
+        Path | None, typer.Option(help="On the virtual clock with engine mujoco: moving picture of the lap, FILE.gif.")
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """The emulated truck drives a lap: real drivers, real bytes, real log.
+    """The emulated truck maps an unknown room, finds a tag and drives home: real drivers, real bytes, real log.
 
-    A configuration without a path but with an explorer explores: `demo --config points --fast` maps unknown rooms,
-    finds a tag, drives home, and ends in the report of its log.
+    It ends in pictures of the map and the report of its log. `demo --config points` does so in a whole flat. A
+    configuration with a path has it driven: `demo --config lap` drives a lap.
     """
     from monstertruck_runtime.clock import run_wall
     from monstertruck_schemas.reasons import Reason
@@ -69,7 +78,7 @@ def demo(
             f"`monstertruckd simulate --run --config {config}` starts this robot"
         )
     if film is not None and (not fast or simulated.sim.world.engine != "mujoco" or film.suffix.lower() != ".gif"):
-        raise InputError(f"--film {film}: expected --fast, engine mujoco, and a name.gif")
+        raise InputError(f"--film {film}: expected the virtual clock, engine mujoco, and a name.gif")
     if film is not None:
         require_place(film)
     folder = fresh(output)
@@ -79,10 +88,13 @@ def demo(
         remark(f"{waiting}: late control ticks may stop the robot; `monstertruckd demo --fast` waits for none")
     summary: Summary | ExplorationSummary
     try:
-        if explores and fast:
-            summary = run_fast_exploration(config, folder, seed, remark)
-        elif explores:
-            summary = run_wall(lambda clock: run_wall_exploration(clock, config, folder, seed, remark))
+        if explores:
+            with _progress(screen=screen) as report:
+                summary = (
+                    run_fast_exploration(config, folder, seed, report)
+                    if fast
+                    else run_wall(lambda clock: run_wall_exploration(clock, config, folder, seed, report))
+                )
         elif fast:
             summary = run_fast_demo(config, folder, seed, film)
         else:
@@ -97,6 +109,18 @@ def demo(
     if summary.outcome not in DONE:
         finish(summary.outcome, summary.text)
         finish(Reason.INTERNAL)
+
+
+@contextmanager
+def _progress(*, screen: bool) -> "Iterator[Report]":
+    """Show an exploration's map on a terminal, else lines."""
+    from monstertruckd.tools.demo.picture import MapScreen
+
+    if screen:
+        with MapScreen(console()) as shown:
+            yield shown
+    else:
+        yield lambda line, *_: remark(line)
 
 
 def fresh(folder: Path) -> Path:
@@ -120,7 +144,7 @@ def _print(rows: list[tuple[str, str]], messages: dict[str, int]) -> None:
 
 @needs_extra("sim")
 def simulate(
-    config: SimulatedOption = DEMO_CONFIG,
+    config: SimulatedOption = SIMULATED_CONFIG,
     robots: Annotated[
         str | None,
         typer.Option(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from monstertruck_runtime.extras import needs_extra
-from monstertruckd.tools.cli.demo import fresh
+from monstertruckd.tools.cli.demo import busy, fresh
 from monstertruckd.tools.cli.options import complete_config
 from monstertruckd.tools.cli.output import print_words, remark, until_stopped
 
@@ -42,6 +42,8 @@ def try_out(
 
     file, folder = robot_file(robot), fresh(output)
     remark(f"starting {robot}, its daemon and the page; logs and map go to {folder}")
+    if waiting := busy():
+        remark(f"{waiting}: late control ticks may stop the robot; `monstertruckd demo` explores on the virtual clock")
     code = 0
 
     async def main(clock: "WallClock") -> None:

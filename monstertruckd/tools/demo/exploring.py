@@ -11,17 +11,20 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.drives import TaskEnd, run_task
 from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError
+from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.requests import Operator
+from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import ExplorationState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder
 from monstertruck_schemas.roles import ServiceName
-from monstertruck_schemas.topics import EXPLORE
+from monstertruck_schemas.state import Grid
+from monstertruck_schemas.topics import EXPLORE, MAP, POSE
 from monstertruckd.tools.demo.summary import log_figures
 from monstertruckd.tools.logs.report import report
 
-Report = Callable[[str], object]
-"""Gets a line of progress."""
+Report = Callable[[str, Grid | None, Pose2D | None], object]
+"""Gets a line of progress, the newest map and the robot's pose in it; None before the first."""
 DONE: Final = frozenset({Reason.GOAL_REACHED, Reason.EXPLORED, Reason.POINTS_FOUND})
 """Outcomes of a demo that did what it should."""
 STARTING: Final = frozenset(
@@ -48,7 +51,7 @@ async def explore_home(
         operator: gives the orders.
         clock: time.
         tags: end the search once one tag is in the map.
-        report: gets a line every few seconds of the robot's time.
+        report: gets progress every two seconds of the robot's time.
         timeout: seconds to wait until the robot can begin.
 
     Raises:
@@ -63,28 +66,29 @@ async def explore_home(
     def show(state: ExplorationState) -> None:
         nonlocal due
         if state.elapsed >= due:
-            due = state.elapsed + 5.0  # seconds between two lines
-            report(progress(state))
+            due = state.elapsed + 2.0  # seconds: `map_period` of the bundled configurations
+            report(progress(state), maps.latest, None if poses.latest is None else poses.latest.pose)
 
     begun = clock.now()
-    while True:
-        try:
-            return await run_task(
-                operator,
-                EXPLORE,
-                ServiceName.EXPLORER,
-                lambda: ask(ExploreOrder.START, home=True, **({"find": 1} if tags else {})),
-                lambda: ask(ExploreOrder.STOP, own=True),
-                show,
-                arm=True,
-                to_its_end=True,
-            )
-        except RequestRefusedError as error:
-            if error.refusal not in STARTING:
-                raise
-            if clock.now() - begun > timeout * SECOND:
-                raise NoAnswerError(f"the robot was not ready to explore within {timeout:g} s: {error}") from None
-        await clock.sleep(0.5)
+    with operator.subscribe(MAP, latest()) as maps, operator.subscribe(POSE, latest()) as poses:
+        while True:
+            try:
+                return await run_task(
+                    operator,
+                    EXPLORE,
+                    ServiceName.EXPLORER,
+                    lambda: ask(ExploreOrder.START, home=True, **({"find": 1} if tags else {})),
+                    lambda: ask(ExploreOrder.STOP, own=True),
+                    show,
+                    arm=True,
+                    to_its_end=True,
+                )
+            except RequestRefusedError as error:
+                if error.refusal not in STARTING:
+                    raise
+                if clock.now() - begun > timeout * SECOND:
+                    raise NoAnswerError(f"the robot was not ready to explore within {timeout:g} s: {error}") from None
+            await clock.sleep(0.5)
 
 
 def progress(state: ExplorationState) -> str:

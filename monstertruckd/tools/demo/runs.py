@@ -139,7 +139,7 @@ def run_fast_exploration(config_file: Path, folder: Path, seed: int | None, repo
         config_file: configuration of a simulated robot with an explorer.
         folder: for log, map, report and outputs.
         seed: of the world; None = the configuration's.
-        report: gets lines of progress.
+        report: gets the progress.
 
     Raises:
         RequestRefusedError: the exploration does not start.

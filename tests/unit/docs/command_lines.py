@@ -187,6 +187,7 @@ INSTEAD |= {
 }
 FOREIGN = {
     "python3 -m monstertruckd.bootstrap demo": "sets up .venv, then `monstertruckd demo`, which has its own tests",
+    "python3 -m monstertruckd.bootstrap demo --config lap": "the same",
     "python3 -m monstertruckd.bootstrap try": "sets up .venv, then `monstertruckd try`, which has its own tests",
     "python3 -m monstertruckd.bootstrap check": "runs this very test",
     "python3 systemd/debian/build.py": "benchmarks/package.py builds the package and installs it in a Debian",
