@@ -224,6 +224,21 @@ class PlaceObstacle(Asked):
     """Position (m); None removes all obstacles."""
 
 
+class ListNumbers(Asked):
+    """List the numbers that may be plotted."""
+
+    do: Literal["numbers"]
+
+
+class PlotNumbers(Asked):
+    """Send the values of these numbers from now on, instead of those chosen before."""
+
+    do: Literal["plot"]
+    set: Id
+    """Number of this choice, which its values carry."""
+    names: Annotated[tuple[Annotated[str, Field(max_length=100)], ...], Field(max_length=100)]
+
+
 class ControlReplay(_Command):
     """Seek in the shown recording (s since its start), play or pause it, or change its rate."""
 
@@ -257,6 +272,8 @@ AnyCommand = (
     | ReplayRecording
     | InjectFault
     | PlaceObstacle
+    | ListNumbers
+    | PlotNumbers
     | ControlReplay
 )
 Command = Annotated[AnyCommand, Field(discriminator="do")]
@@ -264,11 +281,15 @@ Command = Annotated[AnyCommand, Field(discriminator="do")]
 _COMMANDS: Final[TypeAdapter[AnyCommand]] = TypeAdapter(Command)
 
 
+LOOKING: Final = Watch | LookAtFleet | EchoRequest | ControlReplay | ListNumbers | PlotNumbers
+"""Commands that reach no robot."""
+
+
 def needed(command: AnyCommand) -> AccessRole:
     """Return the role required for a command: every user may watch and stop."""
     if isinstance(command, GiveOrder) and command.order in UNCONDITIONAL:
         return AccessRole.OBSERVER
-    if isinstance(command, Watch | LookAtFleet | EchoRequest | ControlReplay | ListSettings | ListRecordings):
+    if isinstance(command, LOOKING | ListSettings | ListRecordings):
         return AccessRole.OBSERVER
     return AccessRole.ENGINEER if isinstance(command, ChangeSetting | DeleteRecording) else AccessRole.PILOT
 

@@ -23,6 +23,7 @@ from monstertruck_schemas.topics import Topic
 from monstertruckd.station import frames
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.frames import Frame
+from monstertruckd.station.plots import Sampler, Subscriptions
 from monstertruckd.station.viewer import MOST_TILES, Place, Viewer, Viewers
 
 log = logging.getLogger(__name__)
@@ -31,6 +32,8 @@ M = TypeVar("M", bound=Message)
 
 FEED_PERIOD: Final = 0.05
 """Interval between checks for new messages (s)."""
+SAMPLING: Final = 0.09
+"""Interval between values of plots (s): every second check, for the checks come slightly early or late."""
 PING: Final = 1.0
 """Interval between measurements of the round trip to the robot (s)."""
 KEPT_EVENTS: Final = 200
@@ -259,7 +262,9 @@ class RobotFeed:
                 events = stack.enter_context(client.subscribe(topics.EVENT, fifo(64)))
                 maps = stack.enter_context(client.subscribe(topics.MAP, latest()))
                 tiles = stack.enter_context(client.subscribe(topics.MAP_TILES, fifo(MOST_TILES)))
+                sampler = Sampler(Subscriptions(client.subscribe, stack).newest)
                 taken: dict[str, tuple[Message, int]] = {}
+                sampled = 0
                 run = self._runs
                 while self._viewers and run == self._runs:
                     now = self._clock.now()
@@ -270,6 +275,9 @@ class RobotFeed:
                     self._take_map(maps, tiles)
                     for event in events.drain():
                         self._take_event(event)
+                    if now >= sampled:
+                        sampled = now + round(SAMPLING * SECOND)
+                        sampler.sample(self._viewers)
                     await self._clock.sleep(FEED_PERIOD)
             # The next browser starts with messages published then, not with stale ones.
             self._viewers.newest.clear()

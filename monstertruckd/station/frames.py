@@ -70,7 +70,7 @@ def scan(of: LaserScan) -> bytes:
 
 def picture(of: CompressedImage) -> bytes:
     """Return a camera image; payload: the JPEG file."""
-    return binary("camera", of.data, sequence=of.sequence)
+    return binary("camera", of.data, sequence=of.sequence, stamp=of.stamp)
 
 
 def pose(of: Odometry) -> str:

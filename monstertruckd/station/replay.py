@@ -13,6 +13,7 @@ from monstertruck_schemas.base import Message
 from monstertruckd.station import frames
 from monstertruckd.station.feed import FEED_PERIOD, POSE, SHOWN, MapStore
 from monstertruckd.station.frames import Frame
+from monstertruckd.station.plots import Sampler
 from monstertruckd.station.viewer import Viewer, Viewers
 
 log = logging.getLogger(__name__)
@@ -52,6 +53,7 @@ class RecordedTopic:
         self.messages: list[Recorded] = []
         self.index = 0
         """Number of messages before the current time."""
+        self._last: tuple[int, Message | None] = -1, None
 
     def up_to(self, at: int) -> Iterator[Message]:
         """Return the messages since the last call, up to ``at``; skip undecodable ones."""
@@ -66,6 +68,13 @@ class RecordedTopic:
             return None
         self.index = end - 1
         return next(self.up_to(at), None)
+
+    def last(self, at: int) -> Message | None:
+        """Return the latest message up to ``at``, the same object until there is a later one; None before the first."""
+        place = bisect.bisect_right(self.times, at) - 1
+        if place != self._last[0]:
+            self._last = place, next(_decoded(self.messages[place : place + 1]), None) if place >= 0 else None
+        return self._last[1]
 
 
 def _decoded(rows: Iterable[Recorded]) -> Iterator[Message]:
@@ -99,6 +108,9 @@ class ReplayFeed:
         shown = (*SHOWN, POSE)
         ways = (topics.POSE, topics.MAP, topics.MAP_TILES, topics.EVENT)
         self._tracks = {topic.name: RecordedTopic() for topic in (*(row.topic for row in shown), *ways)}
+        self._plotted = {topic.name: self._tracks.get(topic.name, RecordedTopic()) for topic in topics.TOPICS}
+        """Messages of all topics: each has numbers to plot."""
+        self._sampler = Sampler(lambda topic: self._plotted[topic].last(self._at))
         reader = open_log(file)
         self._begin, self._end = self._fill(reader, file)
         self._fault = reader.fault
@@ -114,7 +126,7 @@ class ReplayFeed:
         size = 0
         most_bytes = 400_000_000  # maximum payload of a recording kept in memory (bytes)
         for row in reader:
-            track = self._tracks.get(row.topic)
+            track = self._plotted.get(row.topic)
             if track is None:
                 continue
             size += len(row.payload)
@@ -190,6 +202,7 @@ class ReplayFeed:
             if self._viewers and self._playing:
                 self._play(min(self._at + round((now - before) * self._rate), self._end))
             before = now
+            self._sampler.sample(self._viewers)
             if self._viewers and now >= due:
                 # 0.4: interval for repeating unchanged frames (s): pages detect a silent robot by their absence
                 due = now + round(0.4 * SECOND)

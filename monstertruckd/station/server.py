@@ -33,8 +33,10 @@ from monstertruckd.station.commands import (
     EchoRequest,
     Heartbeat,
     InjectFault,
+    ListNumbers,
     LookAtFleet,
     PlaceObstacle,
+    PlotNumbers,
     ReplayRecording,
     Watch,
 )
@@ -45,6 +47,7 @@ from monstertruckd.station.feed import RobotFeed
 from monstertruckd.station.fleet import FleetBoard
 from monstertruckd.station.listener import WebListener
 from monstertruckd.station.pilot import Pilot
+from monstertruckd.station.plots import numbers, require_numbers
 from monstertruckd.station.remarks import Remarks
 from monstertruckd.station.replay import LogOpener, ReplayFeed
 from monstertruckd.station.users import LOCAL, StationUser, StationUsers, network_of
@@ -551,19 +554,28 @@ class _Browser:
                 self._board.show(self.viewer, command.on)
             case Watch():
                 self._watch(command.robot)
-            case InjectFault() | PlaceObstacle():
-                self._emulate(command)
+            case InjectFault() | PlaceObstacle() | ListNumbers() | PlotNumbers():
+                self._do(command)
             case _:
                 if self._pilot is None:
                     raise self._answered(command, InputError("no robot is looked at"))
                 self._pilot.ask(command)
 
-    def _emulate(self, command: InjectFault | PlaceObstacle) -> None:
+    def _do(self, command: InjectFault | PlaceObstacle | ListNumbers | PlotNumbers) -> None:
+        """Execute a command for the station itself, and answer it."""
+        value: dict[str, Any] = {}
         try:
-            self._station.emulate(command)
+            match command:
+                case ListNumbers():
+                    value = {"numbers": dict(numbers())}
+                case PlotNumbers():
+                    require_numbers(command.names)
+                    self.viewer.plotted, self.viewer.plot_set = command.names, command.set
+                case _:
+                    self._station.emulate(command)
         except InputError as error:
             raise self._answered(command, error) from None
-        self.viewer.send(frames.text("answer", id=command.id, ok=True))
+        self.viewer.send(frames.text("answer", id=command.id, ok=True, value=value))
 
     def _fetch(self, command: ReplayRecording) -> None:
         if len(self._ending) >= MOST_REPLAYS:
@@ -659,7 +671,7 @@ def _while_replaying(command: commands.AnyCommand) -> bool:
     """Return whether a command is executed while a recording is shown."""
     if isinstance(command, commands.GiveOrder):
         return command.order in UNCONDITIONAL
-    return isinstance(command, Watch | LookAtFleet | EchoRequest | ControlReplay)
+    return isinstance(command, commands.LOOKING)
 
 
 async def _send(socket: web.WebSocketResponse, viewer: Viewer) -> None:

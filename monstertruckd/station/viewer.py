@@ -22,6 +22,10 @@ class Viewer:
         self._tiles: dict[Place, Frame] = {}
         self._ordered: deque[Frame] = deque(maxlen=MOST_ANSWERS)
         self._news = asyncio.Event()
+        self.plotted: tuple[str, ...] = ()
+        """Names of the numbers that the browser plots."""
+        self.plot_set = 0
+        """Number that the browser gave to this choice."""
         self.lost = 0
         """Number of frames dropped from the ordered queue."""
 

@@ -2,6 +2,7 @@ import { Drive } from "./drive.js";
 import { FleetView } from "./fleet.js";
 import { MapView } from "./map.js";
 import { element, Panels } from "./panels.js";
+import { Plots } from "./plots.js";
 import { ReplayBar } from "./replay.js";
 import { Link } from "./socket.js";
 import { Tryout } from "./tryout.js";
@@ -61,6 +62,13 @@ const panels = new Panels(link);
 const fleet = new FleetView(link, map, chosen);
 new ReplayBar(link, chosen); // first: the others look at what it says of the page
 new Work(link, { outcome, order, stopDriving, letPlannersDrive, watch: chosen });
+const plots = new Plots(link, { outcome, pointed });
+
+/** Show map and camera as they were at a time that a plot is pointed at; null = as they are. */
+function pointed(at) {
+  map.take("cursor", at);
+  panels.showPast(at);
+}
 
 const tryout = new Tryout(link, { outcome, aim: (on) => aim(on, "tryout.hint") });
 
@@ -130,6 +138,7 @@ byId("theme").onclick = () => {
   document.documentElement.dataset.theme = next;
   localStorage.setItem("theme", next);
   map.readColours();
+  if (plots.uPlot) plots.show();
   if (fleet.open) fleet.draw();
 };
 

@@ -1,5 +1,6 @@
 // The map: grid, tiles, scan, trail, route, footprint, stopping distance and goal on one canvas.
 import { compose, moved, outline, wheelAngles, wrapped } from "./geometry.js";
+import { Past } from "./series.js";
 
 const COLOURS = ["map", "map-free", "map-wall", "map-grid", "scan", "trail", "route", "deformed", "goal", "ghost", "truck", "ink", "card", "accent", "frontier", "point"];
 const TRAIL_STEP = 0.03;
@@ -41,6 +42,8 @@ export class MapView {
 
   clear() {
     this.poses = [];
+    this.past = new Past(0.2); // seconds between two poses
+    this.cursor = null;
     this.pose = null;
     this.points = null;
     this.trail = [];
@@ -105,6 +108,7 @@ export class MapView {
     this.twist = message.twist;
     this.poses.push([message.stamp, message.pose]);
     if (this.poses.length > POSES) this.poses.shift();
+    this.past.add(message.stamp / 1e9, message.pose);
     const last = this.trail.at(-1);
     if (!last || Math.hypot(last[0] - message.pose[0], last[1] - message.pose[1]) > TRAIL_STEP) {
       this.trail.push(message.pose);
@@ -388,6 +392,7 @@ export class MapView {
     if (this.layers.scan) this.drawScan(c, px);
     this.drawGhost(c, px);
     if (this.pose) this.drawTruck(c, px);
+    this.drawPast(c, px);
     if (this.goal) this.drawGoal(c, [this.goal.x, this.goal.y, this.goal.yaw], px, this.colour.goal);
     this.drawPlaces(c, px);
     if (this.pending) this.drawGoal(c, this.pending, px, this.colour.accent);
@@ -496,6 +501,13 @@ export class MapView {
     this.polygon(c, compose(this.pose, [length / 2, 0, 0]), [[0, width / 5], [0, -width / 5], [width / 5, 0]]);
     c.fill();
     c.globalAlpha = 1;
+  }
+
+  /** Where the robot was at the time that a plot is pointed at. */
+  drawPast(c, px) {
+    const pose = this.cursor === null ? null : this.past.at(this.cursor);
+    this.canvas.dataset.past = pose ? pose.map((value) => value.toFixed(2)) : "";
+    if (pose) this.drawGoal(c, pose, px, this.colour.ghost);
   }
 
   drawGoal(c, pose, px, colour) {

@@ -1,5 +1,6 @@
 // The panels beside the map: safety gate, truck, system, events, banners.
 import { wheelAngles } from "./geometry.js";
+import { Past } from "./series.js";
 import { degrees, modeText, moves, number, reason, words } from "./words.js";
 
 const byId = (id) => document.getElementById(id);
@@ -50,6 +51,8 @@ export class Panels {
   constructor(link) {
     this.link = link;
     this.seen = new Set();
+    this.pictures = new Past(1); // seconds between two pictures: ten minutes of them are some 15 MB
+    this.pointed = null;
     this.early = []; // events that came before the robot's time was known
     link.on("robot", () => this.clear());
     link.on("stop", (stop) => this.showStop(stop));
@@ -70,6 +73,7 @@ export class Panels {
 
   clear() {
     this.seen.clear();
+    this.pictures.clear();
     this.early = [];
     byId("events").replaceChildren();
     byId("services").replaceChildren();
@@ -239,9 +243,22 @@ export class Panels {
   }
 
   showPicture(message) {
+    const picture = new Blob([message.payload], { type: "image/jpeg" });
+    this.pictures.add(message.stamp / 1e9, picture);
+    if (this.pointed === null) this.drawPicture(picture);
+  }
+
+  /** Show the picture of a time that a plot is pointed at; null = the newest. */
+  showPast(at) {
+    this.pointed = at;
+    const picture = at === null ? this.pictures.rows.at(-1)?.[1] : this.pictures.at(at);
+    if (picture) this.drawPicture(picture);
+  }
+
+  drawPicture(picture) {
     const image = byId("camera");
     const before = image.src;
-    image.src = URL.createObjectURL(new Blob([message.payload], { type: "image/jpeg" }));
+    image.src = URL.createObjectURL(picture);
     if (before) URL.revokeObjectURL(before);
     image.alt = words("camera");
     image.hidden = false;

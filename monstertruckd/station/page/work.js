@@ -27,7 +27,6 @@ export class Work {
     byId("tab-settings").addEventListener("click", () => this.loadSettings());
     byId("tab-recordings").addEventListener("click", () => this.loadRecordings());
     byId("settings-find").oninput = byId("settings-changed").onchange = () => this.filterSettings();
-    byId("settings-find").placeholder = words("settings.find");
     byId("recordings-again").onclick = () => this.loadRecordings();
     byId("explore-start").onclick = () => this.begin("task.explore", { do: "explore", order: "start" });
     byId("explore-stop").onclick = () => this.ask("task.explore", { do: "explore", order: "stop" });

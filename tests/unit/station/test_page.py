@@ -526,6 +526,109 @@ async def stick_and_map_are_in_view_together_on_a_phone_and_tabs_stay_in_one_lin
     await page.set_viewport_size({"width": 1280, "height": 720})
 
 
+SERIES = """
+async () => {
+  const { Past, Table, titleOf, unitIn } = await import("/page/series.js");
+  const table = new Table();
+  table.choose(["a", "b"]);
+  for (let i = 0; i < 8000; i++) table.add(i / 10, [i, i % 2 ? null : -i]);
+  const kept = [table.times.length, table.times[0]];
+  const [times, a, b] = table.between(799.5, 799.8, ["a", "b"], [1, 2]);
+  const last = [table.value("b", 799.5), table.value("b", 799.65), table.value("a", -1)];
+  table.choose(["b", "c"]);
+  const added = [table.columns.get("c").length === table.times.length, table.value("b", 799.8)];
+  table.add(800.5, [5, 6]);
+  table.add(800.5, [7, 8]);
+  const twice = table.value("c", 801);
+  table.add(3, [1, 1]);
+  const past = new Past(1);
+  for (const at of [0, 0.5, 1, 2, 700]) past.add(at, `row ${at}`);
+  const again = new Past(1);
+  for (const at of [10, 3]) again.add(at, at);
+  return {
+    kept, times, a, b, last, added, twice, anew: table.times,
+    past: past.rows.map(([at]) => at), at: past.at(700.3), again: again.rows.length,
+    units: ["Speed, m/s", "Filtered pack voltage, V; None at fault.", "Yaw rate (rad/s).", "How many"].map(
+      (text) => unitIn(text).name,
+    ),
+    title: titleOf("state/pose:pose.x"),
+  };
+}
+"""
+
+
+async def values_over_time_are_kept_for_ten_minutes_and_found_by_their_time(page: Page) -> None:
+    found = await page.evaluate(SERIES)
+    count, first = found["kept"]
+    assert 6000 <= count <= 6700
+    assert first >= 799.9 - 670
+    assert found["times"] == [799.5, 799.6, 799.7, 799.8]
+    assert found["a"] == [7995, 7996, 7997, 7998]
+    assert found["b"] == [None, -15992, None, -15996], "multiplied for people"
+    assert found["last"] == [-7994, -7996, None]
+    assert found["added"] == [True, -7998], "what stays keeps its values"
+    assert found["twice"] == 6, "one row for a time"
+    assert found["anew"] == [3], "the robot's clock began anew"
+    assert found["past"] == [700]
+    assert found["at"] == "row 700"
+    assert found["again"] == 1
+    assert found["units"] == ["m/s", "V", "°/s", ""]
+    assert found["title"] == "pose pose x"
+
+
+async def numbers_are_plotted_pinned_and_pointed_at(page: Page) -> None:
+    async def asked() -> list[dict[str, Any]]:
+        sent: list[dict[str, Any]] = await page.evaluate("window.sent.filter((each) => each.do === 'plot')")
+        return sent
+
+    await page.evaluate("void (window.sent = [])")
+    await page.click("#tab-plots")
+    await page.wait_for_function("window.sent.some((each) => each.do === 'numbers')")
+    (listed,) = await page.evaluate("window.sent.filter((each) => each.do === 'numbers')")
+    meanings = {"sensor/battery:voltage": "Pack voltage, V.", "state/pose:twist.wz": "Turn rate, rad/s."}
+    await say(page, {"kind": "answer", "id": listed["id"], "ok": True, "value": {"numbers": meanings}})
+    await page.wait_for_function("document.querySelectorAll('#plot-names option').length === 2")
+
+    await page.fill("#plot-name", "sensor/battery")
+    await page.click("#plot-add")
+    await expect(page.locator("#plot-note")).to_contain_text("choose a number from the list")
+    for name, into in (("sensor/battery:voltage", ""), ("state/pose:twist.wz", "0")):
+        await page.select_option("#plot-into", into)
+        await page.fill("#plot-name", name)
+        await page.press("#plot-name", "Enter")
+    await page.locator(".plot canvas").wait_for()
+    assert await page.locator(".plot").count() == 1
+    order = (await asked())[-1]
+    assert order["names"] == [*meanings]
+    for i in range(40):
+        at = 100.0 + i / 10
+        await say(page, {"kind": "samples", "set": order["set"], "at": at, "values": [7.4, None if i % 2 else 0.5]})
+        pose = {"stamp": round(at * 1e9), "pose": [i / 10, 0.0, 0.0], "twist": [0.0, 0.0, 0.0], "age": 0.0}
+        await say(page, {"kind": "pose", "frame": "map", **pose})
+    await say(page, {"kind": "samples", "set": order["set"] - 1, "at": 200.0, "values": [9.9]})
+    outputs = page.locator(".legend output")
+    await expect(outputs).to_have_text(["7.400 V", "28.648 °/s"])
+
+    await page.select_option("#plot-window", "10")
+    over = page.locator(".plot .u-over")
+    box = await over.bounding_box()
+    assert box is not None
+    await page.wait_for_timeout(300)
+    await page.mouse.move(box["x"] + box["width"] * 0.8, box["y"] + 20)
+    past = await page.wait_for_function("document.querySelector('#map').dataset.past")
+    x = float((await past.json_value()).split(",")[0])
+    assert 1.5 < x < 2.3, "two seconds ago"
+    await page.mouse.move(5, 5)
+    await page.wait_for_function("!document.querySelector('#map').dataset.past")
+
+    assert json.loads(await page.evaluate("localStorage.plots")) == [[*meanings]]
+    for _ in meanings:
+        await page.locator(".legend button").first.click()
+    assert (await asked())[-1]["names"] == []
+    await expect(page.locator("#plots-none")).to_be_visible()
+    await page.click("#tab-drive")
+
+
 async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path: Path):
     """All in one browser, for it takes seconds to start."""
     async with serving() as (station, _), chromium(tmp_path) as browser:
@@ -559,5 +662,7 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await events_have_times_are_counted_and_filtered(page)
         await settings_have_names_units_degrees_search_and_a_way_back(page)
         await stick_and_map_are_in_view_together_on_a_phone_and_tabs_stay_in_one_line(page)
+        await values_over_time_are_kept_for_ten_minutes_and_found_by_their_time(page)
+        await numbers_are_plotted_pinned_and_pointed_at(page)
         await the_link_that_failed_is_named_with_its_age(page)
         assert errors == []
