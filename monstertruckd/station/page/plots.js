@@ -141,7 +141,7 @@ export class Plots {
       scales: { x: { time: false } },
       series: [{}, ...panel.names.map((_, j) => ({ stroke: colour(COLOURS[j % COLOURS.length]), width: 1.5, scale: `y ${panel.units[j].name}`, spanGaps: true, points: { show: false } }))],
       axes: [
-        { ...text, values: (plot, ticks) => ticks.map((tick) => `${Math.round(tick - this.until())} s`) },
+        { ...text, size: 26, values: (plot, ticks) => ticks.map((tick) => `${Math.round(tick - this.until())} s`) },
         ...units.map((unit, j) => ({ ...text, scale: `y ${unit}`, side: j % 2 ? 1 : 3, size: 44, label: unit || undefined, labelSize: unit ? 14 : 0, labelFont: "11px system-ui, sans-serif", grid: { ...text.grid, show: j === 0 } })),
       ],
       hooks: { setCursor: [(plot) => this.point(plot)] },
