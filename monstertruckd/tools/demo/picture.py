@@ -92,4 +92,5 @@ def reduced(kinds: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
     rows, columns = math.ceil(height / step), math.ceil(width / step)
     padded = np.zeros(((rows + rows % 2) * step, columns * step), dtype=np.uint8)
     padded[:height, :width] = kinds
-    return padded.reshape(rows + rows % 2, step, columns, step).max(axis=(1, 3))
+    found: NDArray[np.uint8] = padded.reshape(rows + rows % 2, step, columns, step).max(axis=(1, 3))
+    return found
