@@ -224,6 +224,17 @@ class PlaceObstacle(Asked):
     """Position (m); None removes all obstacles."""
 
 
+class Calibrate(Asked):
+    """List the calibration wizards, run one, answer its question, accept its result or discard it."""
+
+    do: Literal["calibrate"]
+    order: Literal["list", "start", "answer", "accept", "discard"]
+    step: Annotated[str, Field(max_length=100)] = ""
+    """Wizard to start."""
+    value: Number | bool = False
+    """Answer: a number, or yes."""
+
+
 class ListNumbers(Asked):
     """List the numbers that may be plotted."""
 
@@ -272,6 +283,7 @@ AnyCommand = (
     | ReplayRecording
     | InjectFault
     | PlaceObstacle
+    | Calibrate
     | ListNumbers
     | PlotNumbers
     | ControlReplay
@@ -291,7 +303,7 @@ def needed(command: AnyCommand) -> AccessRole:
         return AccessRole.OBSERVER
     if isinstance(command, LOOKING | ListSettings | ListRecordings):
         return AccessRole.OBSERVER
-    return AccessRole.ENGINEER if isinstance(command, ChangeSetting | DeleteRecording) else AccessRole.PILOT
+    return AccessRole.ENGINEER if isinstance(command, ChangeSetting | DeleteRecording | Calibrate) else AccessRole.PILOT
 
 
 def parse(data: str) -> AnyCommand:

@@ -28,7 +28,9 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruckd import __version__
 from monstertruckd.station import commands, frames
 from monstertruckd.station.address import RobotAddress
+from monstertruckd.station.calibration import Calibration, Calibrator
 from monstertruckd.station.commands import (
+    Calibrate,
     ControlReplay,
     EchoRequest,
     Heartbeat,
@@ -148,6 +150,7 @@ class Station:
         routers: endpoints whose robots are shown as they appear.
         open_log: opens recordings for replay; None disables replay.
         emulated: receives faults and obstacles of an emulated robot; None if this program emulates no robot.
+        calibrator: the calibration wizards; None disables calibration.
     """
 
     def __init__(
@@ -158,9 +161,11 @@ class Station:
         routers: Sequence[str] = (),
         open_log: LogOpener | None = None,
         emulated: EmulatedWorld | None = None,
+        calibrator: Calibrator | None = None,
     ) -> None:
         self._clock = clock
         self._emulated = emulated
+        self.calibrator = calibrator
         self.place = place
         self.feeds = {address.name: RobotFeed(address, clock) for address in robots}
         if len(self.feeds) != len(robots):
@@ -523,6 +528,7 @@ class _Browser:
         self._feed: RobotFeed | ReplayFeed | None = None
         self._pilot: Pilot | None = None
         self._session: asyncio.Task[None] | None = None
+        self._calibration: Calibration | None = None
         self._ending: set[asyncio.Task[None]] = set()
         self.viewer.send(frames.text("hello", version=__version__, user=user.name, role=user.role.value))
         self.viewer.send(frames.text("robots", names=station.names))
@@ -557,9 +563,7 @@ class _Browser:
             case InjectFault() | PlaceObstacle() | ListNumbers() | PlotNumbers():
                 self._do(command)
             case _:
-                if self._pilot is None:
-                    raise self._answered(command, InputError("no robot is looked at"))
-                self._pilot.ask(command)
+                self._ask_robot(command)
 
     def _do(self, command: InjectFault | PlaceObstacle | ListNumbers | PlotNumbers) -> None:
         """Execute a command for the station itself, and answer it."""
@@ -576,6 +580,34 @@ class _Browser:
         except InputError as error:
             raise self._answered(command, error) from None
         self.viewer.send(frames.text("answer", id=command.id, ok=True, value=value))
+
+    def _ask_robot(self, command: commands.Asked) -> None:
+        """Execute a command that needs a robot."""
+        if self._pilot is None:
+            raise self._answered(command, InputError("no robot is looked at"))
+        if isinstance(command, Calibrate):
+            self._begin(self._calibrate(command))
+        else:
+            self._pilot.ask(command)
+
+    async def _calibrate(self, command: Calibrate) -> None:
+        value: dict[str, Any] = {}
+        try:
+            if self._calibration is None:
+                raise InputError("this station calibrates no robot")
+            match command.order:
+                case "list":
+                    value = {"wizards": await self._calibration.offer()}
+                case "start":
+                    self._calibration.begin(command.step)
+                case "answer":
+                    self._calibration.answer(command.value)
+                case "accept" | "discard":
+                    self._calibration.decide(accept=command.order == "accept")
+        except TruckError as error:
+            self.viewer.send(frames.refusal(command.id, error))
+        else:
+            self.viewer.send(frames.text("answer", id=command.id, ok=True, value=value))
 
     def _fetch(self, command: ReplayRecording) -> None:
         if len(self._ending) >= MOST_REPLAYS:
@@ -629,6 +661,9 @@ class _Browser:
         self._pilot = Pilot(feed.address, self.name, self.viewer, self._clock, lambda: feed.client)
         self._session = asyncio.create_task(self._pilot.run())
         self.viewer.send(frames.text("stops", robot=feed.address.name))
+        if (calibrator := self._station.calibrator) is not None:
+            program = f"{self.user.name}{'.' * bool(self.user.name)}calibrate"
+            self._calibration = Calibration(feed.address, program, self._clock, calibrator, self.viewer)
 
     def _show_replay(self, replay: ReplayFeed) -> None:
         """Show a recording; keep or open the session with the robot, so that its emergency stop is available."""
@@ -649,6 +684,10 @@ class _Browser:
             self._session.cancel()
             self._ending.add(self._session)
             self._session.add_done_callback(self._ending.discard)
+        if self._calibration is not None and (ended := self._calibration.end()) is not None:
+            self._ending.add(ended)
+            ended.add_done_callback(self._ending.discard)
+        self._calibration = None
         self._feed = self._pilot = self._session = None
 
     async def close(self) -> None:

@@ -1,3 +1,4 @@
+import { Calibration } from "./calibration.js";
 import { Drive } from "./drive.js";
 import { FleetView } from "./fleet.js";
 import { MapView } from "./map.js";
@@ -62,6 +63,7 @@ const panels = new Panels(link);
 const fleet = new FleetView(link, map, chosen);
 new ReplayBar(link, chosen); // first: the others look at what it says of the page
 new Work(link, { outcome, order, stopDriving, letPlannersDrive, watch: chosen });
+new Calibration(link, { outcome });
 const plots = new Plots(link, { outcome, pointed });
 
 /** Show map and camera as they were at a time that a plot is pointed at; null = as they are. */

@@ -189,18 +189,34 @@ async def calibrate(
     config: TruckConfig,
     known: Mapping[WizardName, Result],
 ) -> tuple[Result, str]:
-    """Run a wizard and have the daemon save its result; returns the saved result and the path of the new file.
+    """Run a wizard and have the daemon save its result; returns what ``save`` does.
 
     Raises:
         TruckError: the wizard ended without a result; nothing was saved.
     """
+    return await save(truck, await measure(wizard, truck, panel, clock, config, known))
+
+
+async def measure(
+    wizard: Wizard,
+    truck: TruckClient,
+    panel: Panel,
+    clock: Clock,
+    config: TruckConfig,
+    known: Mapping[WizardName, Result],
+) -> Result:
+    """Run a wizard; nothing is saved. Raises TruckError if it ended without a result."""
     panel.say(f"{wizard.name}: {wizard.doc}")
     if wizard.room:
         panel.say(f"room: {wizard.room}")
     context = WizardContext(truck, panel, clock, config, known)
     if why := context.expired.get(wizard.name):
         panel.say(f"nothing of the calibration before is used, it has expired: {why}")
-    result = await wizard(context)
+    return await wizard(context)
+
+
+async def save(truck: TruckClient, result: Result) -> tuple[Result, str]:
+    """Have the daemon save a result; returns it as it was saved, and the path of the new file."""
     saved = await truck.call(SAVE, {"result": result.model_dump(mode="json"), "source": truck.source})
     return Result.model_validate_json(json.dumps(saved["result"])), str(saved["file"])
 

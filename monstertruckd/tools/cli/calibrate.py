@@ -176,7 +176,7 @@ async def _steps_left(call: _Call, clock: "Clock") -> "tuple[list[WizardRun], bo
         config = await robot_config(client)
         state = await client.call(SHOW)
         health = await client.get_retained(CALIBRATION)
-    file = _file(state)
+    file = file_in(state)
     results = {} if file is None else file.results
     dates = {row.wizard: row.date for row in health.wizards if row.expired} if health is not None else {}
     expired = {name for name, date in dates.items() if name in results and results[name].date == date}
@@ -213,7 +213,7 @@ def show(
         state: dict[str, Any] = {"folder": str(store.folder), "newest": newest, "content": file, "unused": left}
     else:
         state = with_robot(lambda client, _: client.call(SHOW), robot, endpoint, ANSWER_TIMEOUT, named=False)
-        file = _file(state)
+        file = file_in(state)
     if json_output:
         print_json(state)
         return
@@ -278,7 +278,7 @@ async def _run_wizard(wizard: "Wizard", call: _Call, clock: "Clock", panel: "Pan
     async with _client(call.robot, call.endpoint, clock) as client:
         remark(f"robot: {robot_on_host(call.robot, call.endpoint)}")
         config = await robot_config(client)
-        file = _file(await client.call(SHOW))
+        file = file_in(await client.call(SHOW))
         known = {} if file is None else file.results
         return await calibrate(wizard, client, panel, clock, config, known)
 
@@ -318,7 +318,7 @@ def _store(config: Path) -> "tuple[TruckConfig, CalibrationStore]":
     return loaded, CalibrationStore(loaded.calibration_folder, loaded.robot)
 
 
-def _file(state: dict[str, Any]) -> "CalibrationFile | None":
+def file_in(state: dict[str, Any]) -> "CalibrationFile | None":
     """The newest file of a robot that answers with ``state``."""
     import json
 

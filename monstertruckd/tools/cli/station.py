@@ -74,6 +74,7 @@ def station(
     from monstertruckd.station import users as station_users
     from monstertruckd.station.address import RobotAddress
     from monstertruckd.station.server import Place, Station
+    from monstertruckd.tools.cli.calibrate_page import PageCalibrator
 
     if add_user is not None:
         if users is None:
@@ -93,7 +94,7 @@ def station(
         raise typer.BadParameter("a viewer shows one robot: expected --robot NAME@ENDPOINT")
 
     async def serve(clock: "WallClock") -> None:
-        page = Station(addresses, clock, place, routers or (), open_log)
+        page = Station(addresses, clock, place, routers or (), open_log, calibrator=PageCalibrator(clock))
         jobs = [page.run(lambda: remark(f"station: {place.url}"))]
         if foxglove or foxglove_drive:
             jobs.append(_foxglove(addresses[0], clock, foxglove_port, drives=foxglove_drive))

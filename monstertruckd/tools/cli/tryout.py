@@ -38,6 +38,7 @@ def try_out(
     no route planner can steer is driven by hand.
     """
     with needs_extra("planning"), needs_extra("station"):
+        from monstertruckd.tools.cli.calibrate_page import PageCalibrator
         from monstertruckd.tools.demo.tryout import free_port, robot_file, run_tryout
 
     file, folder = robot_file(robot), fresh(output)
@@ -48,7 +49,10 @@ def try_out(
 
     async def main(clock: "WallClock") -> None:
         nonlocal code
-        code = await run_tryout(clock, file, folder, free_port(port), print_words, browser=browser)
+        calibrator = PageCalibrator(clock)
+        code = await run_tryout(
+            clock, file, folder, free_port(port), print_words, browser=browser, calibrator=calibrator
+        )
 
     until_stopped(main)
     if code:

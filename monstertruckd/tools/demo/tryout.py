@@ -18,6 +18,7 @@ from monstertruck_sim.console import Commanded
 from monstertruckd.config.load import FILE_VERSION
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.station.address import RobotAddress
+from monstertruckd.station.calibration import Calibrator
 from monstertruckd.station.emulated import EmulatedWorld
 from monstertruckd.station.server import Place, Station
 from monstertruckd.tools.demo.runs import free_endpoint, write_overlay
@@ -105,7 +106,14 @@ def open_page(url: str) -> bool:
 
 
 async def run_tryout(
-    clock: Clock, robot: Path, folder: Path, port: int, say: Callable[[str], None], *, browser: bool
+    clock: Clock,
+    robot: Path,
+    folder: Path,
+    port: int,
+    say: Callable[[str], None],
+    *,
+    browser: bool,
+    calibrator: Calibrator | None = None,
 ) -> int:
     """Run emulated robot, daemon and page until SIGTERM, SIGINT or the end of one of them.
 
@@ -116,6 +124,7 @@ async def run_tryout(
         port: of the page.
         say: gets a line for the terminal.
         browser: whether to open the page in a browser, where there is one.
+        calibrator: the calibration wizards, for the page.
 
     Returns:
         The daemon's exit code.
@@ -129,7 +138,14 @@ async def run_tryout(
     async def page(console: Commanded) -> None:
         world = EmulatedWorld(tuple(config.devices.present()), console.command)
         place = Place(port=port)
-        station = Station([RobotAddress(config.robot, endpoint)], clock, place, open_log=open_log, emulated=world)
+        station = Station(
+            [RobotAddress(config.robot, endpoint)],
+            clock,
+            place,
+            open_log=open_log,
+            emulated=world,
+            calibrator=calibrator,
+        )
         opening: list[asyncio.Task[bool]] = []
 
         def ready() -> None:

@@ -629,6 +629,49 @@ async def numbers_are_plotted_pinned_and_pointed_at(page: Page) -> None:
     await page.click("#tab-drive")
 
 
+async def a_wizard_asks_and_its_result_is_accepted_beside_the_one_before(page: Page) -> None:
+    async def asked() -> dict[str, Any]:
+        sent: dict[str, Any] = await page.evaluate("window.sent.filter((each) => each.do === 'calibrate').at(-1)")
+        return sent
+
+    await page.evaluate("void (window.sent = [])")
+    await page.click("#tab-system")
+    await page.click("#wizards-list")
+    wizards = [
+        {"id": "drive.inverted", "name": "drive", "rough": True, "doc": "Which way is forward.", "due": True},
+        {"id": "battery.gain", "name": "battery", "rough": False, "doc": "Scale of the voltage.", "due": False},
+    ]
+    await say(page, {"kind": "answer", "id": (await asked())["id"], "ok": True, "value": {"wizards": wizards}})
+    await expect(page.locator("#wizards button")).to_have_text(["First look at drive", "Calibrate battery"])
+    await page.locator("#wizards button").last.click()
+    assert ((await asked())["order"], (await asked())["step"]) == ("start", "battery.gain")
+
+    state = {"kind": "calibrating", "step": "battery.gain", "phase": "running", "said": ["battery: Scale"], "text": ""}
+    state |= {"progress": None, "measured": None, "question": None}
+    question = {"kind": "number", "name": "meter", "text": "What does the meter show, V?", "low": 5.0, "high": 30.0}
+    await say(page, state | {"question": question})
+    await expect(page.locator("#wizard-question")).to_have_text(question["text"])
+    await page.fill("#wizard-number", "12,6")
+    await page.press("#wizard-number", "Enter")
+    assert ((await asked())["order"], (await asked())["value"]) == ("answer", 12.6)
+    await say(page, state | {"question": {"kind": "confirm", "name": "another", "text": "Another?", "fact": True}})
+    await page.click("#wizard-no")
+    assert (await asked())["value"] is False
+    await say(page, state | {"progress": {"name": "drive", "done": 0.5, "total": 1.0}})
+    assert await page.locator("#wizard-progress").evaluate("(bar) => bar.position") == 0.5
+    await expect(page.locator("#wizard-ask")).to_be_hidden()
+    row = {"name": "gain", "value": 1.0213, "low": 1.0, "high": 1.04, "unit": "V", "meaning": "scale", "grade": "A"}
+    measured = {"rows": [row | {"before": 0.98}], "text": "two readings"}
+    await say(page, state | {"phase": "measured", "measured": measured})
+    await expect(page.locator("#wizard-rows td")).to_contain_text(["gain", "1.021 ± 0.020 V", "0.9800 V", "A"])
+    await page.click("#wizard-accept")
+    assert (await asked())["order"] == "accept"
+    await say(page, state | {"phase": "saved", "text": "0002.json"})
+    await expect(page.locator("#wizard-text")).to_contain_text("0002.json; it counts from the next start")
+    await expect(page.locator("#wizards")).to_be_visible()
+    await page.click("#tab-drive")
+
+
 async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path: Path):
     """All in one browser, for it takes seconds to start."""
     async with serving() as (station, _), chromium(tmp_path) as browser:
@@ -664,5 +707,6 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await stick_and_map_are_in_view_together_on_a_phone_and_tabs_stay_in_one_line(page)
         await values_over_time_are_kept_for_ten_minutes_and_found_by_their_time(page)
         await numbers_are_plotted_pinned_and_pointed_at(page)
+        await a_wizard_asks_and_its_result_is_accepted_beside_the_one_before(page)
         await the_link_that_failed_is_named_with_its_age(page)
         assert errors == []

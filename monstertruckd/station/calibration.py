@@ -1,0 +1,208 @@
+"""Calibration of a robot from a browser: a wizard's sentences, questions, progress and result."""
+
+import asyncio
+from collections import deque
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+from monstertruck_runtime.client import TruckClient
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.errors import InputError, TruckError
+from monstertruckd.station import frames
+from monstertruckd.station.address import RobotAddress
+from monstertruckd.station.viewer import Viewer
+
+TIMEOUT: Final = 10.0
+"""Timeout of the robot's answer (s): its daemon writes files."""
+SAID: Final = 30
+"""Maximum number of a wizard's sentences shown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Result of a wizard, not yet saved."""
+
+    rows: Sequence[dict[str, Any]]
+    """Estimates: name, unit, meaning, value, low, high, grade, and the value ``before``."""
+    measured: str
+    """What was done, in a sentence."""
+    save: Callable[[], Awaitable[str]]
+    """Saves it; returns where, for people."""
+
+
+class Calibrator(Protocol):
+    """The wizards, which the station does not know."""
+
+    async def offered(self, truck: TruckClient) -> list[dict[str, Any]]:
+        """Return what fits the robot, in the order in which it is best done: id, name, doc, and whether it is due."""
+
+    async def measure(self, truck: TruckClient, step: str, panel: "PagePanel") -> Measured:
+        """Run one of them.
+
+        Raises:
+            TruckError: it ended without a result.
+        """
+
+
+class PagePanel:
+    """A wizard's operator at a browser.
+
+    Args:
+        show: is called after every change.
+    """
+
+    def __init__(self, show: Callable[[], object]) -> None:
+        self._show = show
+        self.said: deque[str] = deque(maxlen=SAID)
+        self.bar: dict[str, Any] | None = None
+        """Progress of the step under way."""
+        self.question: dict[str, Any] | None = None
+        """What the operator is asked."""
+        self._answer: asyncio.Future[float | bool] | None = None
+
+    def say(self, text: str) -> None:
+        """Show a sentence."""
+        self.bar = None
+        self.said.append(text)
+        self._show()
+
+    def progress(self, name: str, done: float, total: float) -> None:
+        """Move the bar of a step."""
+        self.bar = {"name": name, "done": round(min(done, total), 3), "total": total}
+        self._show()
+
+    async def number(self, step: Any) -> float:
+        """Ask for a number; ``step`` has its name, question and bounds."""
+        return float(await self._ask(kind="number", name=step.name, text=step.question, low=step.low, high=step.high))
+
+    async def confirm(self, step: Any) -> bool:
+        """Ask for yes or no; of what is no ``fact``, no ends the wizard."""
+        return bool(await self._ask(kind="confirm", name=step.name, text=step.question, fact=step.fact))
+
+    async def _ask(self, **question: Any) -> float | bool:
+        self._answer, self.question, self.bar = asyncio.get_running_loop().create_future(), question, None
+        self._show()
+        try:
+            value = await self._answer
+        finally:
+            self._answer = self.question = None
+        shown = {True: "yes", False: "no"}[value] if question["kind"] == "confirm" else f"{value:g}"
+        self.say(f"{question['text']} {shown}")
+        return value
+
+    def answer(self, value: float | bool) -> None:
+        """Answer the question.
+
+        Raises:
+            InputError: nothing is asked, or the number is out of its bounds.
+        """
+        question = self.question
+        if question is None or self._answer is None or self._answer.done():
+            raise InputError("the wizard asks nothing now")
+        if question["kind"] == "number" and not question["low"] <= value <= question["high"]:
+            raise InputError(f"{question['name']}: expected {question['low']:g} to {question['high']:g}, got {value:g}")
+        if question["kind"] == "confirm" and not isinstance(value, bool):
+            raise InputError(f"{question['name']}: expected yes or no")
+        self._answer.set_result(value)
+
+
+class Calibration:
+    """Calibration by one browser: one wizard at a time.
+
+    Args:
+        address: address of the robot.
+        program: name of the session with it.
+        clock: clock of the station.
+        calibrator: the wizards.
+        viewer: outbox of the browser.
+    """
+
+    def __init__(
+        self, address: RobotAddress, program: str, clock: Clock, calibrator: Calibrator, viewer: Viewer
+    ) -> None:
+        self._open = lambda: address.session(program, clock, TIMEOUT)
+        self._calibrator, self._viewer = calibrator, viewer
+        self._panel = PagePanel(self._show)
+        self._step, self._phase, self._text = "", "idle", ""
+        self._measured: Measured | None = None
+        self._decision: asyncio.Future[bool] | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    def _show(self) -> None:
+        measured = None if self._measured is None else {"rows": self._measured.rows, "text": self._measured.measured}
+        self._viewer.show(
+            "calibrating",
+            frames.text(
+                "calibrating",
+                step=self._step,
+                phase=self._phase,
+                said=list(self._panel.said),
+                progress=self._panel.bar,
+                question=self._panel.question,
+                measured=measured,
+                text=self._text,
+            ),
+        )
+
+    async def offer(self) -> list[dict[str, Any]]:
+        """Return the wizards; raises TruckError as the robot does."""
+        async with self._open() as truck:
+            return await self._calibrator.offered(truck)
+
+    def begin(self, step: str) -> None:
+        """Start a wizard.
+
+        Raises:
+            InputError: one runs already.
+        """
+        if self._task is not None and not self._task.done():
+            raise InputError(f"calibration {self._step} runs already")
+        self._panel, self._step, self._measured = PagePanel(self._show), step, None
+        self._enter("running")
+        self._task = asyncio.create_task(self._run(step), name=f"calibration {step}")
+
+    def answer(self, value: float | bool) -> None:
+        """Answer the wizard's question; raises as ``PagePanel.answer`` does."""
+        self._panel.answer(value)
+
+    def decide(self, *, accept: bool) -> None:
+        """Accept the result, or discard it; a wizard that still measures is cancelled.
+
+        Raises:
+            InputError: there is no result to accept.
+        """
+        if self._decision is not None and not self._decision.done():
+            self._decision.set_result(accept)
+        elif accept:
+            raise InputError("there is no result to accept")
+        elif self._task is not None:
+            self._task.cancel()
+
+    def end(self) -> asyncio.Task[None] | None:
+        """End a wizard that runs; nothing is saved. Returns its task."""
+        if self._task is not None:
+            self._task.cancel()
+        return self._task
+
+    def _enter(self, phase: str, text: str = "") -> None:
+        self._phase, self._text = phase, text
+        self._show()
+
+    async def _run(self, step: str) -> None:
+        try:
+            async with self._open() as truck:
+                self._measured = await self._calibrator.measure(truck, step, self._panel)
+                self._decision = asyncio.get_running_loop().create_future()
+                self._enter("measured")
+                if await self._decision:
+                    self._enter("saved", await self._measured.save())
+                else:
+                    self._enter("discarded")
+        except TruckError as error:
+            self._enter("failed", str(error))
+        except asyncio.CancelledError:
+            self._enter("discarded")
+            raise
+        finally:
+            self._decision = None

@@ -1,0 +1,89 @@
+"""The wizards of ``monstertruckd calibrate`` for the operator's page."""
+
+from typing import TYPE_CHECKING, Any
+
+from monstertruck_runtime.errors import InputError
+from monstertruckd.config.calibration_rpc import SHOW
+from monstertruckd.config.wizards import WizardRun, sequence
+from monstertruckd.station.calibration import Measured, PagePanel
+from monstertruckd.tools.cli.calibrate import file_in, wizard_of
+from monstertruckd.tools.cli.connection import robot_config
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.client import TruckClient
+    from monstertruck_runtime.clock import Clock
+    from monstertruckd.config.calibration import Result
+
+
+class PageCalibrator:
+    """Offers and runs the steps of ``calibrate all``.
+
+    Args:
+        clock: of the station.
+    """
+
+    def __init__(self, clock: "Clock") -> None:
+        self._clock = clock
+
+    async def offered(self, truck: "TruckClient") -> list[dict[str, Any]]:
+        """Return the steps that fit the robot, in their order; those that were never done are due."""
+        from monstertruckd.tools.calibrate.wizard import missing
+
+        config, known = await robot_config(truck), await _known(truck)
+        due = set(map(_id, missing(config, known)))
+        return [
+            {
+                "id": _id(run),
+                "name": run.name,
+                "rough": run.step.rough,
+                "doc": _sentence(run.wizard.doc),
+                "due": _id(run) in due,
+            }
+            for run in sequence()
+            if run.wizard.fits(config) and run.step.fits(config)
+        ]
+
+    async def measure(self, truck: "TruckClient", step: str, panel: PagePanel) -> Measured:
+        """Run a step.
+
+        Raises:
+            TruckError: there is no such step, or it ended without a result.
+        """
+        from monstertruckd.tools.calibrate.wizard import measure, save
+
+        run = next((run for run in sequence() if _id(run) == step), None)
+        if run is None:
+            raise InputError(f"{step}: no such calibration")
+        config, known = await robot_config(truck), await _known(truck)
+        result = await measure(wizard_of(run), truck, panel, self._clock, config, known)
+
+        async def saved() -> str:
+            return (await save(truck, result))[1]
+
+        return Measured(_rows(result, known.get(run.name)), result.measured, saved)
+
+
+def _id(run: WizardRun) -> str:
+    return f"{run.name}.{run.step.complete}"
+
+
+def _sentence(doc: str) -> str:
+    """The first paragraph, in one line."""
+    return " ".join(doc.partition("\n\n")[0].split())
+
+
+async def _known(truck: "TruckClient") -> "dict[str, Result]":
+    file = file_in(await truck.call(SHOW))
+    return {} if file is None else dict(file.results)
+
+
+def _rows(result: "Result", before: "Result | None") -> list[dict[str, Any]]:
+    """The estimates, each with its value of the run before."""
+    rows = []
+    for estimate in result.estimates:
+        old = None if before is None else before.estimate(estimate.name)
+        row = estimate.model_dump(
+            mode="json", include={"name", "unit", "meaning", "value", "low", "high", "grade", "samples"}
+        )
+        rows.append({**row, "before": None if old is None else old.value})
+    return rows
