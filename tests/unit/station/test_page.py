@@ -672,6 +672,7 @@ async def a_wizard_asks_and_its_result_is_accepted_beside_the_one_before(page: P
     await page.click("#tab-drive")
 
 
+@pytest.mark.timeout(300)
 async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path: Path):
     """All in one browser, for it takes seconds to start."""
     async with serving() as (station, _), chromium(tmp_path) as browser:
