@@ -87,7 +87,7 @@ class PagePanel:
             value = await self._answer
         finally:
             self._answer = self.question = None
-        shown = {True: "yes", False: "no"}[value] if question["kind"] == "confirm" else f"{value:g}"
+        shown = ("yes" if value else "no") if question["kind"] == "confirm" else f"{value:g}"
         self.say(f"{question['text']} {shown}")
         return value
 
@@ -121,7 +121,7 @@ class Calibration:
     def __init__(
         self, address: RobotAddress, program: str, clock: Clock, calibrator: Calibrator, viewer: Viewer
     ) -> None:
-        self._open = lambda: address.session(program, clock, TIMEOUT)
+        self._address, self._program, self._clock = address, program, clock
         self._calibrator, self._viewer = calibrator, viewer
         self._panel = PagePanel(self._show)
         self._step, self._phase, self._text = "", "idle", ""
@@ -145,9 +145,12 @@ class Calibration:
             ),
         )
 
+    def _session(self) -> TruckClient:
+        return self._address.session(self._program, self._clock, TIMEOUT)
+
     async def offer(self) -> list[dict[str, Any]]:
         """Return the wizards; raises TruckError as the robot does."""
-        async with self._open() as truck:
+        async with self._session() as truck:
             return await self._calibrator.offered(truck)
 
     def begin(self, step: str) -> None:
@@ -191,7 +194,7 @@ class Calibration:
 
     async def _run(self, step: str) -> None:
         try:
-            async with self._open() as truck:
+            async with self._session() as truck:
                 self._measured = await self._calibrator.measure(truck, step, self._panel)
                 self._decision = asyncio.get_running_loop().create_future()
                 self._enter("measured")

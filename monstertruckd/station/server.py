@@ -614,7 +614,7 @@ class _Browser:
             raise self._answered(command, InputError("recordings are being fetched already"))
         self._begin(self._replay(command))
 
-    def _answered(self, command: commands.AnyCommand, error: TruckError) -> TruckError:
+    def _answered(self, command: commands.AnyCommand | commands.Asked, error: TruckError) -> TruckError:
         """Report the error as the outcome of a command that has one, and return it."""
         if isinstance(command, commands.Asked):
             self.viewer.send(frames.refusal(command.id, error))
