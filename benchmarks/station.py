@@ -28,7 +28,7 @@ import numpy as np
 
 from monstertruckd.station.server import Place
 from monstertruckd.tools.demo.runs import free_endpoint
-from tests.daemon.browser_kit import CHROMIUM, chromium
+from tests.daemon.browser_kit import CHROMIUM, chromium, new_tab
 
 ROOT = Path(__file__).parents[1]
 GOALS = {
@@ -186,7 +186,7 @@ async def first_pictures(url: str, count: int) -> list[float]:
     with TemporaryDirectory() as folder:
         async with chromium(Path(folder)) as browser:
             for _ in range(count):
-                page = await (await browser.new_context()).new_page()
+                page = await new_tab(browser)
                 began = time.monotonic()
                 await page.goto(url)
                 await page.wait_for_selector("#authority[data-mode=disarmed]")

@@ -16,7 +16,7 @@ from pathlib import Path
 from playwright.async_api import Browser, Page
 
 from monstertruckd.tools.demo.runs import free_endpoint
-from tests.daemon.browser_kit import chromium, station
+from tests.daemon.browser_kit import chromium, new_tab, station
 from tests.daemon.wall_kit import ROOT, Robot, end, robot
 
 HERE = Path(__file__).parent
@@ -72,7 +72,7 @@ async def tried(folder: Path) -> None:
         while (found := re.search(r"http://127[0-9.:]+/", said.read_text())) is None:
             await asyncio.sleep(0.1)
         async with chromium(folder) as browser:
-            page = await browser.new_page(viewport=DESK)
+            page = await new_tab(browser, viewport=DESK)
             await page.goto(found[0])
             await page.wait_for_selector("#map[data-drawn=true]", timeout=60_000)
             await page.click("#tab-tryout")
@@ -88,7 +88,7 @@ async def tried(folder: Path) -> None:
 
 async def asking(browser: Browser, url: str, theme: str, view: str, size: dict[str, int]) -> None:
     """Views of a robot that is there: tasks, settings, recordings, a replay, a path that is drawn."""
-    page = await (await browser.new_context(viewport=size, color_scheme=theme, has_touch=bool(view))).new_page()
+    page = await new_tab(browser, viewport=size, color_scheme=theme, has_touch=bool(view))
     page.set_default_timeout(60_000)
     await page.goto(url)
     await page.wait_for_selector("html[data-ready=true]")
@@ -126,7 +126,7 @@ async def asking(browser: Browser, url: str, theme: str, view: str, size: dict[s
 
 async def pictures(made: Robot, browser: Browser, url: str, theme: str, view: str, size: dict[str, int]) -> None:
     """All tabs of one theme and size, during one replay."""
-    page = await (await browser.new_context(viewport=size, color_scheme=theme, has_touch=bool(view))).new_page()
+    page = await new_tab(browser, viewport=size, color_scheme=theme, has_touch=bool(view))
     await page.goto(url)
     await page.wait_for_selector("html[data-ready=true]")
     for _ in range(4):

@@ -110,6 +110,7 @@ def facts(config: dict[str, Any], versions: dict[str, str]) -> str:
         geometry=config.get("geometry"),
         gate={name: config["gate"][name] for name in ("speed", "reverse_speed", "angle", "tilt", "leases")},
         devices=sorted(devices),
+        lens=(devices.get("camera") or {}).get("driver", {}).get("lens"),
         goals=(config.get("planner") or {}).get("mode", "ros2") != "ros2",
         mapping=bool(config.get("slam") or (config.get("planner") or {}).get("map")),
         explores=config.get("explorer") is not None,

@@ -56,9 +56,16 @@ async def chromium(folder: Path, *flags: str) -> AsyncIterator[Browser]:
             await browser.close()
 
 
+async def new_tab(browser: Browser, **context: Any) -> Page:
+    """A tab of somebody who has been here before: the page does not begin with its guide."""
+    page = await (await browser.new_context(**context)).new_page()
+    await page.add_init_script("localStorage.guided ??= 'yes'")
+    return page
+
+
 async def opened(browser: Browser, url: str, **context: Any) -> Page:
     """A tab with the page, as soon as it shows the gate's state; errors of its scripts fail the test."""
-    page = await (await browser.new_context(**context)).new_page()
+    page = await new_tab(browser, **context)
     page.set_default_timeout(PATIENCE)
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))

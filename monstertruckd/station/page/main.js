@@ -1,9 +1,12 @@
+import { CameraView } from "./camera.js";
 import { Calibration } from "./calibration.js";
 import { Drive } from "./drive.js";
 import { FleetView } from "./fleet.js";
 import { MapView } from "./map.js";
+import { commandLine } from "./commandline.js";
 import { element, Panels } from "./panels.js";
 import { Plots } from "./plots.js";
+import { Guide } from "./guide.js";
 import { ReplayBar } from "./replay.js";
 import { Link } from "./socket.js";
 import { Tryout } from "./tryout.js";
@@ -63,6 +66,8 @@ const panels = new Panels(link);
 const fleet = new FleetView(link, map, chosen);
 new ReplayBar(link, chosen); // first: the others look at what it says of the page
 new Work(link, { outcome, order, stopDriving, letPlannersDrive, watch: chosen });
+new Guide();
+new CameraView(link, map);
 new Calibration(link, { outcome });
 const plots = new Plots(link, { outcome, pointed });
 
@@ -73,6 +78,14 @@ function pointed(at) {
 }
 
 const tryout = new Tryout(link, { outcome, aim: (on) => aim(on, "tryout.hint") });
+
+// What a press of a button does, as a command line: who has seen it can write a script.
+link.onAsk = (command) => {
+  const line = commandLine(command, link.robot);
+  if (line === null) return;
+  byId("command").hidden = false;
+  byId("command").lastElementChild.textContent = line;
+};
 
 link.on("robots", ({ names }) => {
   const select = byId("robots");

@@ -259,6 +259,7 @@ export class Panels {
     const image = byId("camera");
     const before = image.src;
     image.src = URL.createObjectURL(picture);
+    if (!byId("camera-view").hidden) byId("camera-picture").src = image.src;
     if (before) URL.revokeObjectURL(before);
     image.alt = words("camera");
     image.hidden = false;

@@ -115,6 +115,7 @@ export class Link {
   /** Send and wait for the outcome. */
   ask(command) {
     const id = ++this.number;
+    this.onAsk?.(command);
     return new Promise((settle) => {
       this.waiting.set(id, settle);
       if (!this.send({ ...command, id })) {

@@ -6,6 +6,7 @@ export async function loadWords() {
   table = await (await fetch("/strings.json")).json();
   for (const element of document.querySelectorAll("[data-s]")) element.textContent = words(element.dataset.s);
   for (const element of document.querySelectorAll("[data-aria]")) element.setAttribute("aria-label", words(element.dataset.aria));
+  for (const element of document.querySelectorAll("[data-alt]")) element.alt = words(element.dataset.alt);
   for (const element of document.querySelectorAll("[data-hint]")) element.placeholder = words(element.dataset.hint);
   for (const element of document.querySelectorAll("[data-label]")) {
     element.setAttribute("aria-label", words(element.dataset.label));

@@ -3,15 +3,19 @@
 import asyncio
 import json
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
 import pytest
 from playwright.async_api import Page, expect
+from typer.main import get_command
 
+from monstertruck_schemas.body import LensConfig
 from monstertruck_schemas.event import Cause, Stop
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode, GateState
+from monstertruckd.tools.cli.main import app
 from tests.daemon.browser_kit import NEEDS_CHROMIUM, chromium
 from tests.unit.station.test_server import serving
 
@@ -31,6 +35,7 @@ window.WebSocket = class {
   }
 };
 window.answers = true;
+localStorage.guided ??= "yes";
 window.say = (...messages) => messages.forEach((m) => window.socket.onmessage({ data: JSON.stringify(m) }));
 """
 """Instead of the browser's WebSocket: what the page sends is kept, what the station would say is said by the test."""
@@ -672,6 +677,148 @@ async def a_wizard_asks_and_its_result_is_accepted_beside_the_one_before(page: P
     await page.click("#tab-drive")
 
 
+LENS = LensConfig().model_dump()
+PROJECTED = """
+async (lens) => {
+  const { projected, relative } = await import("/page/geometry.js");
+  const level = { translation: [0.18, 0, 0.25], rotation: [0, 0, 0, 1] };
+  const down = { translation: [0, 0, 1], rotation: [0, Math.sin(Math.PI / 4), 0, Math.cos(Math.PI / 4)] };
+  return {
+    level: [[1.18, 0, 0.25], [1.18, 0, 0], [1.18, 0.5, 0.25], [0, 0, 0]].map((point) => projected(point, level, lens)),
+    down: projected([0, 0.1, 0], down, lens),
+    barrel: projected([1.18, 0.5, 0.25], level, { ...lens, k1: -0.2 }),
+    relative: relative([1, 2, Math.PI / 2], [1, 4, Math.PI]),
+  };
+}
+"""
+
+
+async def the_path_is_drawn_into_the_large_picture_of_the_camera(page: Page) -> None:
+    found = await page.evaluate(PROJECTED, LENS)
+    assert found["level"][0] == pytest.approx([0.5, 0.5])
+    assert found["level"][1] == pytest.approx([0.5, 0.5 + 522.2 * 0.25 / 480]), "the ground is below the axis"
+    assert found["level"][2] == pytest.approx([0.5 - 522.2 * 0.5 / 640, 0.5]), "left is left"
+    assert found["level"][3] is None, "behind the lens"
+    assert found["down"] == pytest.approx([0.5 - 522.2 * 0.1 / 640, 0.5]), "a camera that looks down"
+    assert found["barrel"][0] == pytest.approx(0.5 - 522.2 * 0.5 * (1 - 0.2 * 0.25) / 640)
+    assert found["relative"] == pytest.approx([2.0, 0.0, 1.5708], abs=1e-4)
+
+    tree = {"camera": ["base", 0.18, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0]}
+    await say(page, {**FACTS, "lens": LENS}, {"kind": "transforms", "tree": tree})
+    pose = {"stamp": 10**9, "pose": [0.0, 0.0, 0.0], "twist": [0.0, 0.0, 0.0], "age": 0.0}
+    poses = [value for i in range(30) for value in (i / 10, 0.0, 0.0)]
+    await say(page, {"kind": "pose", "frame": "map", **pose})
+    await say(page, {"kind": "path", "frame": "map", "name": "route", "poses": poses, "directions": []})
+    await page.evaluate(PICTURE)
+    await page.click("#tab-truck")
+    await page.click("#camera-large")
+    await page.wait_for_function("Number(document.querySelector('#camera-lines').dataset.drawn) > 60")
+    box, view = await page.locator("#camera-lines").bounding_box(), await page.locator("#view").bounding_box()
+    assert box is not None
+    assert view is not None
+    assert box["width"] / box["height"] == pytest.approx(4 / 3, rel=0.02)
+    assert box["width"] == pytest.approx(view["width"], abs=4) or box["height"] == pytest.approx(view["height"], abs=4)
+    await page.click("#camera-close")
+    await expect(page.locator("#map")).to_be_visible()
+    await page.click("#tab-drive")
+
+
+PICTURE = """
+async () => {
+  const canvas = Object.assign(document.createElement("canvas"), { width: 64, height: 48 });
+  canvas.getContext("2d").fillRect(0, 0, 64, 48);
+  const blob = await new Promise((done) => canvas.toBlob(done, "image/jpeg"));
+  const jpeg = new Uint8Array(await blob.arrayBuffer());
+  const head = new TextEncoder().encode(JSON.stringify({ kind: "camera", sequence: 1, stamp: 1e9 }));
+  const frame = new Uint8Array(4 + head.length + jpeg.length);
+  new DataView(frame.buffer).setUint32(0, head.length, true);
+  frame.set(head, 4);
+  frame.set(jpeg, 4 + head.length);
+  window.socket.onmessage({ data: frame.buffer });
+}
+"""
+
+
+COMMANDS: list[tuple[dict[str, Any], str | None]] = [
+    ({"do": "order", "order": "arm", "hold": False}, "arm"),
+    ({"do": "order", "order": "arm", "hold": True}, "arm --hold"),
+    ({"do": "order", "order": "estop"}, "estop"),
+    ({"do": "order", "order": "stop"}, None),
+    ({"do": "goal", "goal": [1, -2.5, 1.5708], "via": [[0.5, 1]]}, "goto --via 0.5,1 -- 1 -2.5 90"),
+    ({"do": "start_path", "path": "loop"}, "path loop"),
+    ({"do": "track_file", "name": "my race.csv", "text": "", "closed": True}, "track 'my race.csv' --closed"),
+    ({"do": "explore", "order": "start"}, "explore"),
+    ({"do": "explore", "order": "stop"}, "explore --stop"),
+    ({"do": "mission", "order": "start", "text": ""}, "mission run FILE"),
+    ({"do": "mission", "order": "resume", "moved": True}, "mission run --resume --moved"),
+    ({"do": "mission", "order": "stop"}, "mission stop"),
+    ({"do": "behave", "order": "start", "behaviour": "wall"}, "behave start wall"),
+    ({"do": "behave", "order": "stop", "behaviour": "wall"}, "behave stop"),
+    ({"do": "set", "key": "gate.speed", "value": 0.1, "save": True}, "set --save gate.speed 0.1"),
+    ({"do": "set", "key": "gate.speed", "value": -1, "save": False}, "set gate.speed -- -1"),
+    ({"do": "settings"}, "get"),
+    ({"do": "calibrate", "order": "start", "step": "battery.gain"}, "calibrate battery"),
+    ({"do": "calibrate", "order": "list"}, None),
+    ({"do": "hand_over", "to": "ann"}, None),
+]
+LINES = """
+async ([commands, robot]) => {
+  const { commandLine } = await import("/page/commandline.js");
+  return commands.map((command) => commandLine(command, robot));
+}
+"""
+
+
+def understood(line: str) -> None:
+    """Have the program parse a command line, without running it."""
+    program, *rest = shlex.split(line)
+    assert program == "monstertruckd"
+    command: Any = get_command(app)
+    context = command.make_context(program, [], resilient_parsing=True)
+    while hasattr(command, "commands"):
+        name, *rest = rest
+        command = command.commands[name]
+        if not hasattr(command, "commands"):
+            command.make_context(name, rest, parent=context)
+
+
+async def what_is_pressed_is_shown_as_a_command_line(page: Page) -> None:
+    given = [command for command, _ in COMMANDS]
+    lines = await page.evaluate(LINES, [given, "truck"])
+    assert lines == [None if expected is None else f"monstertruckd {expected}" for _, expected in COMMANDS]
+    named = await page.evaluate(LINES, [given, "rover"])
+    for line in filter(None, (*lines, *named)):
+        understood(line)
+    assert named[0] == "monstertruckd arm --robot rover"
+    await say(page, gate_says(GateMode.ARMED))
+    await page.click("#disarm")
+    await expect(page.locator("#command code")).to_have_text("monstertruckd disarm")
+
+
+async def the_guide_help_and_keys_explain_the_page_and_never_cover_the_emergency_stop(page: Page) -> None:
+    await expect(page.locator("#guide")).to_be_hidden()
+    await page.focus("#map")
+    await page.keyboard.press("?")
+    await expect(page.locator("#keys kbd")).to_contain_text(["Space", "Esc", "W A S D"])
+    await page.click("#guide-again")
+    await expect(page.locator("#keys")).to_be_hidden()
+    pointed = []
+    for step in range(1, 6):
+        await expect(page.locator("#guide-count")).to_have_text(f"{step} of 5")
+        pointed.append(await page.locator(".pointed-at").get_attribute("id"))
+        await page.click("#estop", trial=True)
+        await page.click("#guide-next")
+    assert pointed == ["map", "authority", None, "tool-goal", "estop"]
+    await expect(page.locator("#guide")).to_be_hidden()
+    assert await page.locator(".pointed-at").count() == 0
+    assert await page.evaluate("localStorage.guided") == "yes"
+    await page.click("#pane-drive .help summary")
+    await expect(page.locator("#pane-drive .help p")).to_contain_text("letting go stops the robot")
+    await page.click("#pane-drive .help summary")
+    panes = await page.locator("[role=tabpanel]").count()
+    assert await page.locator("[role=tabpanel] > .help").count() == panes, "each has its help"
+
+
 @pytest.mark.timeout(300)
 async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path: Path):
     """All in one browser, for it takes seconds to start."""
@@ -709,5 +856,8 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await values_over_time_are_kept_for_ten_minutes_and_found_by_their_time(page)
         await numbers_are_plotted_pinned_and_pointed_at(page)
         await a_wizard_asks_and_its_result_is_accepted_beside_the_one_before(page)
+        await the_path_is_drawn_into_the_large_picture_of_the_camera(page)
+        await what_is_pressed_is_shown_as_a_command_line(page)
+        await the_guide_help_and_keys_explain_the_page_and_never_cover_the_emergency_stop(page)
         await the_link_that_failed_is_named_with_its_age(page)
         assert errors == []

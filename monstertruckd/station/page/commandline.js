@@ -1,0 +1,28 @@
+// The command line that does the same as a command of the page. Pure.
+
+const shown = (value) => String(Number(value.toFixed(3)));
+const degrees = (radians) => shown((radians * 180) / Math.PI);
+
+const LINES = {
+  order: ({ order, hold }) => (order === "stop" ? null : [order, hold && order === "arm" && "--hold"]),
+  goal: ({ goal: [x, y, yaw], via = [] }) => ["goto", ...via.flatMap((place) => ["--via", place.map(shown).join(",")]), "--", shown(x), shown(y), degrees(yaw)],
+  start_path: ({ path }) => ["path", path],
+  track_file: ({ name, closed }) => ["track", name, closed && "--closed"],
+  explore: ({ order }) => ["explore", order === "stop" && "--stop"],
+  mission: ({ order, moved }) => (order === "stop" ? ["mission", "stop"] : ["mission", "run", order === "start" ? "FILE" : "--resume", moved && "--moved"]),
+  behave: ({ order, behaviour }) => ["behave", order, order === "start" && behaviour],
+  set: ({ key, value, save }) => ["set", save && "--save", key, ...(typeof value === "number" && value < 0 ? ["--"] : []), String(value)],
+  settings: () => ["get"],
+  calibrate: ({ order, step }) => (order === "start" ? ["calibrate", step.split(".")[0]] : null),
+};
+
+/** The words of a command as a shell takes them; null where no command line does the same. */
+export function commandLine(command, robot) {
+  const words = LINES[command.do]?.(command)?.filter(Boolean);
+  if (!words) return null;
+  const [name, ...rest] = words;
+  const group = ["mission", "behave", "calibrate"].includes(name) ? 1 : 0;
+  const named = robot && robot !== "truck" ? ["--robot", robot] : [];
+  const quoted = (word) => (/^[\w.,/:@+=-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`);
+  return ["monstertruckd", name, ...rest.slice(0, group), ...named, ...rest.slice(group)].map(quoted).join(" ");
+}
