@@ -118,7 +118,7 @@ async def test_what_is_discarded_or_cancelled_is_not_saved():
     assert wizards.saved == 0
 
 
-async def test_a_browser_that_leaves_ends_its_wizard_and_a_failure_is_told():
+async def test_a_browser_that_leaves_ends_its_wizard_and_a_failure_is_shown():
     wizards = Wizards()
     run, viewer = calibration(wizards)
     run.begin("battery.gain")
