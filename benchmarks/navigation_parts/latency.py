@@ -12,7 +12,7 @@ import numpy as np
 from navigation_parts import Options, Part
 from navigation_parts.tracking import RESPONSES, built_in, drive, from_data
 
-KINDS = ("stanley", "lqr", "mpc")
+KINDS = ("lqr", "mpc")
 SPEEDS = (0.5, 1.0, 1.5)
 CONFIGURED: dict[str, dict[str, Any]] = {
     "nothing": {"dead_time": None, "lag": None},
@@ -55,5 +55,5 @@ def run(options: Options) -> Part:
         goal = BOUND if speed == 1.0 else None
         part.add(f"{kind}.{name}.{speed}.over_pure_pursuit", float(np.max(found)), goal)
     for kind, values in right.items():
-        part.add(f"{kind}.right.1.0.rms_mm", float(np.median(values)), 2.5 if kind in ("lqr", "mpc") else None)
+        part.add(f"{kind}.right.1.0.rms_mm", float(np.median(values)), 2.5)
     return part

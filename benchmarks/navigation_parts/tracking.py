@@ -42,7 +42,7 @@ PEERS = {
     ("figure_eight", 1.0, "lag"): (11.0, 28.0),
 }
 """Best RMS and best worst error of PythonRobotics, mm."""
-MUST_ARRIVE = {"pure_pursuit", "stanley", "fuzzy", "lqr", "mpc"}
+MUST_ARRIVE = {"pure_pursuit", "fuzzy", "lqr", "mpc"}
 """The published fuzzy rules are here for comparison only."""
 ARRIVED = 0.05
 """Distance from the course's end, m: as far as every run begins from the course."""
@@ -127,7 +127,6 @@ class Result:
 
 KINDS = {
     "pure_pursuit": {"kind": "pure_pursuit", "lookahead": 0.6, "min_lookahead": 0.2, "lookahead_time": 0.4},
-    "stanley": {"kind": "stanley"},
     "fuzzy_published": {"kind": "fuzzy", "rules": "published"},
     "fuzzy": {"kind": "fuzzy"},
     "lqr": {"kind": "lqr"},

@@ -57,5 +57,5 @@ def test_it_is_listed_and_its_settings_are_checked(project: Path, target: Path):
     bad.write_text((project / "robot.yaml").read_text().replace("length:", "lenght:"))
     with pytest.raises(AssertionError, match=r"bad\.yaml:6: tracker\.lenght: unknown key \(did you mean length\?\)"):
         run_with(target, "config", "show", str(bad))
-    with pytest.raises(AssertionError, match=r"robot\.yaml:4: tracker.*'linear'.*'pure_pursuit', 'stanley'"):
+    with pytest.raises(AssertionError, match=r"robot\.yaml:4: tracker.*'linear'.*'pure_pursuit', 'fuzzy'"):
         run_with(project, "config", "show", str(project / "robot.yaml"))

@@ -166,11 +166,6 @@ class AxleErrorEstimator:
         self._sums: deque[_Sums] = deque(maxlen=KEPT)
         self._begin: _Mark | None = None
 
-    def curvature_deviation(self, angles: Angles) -> float:
-        """Return the standard deviation of the curvature for requested ``angles`` (1/m)."""
-        by = np.array((angles[0], 1.0, 0.0, -angles[1], -1.0, 0.0)) / self._geometry.wheelbase
-        return math.sqrt(float(by @ self.covariance @ by))
-
     def observe(self, motion: AxleMotion, delay_deviation: float) -> bool:
         """Compare the motion since the last interval with the requests; return whether the estimate changed.
 

@@ -18,12 +18,6 @@ TRACKERS: Final = Catalog(
         doc="Arc through a point ahead on the path",
     ),
     Plugin(
-        name="stanley",
-        settings="monstertruck_planners.track.config:StanleyConfig",
-        implementation="monstertruck_planners.track.stanley:Stanley",
-        doc="Feedback of the leading axle's distance from the path",
-    ),
-    Plugin(
         name="fuzzy",
         settings="monstertruck_planners.track.config:FuzzyConfig",
         implementation="monstertruck_planners.track.fuzzy:Fuzzy",

@@ -106,18 +106,6 @@ class PurePursuitConfig(TrackerConfig):
         return self.lookahead
 
 
-class StanleyConfig(TrackerConfig):
-    """Stanley controller: steers the leading axle back to the path."""
-
-    kind: Literal["stanley"]
-    gain: Positive = 2.0
-    """Decay rate of the leading axle's lateral error, 1/s, while the speed allows."""
-    softening: Positive = 0.1
-    """Term added to the speed, m/s: calms the truck at low speed."""
-    heading_gain: Positive = 6.0
-    """Turn per metre and radian if the leading axle cannot steer, 1/m."""
-
-
 class FuzzyConfig(TrackerConfig):
     """Fuzzy controller of rsband_local_planner: its rules as published, or with their mistakes corrected."""
 

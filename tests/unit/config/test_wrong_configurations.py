@@ -120,7 +120,7 @@ WRONG = (
     ("planner: {map: .}", "planner.map: no saved map in this folder: "),
     ("path: {closed: true, file: 3}", "path.file: input should be a valid string, found 3"),
     ("tracker: {kind: crystal_ball}", "tracker: no kind 'crystal_ball'; expected one of"),
-    ("tracker: {kind: stanley, lookahead: 1}", "tracker.lookahead: unknown key; known here"),
+    ("tracker: {kind: lqr, lookahead: 1}", "tracker.lookahead: unknown key; known here"),
     ("tracker: {goal_tolerance: -0.1}", "tracker.goal_tolerance: input should be greater than 0, found -0.1"),
     ("tracker: {speed: 1e400}", "tracker.speed: input should be a finite number, found inf"),
     ("planner: {route: {kind: teleport}}", "planner.route: no kind 'teleport'; expected one of"),

@@ -80,7 +80,6 @@ def test_a_compass_alone_shows_the_turn_and_leaves_the_axles_uncertain():
     assert found.state[1] - found.state[4] == pytest.approx(0.05, abs=0.005)
     assert deviations(found)[[0, 3]].min() > 0.05
     assert deviations(found)[[1, 4]].min() > 0.02
-    assert found.curvature_deviation((0.3, -0.3)) < 0.1
 
 
 def test_poses_that_come_from_the_requests_teach_nothing():
@@ -130,7 +129,7 @@ def test_requests_are_the_inverse_of_wheels(grip):
 
 
 @pytest.mark.parametrize("steering", ["front", "rear", "counter", "hybrid"])
-@pytest.mark.parametrize("kind", ["stanley", "lqr", "mpc"])
+@pytest.mark.parametrize("kind", ["lqr", "mpc"])
 def test_a_truck_out_of_trim_follows_its_path_once_it_has_driven(kind, steering):
     """Both axles are off; one that the way of steering leaves alone stays off, the other makes up for it."""
     route = path(figure_eight(5.5, 960), closed=True)

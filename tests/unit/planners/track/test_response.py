@@ -19,7 +19,7 @@ from tests.unit.planners.kit import STEERING, Follower, figure_eight, path, stra
 RATE = 5.0
 PERIOD = 0.05
 RESPONSES = [(0.0, 0.0), (0.05, 0.0), (0.0, 0.15), (0.05, 0.1), (0.15, 0.0), (0.1, 0.1)]
-MODELS = ["pure_pursuit", "stanley", "lqr", "mpc"]
+MODELS = ["pure_pursuit", "lqr", "mpc"]
 """Trackers whose error is made by the delay; that of fuzzy is made by its rules."""
 
 

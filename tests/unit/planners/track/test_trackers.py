@@ -18,7 +18,7 @@ from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.kit import STEERING, TRACKER, Follower, circle, figure_eight, path, straight
 
 KINDS = list(TRACKERS)
-EXACT = ["stanley", "lqr", "mpc"]
+EXACT = ["lqr", "mpc"]
 MODES = ["front", "rear", "counter", "hybrid"]
 
 
@@ -242,7 +242,7 @@ def test_a_wrong_heading_is_put_right_while_the_path_crabs(kind):
     assert abs(truck.log[-1].cross_track) < 0.02
 
 
-@pytest.mark.parametrize("kind", ["lqr", "mpc"])
+@pytest.mark.parametrize("kind", EXACT)
 def test_where_the_curve_changes_sides_the_truck_waits_for_its_axles(kind):
     turn = MotionPath(np.zeros(3), np.array([[1.0, 2.0, 0.0], [0.3, -2.0, 0.0]]))
     truck = Follower(path(turn.sample(0.05).poses[:, :2]), kind=kind, steering_rate=0.5, speed=0.2)
@@ -262,7 +262,7 @@ def test_hybrid_corrects_sideways_with_less_turning(kind):
     assert turned["hybrid"] < 0.5 * turned["counter"]
 
 
-@pytest.mark.parametrize("kind", ["stanley", "lqr", "mpc"])
+@pytest.mark.parametrize("kind", EXACT)
 def test_knowing_dead_time_and_lag_helps(kind):
     found = []
     for known in (0.0, 0.15):
