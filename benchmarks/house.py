@@ -82,8 +82,8 @@ PATH_TYPE: Final = re.compile(
 POSE_TYPE: Final = re.compile(r"_?(Pose|Pose2|Pose2D|Twist|Twist2|Vector)")
 MESSAGES: Final = "schemas/monstertruck_schemas/"
 EXAMPLES: Final = {
-    "tracker": r"[Ss]tanley",
-    "explorer": r"TourConfig|:Tour\b|class Tour\b",
+    "tracker": r"[Ff]uzzy",
+    "explorer": r"AuthorConfig|:Author\b|class Author\b",
 }
 """A present example of each kind for which no trial is written, by the names that belong to it alone."""
 PLACES: Final = {"wizard": 1, "tracker": 3, "motor_controller": 1, "body": 2, "task": 1, "sensor_role": 4}

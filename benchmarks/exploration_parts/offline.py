@@ -9,11 +9,12 @@ from exploration_parts.arena import BODY, Arena
 from exploration_parts.rover import DECIDE, Rover, Run
 from monstertruck_estimation.slam.service import grid_message
 from monstertruck_estimation.slam.worker_io import GridPatch
-from monstertruck_planners.explore.api import ExplorationView, Frontier, Option, Remembered
+from monstertruck_planners.explore.api import ExplorationView, Remembered
 from monstertruck_planners.explore.config import NearestConfig
 from monstertruck_planners.explore.exchange import ExploreSetup
 from monstertruck_planners.explore.frontier import FrontierMap
-from monstertruck_planners.explore.kernels import sees, short_tour
+from monstertruck_planners.explore.kernels import sees
+from monstertruck_planners.route.heuristic import UNIT, UNREACHED
 
 SPACING = 0.8
 """Metres between places that are compared."""
@@ -34,6 +35,22 @@ def _seen(cells, places, points, reach):  # type: ignore[no-untyped-def] # noqa:
     return result
 
 
+class KnownWorld(ExplorationView):
+    """The whole map, with the path lengths between its places."""
+
+    def path_lengths_between(self, places: list[tuple[float, float]]) -> np.ndarray:
+        """Return the path lengths between all places (m), shape (n, n); inf if no path is known."""
+        at = [self._open_cell(place) for place in places]
+        result = np.full((len(places), len(places)), np.inf)
+        for i, place in enumerate(places):
+            if (to_go := self._flood(place)) is None:
+                continue
+            for j, there in enumerate(at):
+                if there is not None and (cost := int(to_go.cost[there])) < UNREACHED:
+                    result[i, j] = cost * self._cell / UNIT
+        return np.minimum(result, result.T)
+
+
 def offline_tour(arena: Arena, reach: float, seed: int) -> Run:
     """Drive it; coverage is judged as that of the explorers, by what the robot's own scans show."""
     rover = Rover(arena, NearestConfig(reach=reach), seed)
@@ -42,7 +59,7 @@ def offline_tour(arena: Arena, reach: float, seed: int) -> Run:
     grid = grid_message(GridPatch(truth, arena.origin, arena.resolution), 0, 0)
     assert rover.setup is not None
     setup = ExploreSetup(NearestConfig(reach=reach), BODY, rover.setup.radius, 0.04)
-    view = ExplorationView(FrontierMap(grid), setup, rover.home, (), (), Remembered())
+    view = KnownWorld(FrontierMap(grid), setup, rover.home, (), (), Remembered())
     places = _places(arena, view)
     origin = np.array(arena.origin)
     points = rover.truth[:: max(len(rover.truth) // 12_000, 1)]
@@ -50,8 +67,7 @@ def offline_tour(arena: Arena, reach: float, seed: int) -> Run:
         truth, (places - origin) / arena.resolution, (points - origin) / arena.resolution, reach / arena.resolution
     )
     chosen = _cover(seen)
-    options = [Option(Frontier(places[:1], (0.0, 0.0), 0.0), (*places[i], 0.0), 0.0, 0.0, 0.0) for i in chosen]
-    distance = np.minimum(view.path_lengths_between(options), 1e4)
+    distance = np.minimum(view.path_lengths_between([(float(x), float(y)) for x, y in places[chosen]]), 1e4)
     first = np.array([view.path_length_to((x, y)) or 1e4 for x, y in places[chosen]])
     order = [chosen[k] for k in short_tour(distance, first)] if len(chosen) > 1 else list(chosen)
     shown = {i: points[seen[i]] for i in chosen}
@@ -116,3 +132,79 @@ def _unknown(rover: Rover, points: np.ndarray) -> float:
     known = np.zeros(len(points), np.bool_)
     known[inside] = patch.cells[row[inside], column[inside]] >= 0
     return 1.0 - float(known.mean()) if len(points) else 0.0
+
+
+@njit(cache=True)
+def short_tour(distance: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Order of visiting n places on a short tour from the start, with a free end.
+
+    The nearest-neighbour tour, improved by reversing and moving parts while that shortens it (2-opt, Or-opt;
+    G. A. Croes 1958, I. Or 1976).
+
+    Args:
+        distance: distances between places, shape (n, n), symmetric.
+        first: distances from the start, shape (n,).
+    """
+    n = len(first)
+    order = np.empty(n, np.int64)
+    used = np.zeros(n, np.bool_)
+    for k in range(n):
+        best, least = -1, np.inf
+        for i in range(n):
+            if not used[i]:
+                d = first[i] if k == 0 else distance[order[k - 1], i]
+                if d < least:
+                    best, least = i, d
+        order[k] = best
+        used[best] = True
+    for _ in range(60):
+        if not (_reversed_parts(distance, first, order) | _moved_parts(distance, first, order)):
+            break
+    return order
+
+
+@njit(cache=True)
+def _reversed_parts(distance: np.ndarray, first: np.ndarray, order: np.ndarray) -> bool:
+    """Reverse every part of a tour if that shortens the tour; return whether a part was reversed."""
+    n, improved = len(order), False
+    for i in range(n):
+        for j in range(i + 1, n):
+            here, there = order[i], order[j]
+            old = first[here] if i == 0 else distance[order[i - 1], here]
+            new = first[there] if i == 0 else distance[order[i - 1], there]
+            if j < n - 1:
+                old += distance[there, order[j + 1]]
+                new += distance[here, order[j + 1]]
+            if new < old - 1e-9:
+                order[i : j + 1] = order[i : j + 1][::-1].copy()
+                improved = True
+    return improved
+
+
+@njit(cache=True)
+def _moved_parts(distance: np.ndarray, first: np.ndarray, order: np.ndarray) -> bool:
+    """Move parts of up to three places if that shortens the tour; return whether a part was moved."""
+    n, improved = len(order), False
+    trial, least = order.copy(), tour_length(distance, first, order)
+    for length in range(1, min(4, n)):
+        for i in range(n - length + 1):
+            part = order[i : i + length].copy()
+            rest = np.concatenate((order[:i], order[i + length :]))
+            for j in range(len(rest) + 1):
+                trial[:j] = rest[:j]
+                trial[j : j + length] = part
+                trial[j + length :] = rest[j:]
+                there = tour_length(distance, first, trial)
+                if there < least - 1e-9:
+                    least, improved = there, True
+                    order[:] = trial
+    return improved
+
+
+@njit(cache=True)
+def tour_length(distance: np.ndarray, first: np.ndarray, order: np.ndarray) -> float:
+    """Length of a tour; see ``short_tour``."""
+    total = first[order[0]]
+    for k in range(1, len(order)):
+        total += distance[order[k - 1], order[k]]
+    return float(total)

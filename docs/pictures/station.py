@@ -34,7 +34,7 @@ EXPLORING = {
         "map_period": 2.0,
         "grid": {"passed": 5.6, "free_footprint": True},
     },
-    "explorer": {"kind": "tour"},
+    "explorer": {"kind": "information"},
     "odometry": {"start": {"x": 1.0, "y": 3.95, "yaw": 0.0}},
     "sim": {"world": {"map": "rooms"}},
 }

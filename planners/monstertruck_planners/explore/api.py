@@ -15,7 +15,7 @@ from monstertruck_planners.explore.catalog import EXPLORERS
 from monstertruck_planners.explore.config import ExplorerConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, Point, Viewpoint
 from monstertruck_planners.explore.frontier import FrontierMap
-from monstertruck_planners.explore.kernels import far_from_obstacles, joined_cells, new_areas, shares_seen
+from monstertruck_planners.explore.kernels import far_from_obstacles, new_areas, shares_seen
 from monstertruck_planners.goals.plan_step import ASSUMED_FREE, standing_free
 from monstertruck_planners.route.api import RouteCosts, RouteMap, Vehicle
 from monstertruck_planners.route.config import DriveCosts
@@ -152,8 +152,7 @@ class ExplorationView:
         self._costs = RouteCosts.of(vehicle, DriveCosts(margin=setup.margin))
         self._cell = route_map.coarse_cell
         self._cell_cost = route_map.cell_costs(self._costs)
-        self._to_go = self._flood(self._cell_cost, self._cell, self.pose[:2])
-        self._rough: NDArray[np.int16] | None = None
+        self._to_go = self._flood(self.pose[:2])
         if self._to_go is not None:
             self.options = self._find_options(self._to_go)
 
@@ -163,7 +162,7 @@ class ExplorationView:
         """Return the path length to a place (m), with a penalty in narrow places; None if no path is known."""
         if self._to_go is None:
             return None
-        at = self._open_cell(self._cell_cost, self._cell, place)
+        at = self._open_cell(place)
         cost = UNREACHED if at is None else int(self._to_go.cost[at])
         return None if cost >= UNREACHED else cost * self._cell / UNIT
 
@@ -171,36 +170,20 @@ class ExplorationView:
         """Return whether the robot can stand at each pose; poses of shape (n, 3), result of shape (n,)."""
         return np.asarray(self._route_map.field.free(self.setup.footprint, poses, self.setup.margin), np.bool_)
 
-    def path_lengths_between(self, options: list[Option]) -> Array:
-        """Return the path lengths between all options (m), shape (n, n); inf if no path is known."""
-        if self._rough is None:
-            self._rough = joined_cells(self._cell_cost)
-        cell = 2 * self._cell
-        at = [self._open_cell(self._rough, cell, option.pose[:2]) for option in options]
-        result = np.full((len(options), len(options)), np.inf)
-        for i, option in enumerate(options):
-            if (to_go := self._flood(self._rough, cell, option.pose[:2])) is None:
-                continue
-            for j, there in enumerate(at):
-                if there is not None and (cost := int(to_go.cost[there])) < UNREACHED:
-                    result[i, j] = cost * cell / UNIT
-        both: Array = np.minimum(result, result.T)
-        return both
-
-    def _flood(self, cell_cost: NDArray[np.int16], cell: float, place: Point) -> CostToGo | None:
-        at = self._open_cell(cell_cost, cell, place)
+    def _flood(self, place: Point) -> CostToGo | None:
+        at = self._open_cell(place)
         if at is None:
             return None
-        to_go = cost_to_go(cell_cost, cell, at, at, 0, math.inf)
+        to_go = cost_to_go(self._cell_cost, self._cell, at, at, 0, math.inf)
         complete(to_go)
         return to_go
 
-    def _open_cell(self, cell_cost: NDArray[np.int16], cell: float, place: Point) -> tuple[int, int] | None:
+    def _open_cell(self, place: Point) -> tuple[int, int] | None:
         """Return the open cell nearest to a place, if there is one nearby."""
-        row, column = cell_at(self._field, cell, *place)
-        reach = math.ceil(0.6 / cell)  # maximum distance from the robot to the open cell that starts a path (m)
+        row, column = cell_at(self._field, self._cell, *place)
+        reach = math.ceil(0.6 / self._cell)  # maximum distance from the robot to the open cell that starts a path (m)
         top, left = max(row - reach, 0), max(column - reach, 0)
-        rows, columns = np.nonzero(cell_cost[top : max(row + reach + 1, 0), left : max(column + reach + 1, 0)])
+        rows, columns = np.nonzero(self._cell_cost[top : max(row + reach + 1, 0), left : max(column + reach + 1, 0)])
         if not len(rows):
             return None
         nearest = int(np.argmin((rows + top - row) ** 2 + (columns + left - column) ** 2))

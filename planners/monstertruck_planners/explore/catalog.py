@@ -15,13 +15,6 @@ EXPLORERS: Final = Catalog(
         extra="planning",
     ),
     Plugin(
-        name="tour",
-        settings="monstertruck_planners.explore.config:TourConfig",
-        implementation="monstertruck_planners.explore.tour:Tour",
-        doc="Large areas near by first, with a short tour over all frontiers, planned anew as the map grows",
-        extra="planning",
-    ),
-    Plugin(
         name="nearest",
         settings="monstertruck_planners.explore.config:NearestConfig",
         implementation="monstertruck_planners.explore.scores:Nearest",

@@ -79,19 +79,3 @@ class InformationConfig(ExplorerConfig):
     """Cost of half a turn at the start (s)"""
     better: Annotated[float, Field(ge=1)] = 4.0
     """Minimum ratio of area per second of another frontier to the current one, for replacing it"""
-
-
-class TourConfig(ExplorerConfig):
-    """Path to a frontier weighed against its new area and a short tour over the other frontiers."""
-
-    kind: Literal["tour"] = "tour"
-    worth: NotNegative = 1.0
-    """Distance driven (m) per metre of new ground, the square root of the new area"""
-    turning: NotNegative = 1.0
-    """Cost of half a turn at the start of the tour (m)"""
-    keep: NotNegative = 3.0
-    """Advantage another tour needs over one that begins with the current goal (m)"""
-    rest: NotNegative = 0.0
-    """Weight of the short tour over the other frontiers, relative to the path to the first one"""
-    most: Annotated[int, Field(ge=3, le=60)] = 16
-    """Maximum number of frontiers in a tour, the best ones"""

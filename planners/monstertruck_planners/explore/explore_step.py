@@ -13,7 +13,7 @@ from monstertruck_planners.explore.api import (
     Remembered,
     make_explorer,
 )
-from monstertruck_planners.explore.config import TourConfig
+from monstertruck_planners.explore.config import InformationConfig
 from monstertruck_planners.explore.exchange import CameraView, ExploreAnswer, ExploreSetup, ExploreTask, Viewpoint
 from monstertruck_planners.explore.frontier import FrontierMap
 from monstertruck_planners.explore.look import WallLooks
@@ -104,7 +104,7 @@ def warm_up() -> None:
     )  # fmt: skip
     step = ExploringStep()
     pose = (3.5, 3.5, 0.0)
-    setup = ExploreSetup(TourConfig(rest=1.0), Footprint(), 0.5)
+    setup = ExploreSetup(InformationConfig(), Footprint(), 0.5)
     first = step.step(ExploreTask(pose, grid, (), setup, choose=True, home=pose))
     assert first.target is not None
     step.step(ExploreTask(pose, choose=True, current=first.target))

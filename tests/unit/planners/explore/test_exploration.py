@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.explore import exploration
-from monstertruck_planners.explore.config import TourConfig
+from monstertruck_planners.explore.config import InformationConfig
 from monstertruck_planners.explore.exchange import ExploreAnswer, Viewpoint
 from monstertruck_planners.explore.exploration import Attempts, Cancel, Choose, Exploration, Go, Notice, Observed, Save
 from monstertruck_schemas.plan import ExplorationPhase as Phase
 from monstertruck_schemas.reasons import Reason
 
 HOME = (1.0, 2.0, 0.5)
-CONFIG = TourConfig()
+CONFIG = InformationConfig()
 FIRST, SECOND = Viewpoint((3.0, 2.0, 0.0), (4.0, 2.0), 2.0, 1.0), Viewpoint((0.0, 5.0, 1.0), (0.0, 6.0), 3.0, 2.0)
 NOTHING = ExploreAnswer(known=10.0, home=1.0)
 

@@ -9,16 +9,15 @@ from pydantic import TypeAdapter
 from monstertruck_planners.collision import Footprint
 from monstertruck_planners.explore.api import make_explorer
 from monstertruck_planners.explore.catalog import EXPLORERS, AnyExplorer
-from monstertruck_planners.explore.config import AuthorConfig, InformationConfig, NearestConfig, TourConfig
+from monstertruck_planners.explore.config import AuthorConfig, InformationConfig, NearestConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask, Viewpoint
 from monstertruck_planners.explore.explore_step import ExploringStep
-from monstertruck_planners.explore.kernels import new_area, sees, short_tour, tour_length
-from monstertruck_planners.explore.tour import best_beginning
+from monstertruck_planners.explore.kernels import new_area, sees
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import Grid
 
-KINDS = [NearestConfig(), AuthorConfig(), InformationConfig(), TourConfig()]
+KINDS = [NearestConfig(), AuthorConfig(), InformationConfig()]
 MIDDLE = (5.0, 5.0, 0.0)
 
 
@@ -67,7 +66,7 @@ def test_banned_and_closed_places_are_no_options(config):
 
 
 def test_it_looks_from_elsewhere_than_places_that_could_not_be_reached():
-    step = step_of(TourConfig(), hall(EAST))
+    step = step_of(InformationConfig(), hall(EAST))
     first = step.step(ExploreTask(MIDDLE, choose=True)).target
     assert first is not None
     other = step.step(ExploreTask(MIDDLE, choose=True, avoided=(first.pose[:2],))).target
@@ -130,31 +129,13 @@ def test_information_keeps_its_goal_unless_another_one_is_that_much_better(bette
     assert step.step(ExploreTask(pose, choose=True, current=first)).kept is kept
 
 
-def test_a_tour_goes_to_a_wide_opening_before_a_shadow_that_is_nearer():
-    wide, shadow = (8.95, 3.0, 8.95, 7.0), (1.0, 4.8, 1.0, 5.2)
-    pose = (4.8, 5.0, 1.57)
-    chosen = step_of(TourConfig(), hall(wide, shadow)).step(ExploreTask(pose, choose=True)).target
-    assert chosen is not None
-    assert chosen.frontier[0] > 8.0
-    nearest = step_of(NearestConfig(), hall(wide, shadow)).step(ExploreTask(pose, choose=True)).target
-    assert nearest is not None
-    assert nearest.frontier[0] < 2.0
-
-
-def test_a_tour_begins_where_the_way_over_the_others_is_short():
-    places = np.array([1.0, -1.2, -4.0])
-    distance = np.abs(places[:, None] - places)
-    assert best_beginning(np.array([1.2, 1.0, 4.0]), distance, 1.0) == 0
-    assert best_beginning(np.array([1.2, 0.6, 4.0]), distance, 0.01) == 1
-
-
 def test_a_frontier_is_looked_at_from_where_the_robot_can_go_also_once_a_door_is_open():
     """What was found for it holds only while the same ground can be reached."""
     grid = hall(EAST)
     shut = grid.cells.reshape(200, 200).copy()
     shut[20:180, 150:154] = 100
     closed = grid.model_copy(update={"cells": shut.reshape(-1)})
-    step = step_of(TourConfig(), closed)
+    step = step_of(InformationConfig(), closed)
     assert step.step(ExploreTask(MIDDLE, choose=True)).target is None
     shut[80:120, 150:154] = 0
     opened = step.step(ExploreTask(MIDDLE, grid.model_copy(update={"cells": shut.reshape(-1)}), choose=True)).target
@@ -182,30 +163,6 @@ def test_round_a_narrow_corner_it_looks_from_where_the_robot_has_room():
     assert answer.target.gain > 1.0
 
 
-def test_a_tour_begins_with_the_near_end_of_the_row():
-    """Nearest-next would leave the single place on the other side for a long way back."""
-    first = np.array([1.0, 1.2, 4.0, 5.0])
-    places = np.array([1.0, -1.2, -4.0, -5.0])
-    order = short_tour(np.abs(places[:, None] - places), first)
-    assert order.tolist() == [0, 1, 2, 3]
-    assert tour_length(np.abs(places[:, None] - places), first, order) == pytest.approx(7.0)
-
-
-def test_short_tours_are_as_short_as_the_shortest_in_nearly_all_of_small_cases():
-    from itertools import permutations
-
-    rng = np.random.default_rng(1)
-    excess = []
-    for _ in range(40):
-        places = rng.uniform(0, 10, (6, 2))
-        distance = np.hypot(*(places[:, None] - places).transpose(2, 0, 1))
-        first = np.hypot(*(places - 5.0).T)
-        best = min(tour_length(distance, first, np.array(p)) for p in permutations(range(6)))
-        excess.append(tour_length(distance, first, short_tour(distance, first)) / best)
-    assert np.mean(excess) < 1.01
-    assert max(excess) < 1.15
-
-
 def test_sight_ends_at_obstacles_and_new_area_at_depth():
     cells = np.zeros((60, 60), np.int8)
     cells[:, 30] = 100
@@ -222,7 +179,7 @@ def test_the_step_asks_for_a_setup_and_waits_for_a_map():
     with pytest.raises(InputError, match="setup"):
         ExploringStep().step(ExploreTask(MIDDLE))
     step = ExploringStep()
-    answer = step.step(ExploreTask(MIDDLE, setup=ExploreSetup(TourConfig(), Footprint(), 0.5), choose=True))
+    answer = step.step(ExploreTask(MIDDLE, setup=ExploreSetup(InformationConfig(), Footprint(), 0.5), choose=True))
     assert (answer.target, answer.known) == (None, 0.0)
 
 
@@ -231,12 +188,12 @@ def test_a_robot_on_unknown_ground_begins_where_it_stands():
     cells = grid.cells.reshape(200, 200).copy()
     cells[96:104, 94:106] = -1
     hidden = grid.model_copy(update={"cells": cells.reshape(-1)})
-    answer = step_of(TourConfig(), hidden).step(ExploreTask(MIDDLE, choose=True))
+    answer = step_of(InformationConfig(), hidden).step(ExploreTask(MIDDLE, choose=True))
     assert answer.target is not None
 
 
 def test_kinds_are_a_catalog_whose_default_is_information():
-    assert list(EXPLORERS) == ["information", "tour", "nearest", "author"]
+    assert list(EXPLORERS) == ["information", "nearest", "author"]
     assert TypeAdapter(AnyExplorer).validate_python({}).kind == "information"
     assert all(hasattr(make_explorer(config), "choose") for config in KINDS)
     assert Viewpoint((0.0, 0.0, 0.0), (1.0, 0.0)).path_length == 0.0

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from monstertruck_planners.collision import Footprint
-from monstertruck_planners.explore.config import TourConfig
+from monstertruck_planners.explore.config import InformationConfig
 from monstertruck_planners.explore.exchange import CameraView, ExploreSetup, ExploreTask
 from monstertruck_planners.explore.explore_step import ExploringStep
 from monstertruck_planners.explore.look import faces_of
@@ -32,7 +32,7 @@ def room() -> Grid:
 
 def test_every_wall_is_looked_at_from_near_and_then_nothing_is_left():
     step, camera = ExploringStep(), CameraView()
-    step.step(ExploreTask(MIDDLE, room(), (), ExploreSetup(TourConfig(), Footprint(), 0.5, camera=camera)))
+    step.step(ExploreTask(MIDDLE, room(), (), ExploreSetup(InformationConfig(), Footprint(), 0.5, camera=camera)))
     pose, current, looked = MIDDLE, None, 0
     for _ in range(40):
         answer = step.step(ExploreTask(pose, choose=True, current=current, find=True))
@@ -53,7 +53,7 @@ def test_every_wall_is_looked_at_from_near_and_then_nothing_is_left():
 
 def test_faces_point_away_from_their_wall():
     step = ExploringStep()
-    step.step(ExploreTask(MIDDLE, room(), (), ExploreSetup(TourConfig(), Footprint(), 0.5)))
+    step.step(ExploreTask(MIDDLE, room(), (), ExploreSetup(InformationConfig(), Footprint(), 0.5)))
     faces = faces_of(step._map)
     inward = ((np.array(MIDDLE[:2]) - faces.points) * faces.normals).sum(axis=1)
     assert len(faces.keys) == len(set(faces.keys.tolist())) > 40
@@ -65,7 +65,7 @@ def test_it_ends_when_enough_is_found_and_says_how_much_was_not():
     stepped.drive()
     stepped.step(found=2)
     assert stepped.run.phase is ExplorationPhase.DRIVING
-    reported = state_of(stepped.run, "tour", 0)
+    reported = state_of(stepped.run, "information", 0)
     assert (reported.found, reported.find) == (2, 3)
     stepped.step(found=3)
     assert stepped.run.phase is ExplorationPhase.RETURNING

@@ -6,7 +6,7 @@ import numpy as np
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
-from monstertruck_planners.explore.config import TourConfig
+from monstertruck_planners.explore.config import InformationConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.exchange import DeformTask, PlanTask, Setup
@@ -58,7 +58,7 @@ def explore_task() -> ExploreTask:
     """The far half of the room is unknown."""
     cells = room().cells.reshape(60, 120).copy()
     cells[:, 60:] = -1
-    setup = ExploreSetup(TourConfig(), BODY, 0.5)
+    setup = ExploreSetup(InformationConfig(), BODY, 0.5)
     whole = room().model_copy(update={"cells": cells.ravel()})
     return ExploreTask((1.0, 1.5, 0.1), whole=whole, setup=setup, choose=True, home=(0.8, 1.5, 0.0))
 
