@@ -135,7 +135,6 @@ class Reason(StrEnum):
         "the driven wheels slip: other sensors measure another motion",
     )
     HEADING_DISTURBED = "heading_disturbed", 95, "the compass is disturbed: its headings are left out"
-    WITNESS_DISAGREES = "witness_disagrees", 98, "another scan odometry measures another motion than the map's"
     IMU_DISAGREES = "imu_disagrees", 99, "the IMU and the wheels measure different turns"
     SENSORS_DISAGREE = "sensors_disagree", 125, "two sensors measure motions of which one must be wrong"
     SENSOR_FROZEN = "sensor_frozen", 108, "a sensor repeats its values to the digit"

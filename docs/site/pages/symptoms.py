@@ -121,7 +121,6 @@ SYMPTOMS: Final = (
             "imu_disagrees": "Check that it is screwed down; `monstertruckd calibrate imu`.",
             "time_offset": "`monstertruckd calibrate lidar` prints the offset.",
             "odometry_dropped": "Check the wheels; calibrate drive and odometry.",
-            "witness_disagrees": "",
             "pose_lost": "Drive slowly where the lidar sees many walls.",
             "match_degenerate": "A bare corridor: the pose continues by odometry.",
             "outside_map": "Check that the map is of this place: `monstertruckd map localise`.",

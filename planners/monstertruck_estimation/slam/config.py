@@ -94,8 +94,6 @@ class SlamConfig(Schema):
     save_period: Positive = 60.0
     front: Literal["planar", "kiss"] = "planar"
     """Scan matcher"""
-    witness: Literal["kiss"] | None = None
-    """Scan odometry that is compared with the estimate; a difference of more than 0.2 m over 5 s is an event"""
     mapper: MapperConfig = MapperConfig()
     grid: GridConfig = GridConfig()
     max_tilt: Annotated[float, Field(gt=0, le=1.5)] = 0.1

@@ -1,15 +1,10 @@
-"""kiss-icp (Vizzo et al. 2023) for planar scans: its map and registration, a scan matcher, and a second opinion.
+"""kiss-icp (Vizzo et al. 2023) for planar scans: its map and registration as a scan matcher.
 
 All points are kept: the package's own second downsampling leaves too few of a planar scan. The matcher returns neither
 a score nor a failure, so every result is measured like ours (overlap, residual, information) and passes the same gate.
-The second opinion is scan odometry with a separate map. It shares only the points of the scans with the estimate: no
-wheels, no submaps, no pose graph. Each guess is the previous motion. It drifts, so only motions over some seconds are
-compared.
 """
 
 import math
-from collections import deque
-from typing import Final
 
 import numpy as np
 from kiss_icp.config import KISSConfig
@@ -20,11 +15,7 @@ from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.registration import measure
 from monstertruck_estimation.slam.scan_matcher import MIN_PAIRS, MatchStatus, ScanMatch, gated, rejected
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_estimation.slam.worker_io import SlamEstimate
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import between, compose
-from monstertruck_runtime.clock import SECOND
-from monstertruck_schemas.health import LocalisationStatus
 
 
 class KissMap:
@@ -46,10 +37,6 @@ class KissMap:
     def add(self, points: Array) -> None:
         """Take points, (n, 2) (m)."""
         self._map.add_points(_spatial(points))
-
-    def update(self, points: Array, pose: Array) -> None:
-        """Take the points, (n, 2), of a scan at ``pose``, (3,), and forget those far from it."""
-        self._map.update(_spatial(points), _matrix(pose))
 
     def align(self, points: Array, guess: Array) -> Array:
         """Return a scan's pose, (3,): the guess if the map is empty, not finite if the registration failed."""
@@ -99,42 +86,3 @@ class KissMatcher:
         if not np.isfinite(pose).all():
             return rejected(guess, covariance, MatchStatus.FAR)
         return gated(measure(scan, submap.cloud, pose), guess, covariance)
-
-
-JUMPS: Final = frozenset({"closed", "joined", "found", "refuted"})
-"""Events after which the estimate's next motion does not follow its last pose."""
-COMPARABLE: Final = frozenset({LocalisationStatus.MAPPING, LocalisationStatus.LOCALISED})
-"""States with a reliable motion: in others the estimate is in doubt, or in a corridor that leaves it unconstrained."""
-
-
-class KissWitness:
-    """Compare the estimate's motion with kiss-icp's alone."""
-
-    def __init__(self) -> None:
-        self._map = KissMap()
-        self._pose, self._motion = np.zeros(3), np.zeros(3)
-        self._poses: deque[tuple[int, Array, Array]] = deque()
-        """Stamp, pose by kiss-icp, pose by the estimate."""
-
-    def compare(self, scan: Scan, estimate: SlamEstimate) -> float | None:
-        """Take a scan with its estimated pose; return the difference of both motions (m) if it is too large."""
-        guess = compose(self._pose, self._motion)
-        pose = self._map.align(scan.points, guess)
-        if not np.isfinite(pose).all():
-            pose = guess
-        self._map.update(scan.points, pose)
-        self._motion, self._pose = between(self._pose, pose), pose
-        if estimate.status not in COMPARABLE or JUMPS.intersection(estimate.events):
-            self._poses.clear()
-            return None
-        self._poses.append((estimate.stamp, pose, np.array(estimate.pose)))
-        compared = 5 * SECOND  # time over which motions are compared, ns
-        while estimate.stamp - self._poses[0][0] > compared:
-            self._poses.popleft()
-        _, by_kiss, by_estimate = self._poses[0]
-        off = between(between(by_kiss, pose), between(by_estimate, np.array(estimate.pose)))
-        distance = math.hypot(off[0], off[1])
-        if distance <= 0.2:  # maximum difference that is not reported, m
-            return None
-        self._poses.clear()
-        return distance

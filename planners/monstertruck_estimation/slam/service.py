@@ -367,9 +367,6 @@ class SlamService:
                 estimate, outputs.counts, (self._left_out, self._scan.drops), self._clock.now(), self._health.next_seq()
             )
         )
-        if estimate.disagreement is not None:
-            text = f"by {estimate.disagreement:.2f} m over the last seconds"
-            self._events(Reason.WITNESS_DISAGREES, Severity.WARNING, self.name, text, distance=estimate.disagreement)
         for reason, severity, text in (CORRECTIONS[event] for event in estimate.events if event in CORRECTIONS):
             self._events(reason, severity, self.name, text.format(outputs.counts["closures"]))
         if estimate.offset is not None and not self._offset_reported:

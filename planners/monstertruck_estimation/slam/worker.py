@@ -4,7 +4,6 @@ A step's inputs are a ``WorkerInput``, its outputs a ``WorkerOutput``; the first
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,16 +23,12 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.memory import give_back
 from monstertruck_schemas.health import OdometryUse
 
-if TYPE_CHECKING:
-    from monstertruck_estimation.slam.kiss import KissWitness
-
 
 class SlamWorker:
     """Worker step that holds the map; building it compiles all numba functions."""
 
     def __init__(self) -> None:
         self._estimator: Estimator | None = None
-        self._witness: KissWitness | None = None
         self._longest = np.inf
         self._first: ScanInput | None = None
         self._newest: int | None = None
@@ -67,8 +62,6 @@ class SlamWorker:
                     )
                 else:
                     made = estimator.step(scan, inputs.scan)
-                    if made is not None and self._witness is not None:
-                        made = replace(made, disagreement=self._witness.compare(scan, made))
                     if made is not None and MappingEvent.PRUNED in made.events:
                         give_back()
         joint = estimator.finish() if inputs.finish else None
@@ -100,7 +93,6 @@ class SlamWorker:
         settings = config.mapper
         self._run = start.run
         self._longest = settings.longest
-        self._witness = _witness() if config.witness == "kiss" else None
         if config.mode == "localisation":
             assert config.map is not None
             saved = storage.load(config.map)
@@ -155,12 +147,6 @@ def matcher_of(kind: str) -> ScanMatcher | None:
     from monstertruck_estimation.slam.kiss import KissMatcher  # noqa: PLC0415  # its library is for this kind only
 
     return KissMatcher()
-
-
-def _witness() -> "KissWitness":
-    from monstertruck_estimation.slam.kiss import KissWitness  # noqa: PLC0415  # its library is for this only
-
-    return KissWitness()
 
 
 def _warm_up() -> None:

@@ -140,8 +140,6 @@ class SlamEstimate:
     """Lead of odometry over the scans (s); None if none was found."""
     moved: ScanIncrement | None = None
     """Motion since the last match; None for the first scan, and after rejected matches."""
-    disagreement: float | None = None
-    """Deviation of the witness's motion over the last seconds (m); None if within its limit, or without a witness."""
     odometry: OdometryUse = OdometryUse.NONE
 
 
