@@ -1,6 +1,6 @@
 """1000 seeded faults on the whole truck, on the virtual clock: no unsafe motion, nothing stuck, back soon.
 
-    python benchmarks/drill.py [--seed 1] [--count 1000] [--fault KIND ...] [--jobs N | --cluster ADDRESS]
+    python benchmarks/drill.py [--seed 1] [--count 1000] [--fault KIND ...] [--jobs N]
                                [--resume FILE]
     python benchmarks/drill.py --families [--count 10000] [--from N] [--robot NAME] [...]
 
@@ -83,7 +83,7 @@ def drill_families(arguments: argparse.Namespace) -> int:
     count = arguments.count or FAMILY_TRIALS
     began = perf_counter()
     report = Campaign(arguments.seed, count, config, first=arguments.first).run(
-        jobs=arguments.jobs, cluster=arguments.cluster, resume=arguments.resume
+        jobs=arguments.jobs, resume=arguments.resume
     )
     family_table(report)
     figures = {"robot": name} | report.figures() | {"real_s": round(perf_counter() - began, 1)}
@@ -112,7 +112,6 @@ def main() -> int:
     parser.add_argument("--from", type=int, default=0, dest="first", metavar="N", help="of families: first trial")
     parser.add_argument("--robot", metavar="NAME", help="of families: of configs or configs/robots instead of full")
     parser.add_argument("--jobs", type=int, default=default_jobs())
-    parser.add_argument("--cluster", metavar="ADDRESS", help="dask scheduler whose workers run it")
     parser.add_argument(
         "--resume", type=Path, metavar="FILE", help="go on with the outcomes in this file, and add to it"
     )
@@ -122,7 +121,7 @@ def main() -> int:
     truck = load_config(ROOT / "configs" / "full.yaml", SimulatedTruckConfig)[0]
     began = perf_counter()
     report = Drill(arguments.seed, arguments.count or 1000, truck, faults=arguments.fault).run(
-        jobs=arguments.jobs, cluster=arguments.cluster, resume=arguments.resume
+        jobs=arguments.jobs, resume=arguments.resume
     )
     table(report)
     figures = report.figures() | {"real_s": round(perf_counter() - began, 1)}

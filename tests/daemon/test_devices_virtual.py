@@ -15,9 +15,8 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.drill.random_drill import DEADMAN
 from monstertruckd.tools.drill.truck import DrillTruck
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.config import DEADMAN_LINE, SimulatedTruckConfig, with_overlay
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 
@@ -89,4 +88,4 @@ def test_an_emergency_stop_goes_by_the_deadman_line_as_well():
         assert abs(rig.world.truth(clock.now()).v) < 0.01
         await ordering
 
-    driving(test, DEADMAN)
+    driving(test, DEADMAN_LINE)

@@ -30,7 +30,6 @@ from monstertruck_sim.world.world import World
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.drill.observer import Observer, Violation
 from monstertruckd.tools.drill.random_drill import (
-    DEADMAN,
     TRACKER_IN_WORKER,
     Drill,
     DrillReport,
@@ -40,9 +39,11 @@ from monstertruckd.tools.drill.random_drill import (
     wired,
 )
 from monstertruckd.tools.drill.truck import DrillTruck
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
+from monstertruckd.tools.simulation.config import DEADMAN_LINE, SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
+DEADMAN = {"map": None, **DEADMAN_LINE}
+"""Wires the deadman line, and draws no map."""
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

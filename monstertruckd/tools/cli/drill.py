@@ -28,10 +28,6 @@ def drill(
         bool, typer.Option(help="Falsify any signal of any device and ignore commands, singly and in pairs.")
     ] = False,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: all cores but one.")] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run it, such as tcp://HOST:8786."),
-    ] = None,
     resume: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Resume the drill whose outcomes are in this file; new ones are added."),
@@ -50,21 +46,19 @@ def drill(
 
     truck = load_simulated(config)
     if families:
-        found = _run("trials", Campaign(seed, count, truck).run, count, jobs or default_jobs(), cluster, resume)
+        found = _run("trials", Campaign(seed, count, truck).run, count, jobs or default_jobs(), resume)
         _show_families(found, json_output=json_output)
         unsafe, stuck = found.unsafe, found.stuck
     else:
         drill = Drill(seed, count, truck)
-        report = _run("faults", drill.run, count, jobs or default_jobs(), cluster, resume)
+        report = _run("faults", drill.run, count, jobs or default_jobs(), resume)
         _show(report, drill.unguarded, json_output=json_output)
         unsafe, stuck = report.unsafe, report.stuck
     if unsafe or stuck:
         raise typer.Exit(1)
 
 
-def _run(
-    what: str, run: Callable[..., Report], count: int, jobs: int, cluster: str | None, resume: Path | None
-) -> Report:
+def _run(what: str, run: Callable[..., Report], count: int, jobs: int, resume: Path | None) -> Report:
     finished = 0
     with progress(what, count) as done:
 
@@ -73,7 +67,7 @@ def _run(
             finished += len(outcomes)
             done(finished)
 
-        return run(jobs=jobs, cluster=cluster, resume=resume, report=show)
+        return run(jobs=jobs, resume=resume, report=show)
 
 
 def _show_families(report: "CampaignReport", *, json_output: bool) -> None:

@@ -1,11 +1,10 @@
-"""The legs of a drill: each one truck's share, run here, in several processes or on a cluster, and kept in a file."""
+"""The legs of a drill: each one truck's share, run here or in several processes, and kept in a file."""
 
 import hashlib
 import importlib.util
 import json
 import logging
 import os
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -15,16 +14,10 @@ from typing import Any, Final, Generic, TypeVar
 
 from pydantic import TypeAdapter
 
-from monstertruck_runtime.errors import InputError, NoAnswerError, WorkerError
-from monstertruck_runtime.extras import not_installed
+from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.outside import MEGABYTE, contents, reading
-from monstertruckd import __version__
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
-CONNECT: Final = 10.0
-"""Time in which the scheduler of a cluster must answer (s)."""
-T = TypeVar("T")
-U = TypeVar("U")
 Outcome = TypeVar("Outcome")
 
 
@@ -44,8 +37,6 @@ class DrillLeg:
     count: int
     faults: tuple[str, ...] = ()
     """Kinds of faults that are drawn; empty = all that the robot can have."""
-    version: str = __version__
-    """Version of the program; another one would give another report."""
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -150,30 +141,15 @@ def _digest(config: dict[str, Any]) -> str:
     return digest.hexdigest()
 
 
-_ALONE: Final = threading.Lock()
-"""A leg silences the log of its process; a worker of a cluster may have several threads."""
-
-
 @contextmanager
-def leg_alone() -> Iterator[None]:
-    """One leg at a time in this process, without its log."""
-    with _ALONE:
-        quiet = logging.root.manager.disable
-        logging.disable(logging.CRITICAL)
-        try:
-            yield
-        finally:
-            logging.disable(quiet)
-
-
-def check_version(leg: DrillLeg) -> None:
-    """Refuse a leg of another version of the program.
-
-    Raises:
-        InputError: another version made it.
-    """
-    if leg.version != __version__:
-        raise InputError(f"a drill of version {leg.version} was sent to a worker with version {__version__}")
+def without_log() -> Iterator[None]:
+    """Disable logging of this process."""
+    quiet = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(quiet)
 
 
 def run_legs(
@@ -181,7 +157,6 @@ def run_legs(
     step: Callable[[DrillLeg], list[Outcome]],
     adapter: TypeAdapter[list[Outcome]],
     jobs: int = 1,
-    cluster: str | None = None,
     resume: Path | None = None,
     report: Callable[[list[Outcome]], None] = lambda _: None,
 ) -> tuple[Outcome, ...]:
@@ -192,18 +167,16 @@ def run_legs(
         step: runs one of them; a function of a module.
         adapter: of a leg's outcomes.
         jobs: processes; 1 = this one alone.
-        cluster: address of a dask scheduler, whose workers run them instead.
         resume: file of the outcomes: legs that are in it are not run again, the others are added.
         report: called with the outcomes of each leg.
 
     Raises:
-        InputError: see ``LegFile`` and ``on_cluster``.
-        NoAnswerError, WorkerError: see ``on_cluster``.
+        InputError: see ``LegFile``.
     """
     file = None if resume is None else LegFile(resume, legs[0], adapter)
     known = {} if file is None else {leg.number: found for leg in legs if (found := file.outcomes(leg))}
     outcomes: list[Outcome] = []
-    with _parts([leg for leg in legs if leg.number not in known], step, jobs, cluster) as parts:
+    with _parts([leg for leg in legs if leg.number not in known], step, jobs) as parts:
         for leg in legs:
             part = known.get(leg.number)
             if part is None:
@@ -217,49 +190,10 @@ def run_legs(
 
 @contextmanager
 def _parts(
-    legs: Sequence[DrillLeg], step: Callable[[DrillLeg], list[Outcome]], jobs: int, cluster: str | None
+    legs: Sequence[DrillLeg], step: Callable[[DrillLeg], list[Outcome]], jobs: int
 ) -> Iterator[Iterator[list[Outcome]]]:
-    if cluster is not None:
-        with on_cluster(cluster, step, legs) as parts:
-            yield parts
-    elif jobs == 1:
+    if jobs == 1:
         yield map(step, legs)
     else:
         with ProcessPoolExecutor(min(jobs, max(1, len(legs)))) as pool:
             yield pool.map(step, legs)
-
-
-@contextmanager
-def on_cluster(address: str, step: Callable[[T], U], inputs: Sequence[T]) -> Iterator[Iterator[U]]:
-    """Results of ``step`` in the order of ``inputs``; those of a worker that dies are computed by another one.
-
-    Args:
-        address: of the scheduler, ``tcp://HOST:PORT``.
-        step: importable on the workers.
-        inputs: one each.
-
-    Raises:
-        NotInstalledError: dask.distributed is not installed.
-        NoAnswerError: no scheduler answers.
-        WorkerError: workers died of one input three times in a row.
-        Exception: what ``step`` raised.
-    """
-    try:
-        from distributed import Client, KilledWorker  # noqa: PLC0415  # an extra
-    except ImportError as error:
-        raise not_installed("--cluster: dask.distributed", "cluster") from error
-    try:
-        client = Client(address, timeout=CONNECT)
-    except (OSError, ValueError) as error:
-        raise NoAnswerError(f"{address}: no dask scheduler answers: {error}") from error
-    with client:
-        futures = client.map(step, inputs, pure=False)
-
-        def results() -> Iterator[U]:
-            try:
-                for future in futures:
-                    yield future.result()
-            except KilledWorker as error:
-                raise WorkerError(f"{address}: {error}") from error
-
-        yield results()

@@ -1,7 +1,7 @@
 """Random drills: seeded faults of the catalog, one after another, on a truck that drives; judged by the observer.
 
 A drill consists of legs. Each leg has a truck and a virtual clock of its own and draws from its own stream of the
-seed, so that legs can run in parallel, here or on a cluster, and still give the same report.
+seed, so that legs can run in parallel, and still give the same report.
 """
 
 import asyncio
@@ -26,7 +26,7 @@ from monstertruck_schemas.req import Order
 from monstertruck_schemas.roles import SHAFTS
 from monstertruck_schemas.state import GateState
 from monstertruck_sim.faults import CatalogFault, FaultCatalog, FaultKind, apply
-from monstertruckd.tools.drill.legs import DrillLeg, check_version, leg_alone, run_legs, truck_of_leg
+from monstertruckd.tools.drill.legs import DrillLeg, run_legs, truck_of_leg, without_log
 from monstertruckd.tools.drill.observer import EPOS, MAESTRO, STOPS_WITHIN, Violation
 from monstertruckd.tools.drill.truck import OPTIONAL, DrillTruck
 from monstertruckd.tools.simulation.config import DEADMAN_LINE, SimulatedTruckConfig, with_overlay
@@ -46,8 +46,6 @@ QUIET: Final = frozenset(
 """Reasons that explain nothing."""
 OBSTACLE: Final = frozenset({Reason.OBSTACLE_STOP, Reason.OBSTACLE_SLOW})
 """Reasons of a truck that stands, or creeps, before something."""
-DEADMAN: Final[dict[str, Any]] = {"map": None, **DEADMAN_LINE}
-"""Overlay of a truck: the deadman line, and no map; see ``wired``."""
 TRACKER_IN_WORKER: Final[dict[str, Any]] = {"placement": {"tracker": "worker"}}
 """Overlay of every second truck."""
 
@@ -231,25 +229,19 @@ class Drill:
         self,
         *,
         jobs: int = 1,
-        cluster: str | None = None,
         resume: Path | None = None,
         report: Callable[[list[FaultOutcome]], None] = lambda _: None,
     ) -> DrillReport:
         """Run all of it; arguments and errors as of ``run_legs``."""
-        return DrillReport(self.seed, run_legs(self.legs(), run_leg, _OUTCOMES, jobs, cluster, resume, report))
+        return DrillReport(self.seed, run_legs(self.legs(), run_leg, _OUTCOMES, jobs, resume, report))
 
 
 _OUTCOMES: Final = TypeAdapter(list[FaultOutcome])
 
 
 def run_leg(leg: DrillLeg) -> list[FaultOutcome]:
-    """All faults of one leg, on the virtual clock.
-
-    Raises:
-        InputError: it comes from another version of the program.
-    """
-    check_version(leg)
-    with leg_alone(), TemporaryDirectory(prefix="monstertruck-") as folder:
+    """Run all faults of one leg on the virtual clock."""
+    with without_log(), TemporaryDirectory(prefix="monstertruck-") as folder:
         return run_virtual(lambda clock: _LegRun(leg, clock, folder).run())
 
 

@@ -61,9 +61,6 @@ INSTEAD = {
         "monstertruckd install-service --start --root system --dry-run", SYSTEM
     ),
     "monstertruckd install-service --upgrade": Instead(None, "needs a service; benchmarks/service.py boots one"),
-    "monstertruckd drill --count 10000 --cluster tcp://HOST:8786": Instead(
-        None, "needs a cluster; tests/daemon/test_drill_cluster.py starts one"
-    ),
     "monstertruckd security check --endpoint tls/192.168.1.7:7447": Instead(
         None, "needs a robot with certificates; tests/unit/tools/security/test_security.py checks one"
     ),

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_sim.faults import FaultKind
 from monstertruckd.tools.cli import drill as command
 from monstertruckd.tools.cli.main import main
-from monstertruckd.tools.drill import legs
 from monstertruckd.tools.drill.campaign import Campaign, CampaignReport, TrialOutcome
 from monstertruckd.tools.drill.legs import default_jobs
 from monstertruckd.tools.drill.observer import Violation
@@ -138,15 +136,3 @@ def test_a_core_is_left_by_default(monkeypatch: pytest.MonkeyPatch):
         with pytest.raises(SystemExit):
             main()
     assert used == [2, 5]
-
-
-def test_a_cluster_runs_it_where_one_is_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    asked: list[object] = []
-    monkeypatch.setattr(legs, "on_cluster", lambda address, *_: asked.append(address) or nullcontext(iter([[SAFE]])))
-    monkeypatch.setattr(
-        sys, "argv", ["monstertruckd", "drill", "--config", str(DEMO), "--count", "1", "--cluster", "tcp://h:8786"]
-    )
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert (ended.value.code or 0, asked) == (0, ["tcp://h:8786"])
-    assert "1 faults: 0 with unsafe motion" in capsys.readouterr().out
