@@ -5,7 +5,7 @@ from typing import Generic, TypeVar
 
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 
 T = TypeVar("T")
 
@@ -50,3 +50,20 @@ class DeviceStream(Generic[T]):
                 return messages
             if self._clock.now() >= until:
                 raise ProtocolError(f"{name}: {self.bytes_heard - heard} bytes, but no measurement")
+
+    async def first(self, within: float, expected: str) -> list[T]:
+        """Return the first messages of a session.
+
+        Args:
+            within: seconds to wait for one.
+            expected: end of the message of a ``WrongDeviceError``: the expected device, and likely causes.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence.
+            WrongDeviceError: bytes, but no message.
+        """
+        try:
+            return await self.receive(within)
+        except ProtocolError as error:
+            raise WrongDeviceError(f"{error} {expected}") from None

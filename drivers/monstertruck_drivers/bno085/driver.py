@@ -9,7 +9,7 @@ from monstertruck_drivers.inertial import Xyz, corrected_force, corrected_rate, 
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import ProtocolError, WrongDeviceError
+from monstertruck_runtime.errors import ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
@@ -144,16 +144,8 @@ class Bno085Driver:
 
 
 async def first_frames(stream: DeviceStream[RvcFrame]) -> list[RvcFrame]:
-    """Wait for the first frames of a session.
-
-    Raises:
-        DeviceLostError: unplugged.
-        DeviceTimeoutError: silence.
-        WrongDeviceError: bytes, but no frame.
-    """
-    try:
-        listen = 1.0  # seconds to receive a frame at the start; the unit needs a few tenths after power-up
-        return await stream.receive(listen)
-    except ProtocolError as error:
-        text = "of a BNO085 in UART-RVC mode: another device, another baud rate, or PS0 and PS1 set for another mode"
-        raise WrongDeviceError(f"{error} {text}") from None
+    """Wait for the first frames of a session; raises as ``DeviceStream.first``."""
+    listen = 1.0  # seconds to receive a frame at the start; the unit needs a few tenths after power-up
+    return await stream.first(
+        listen, "of a BNO085 in UART-RVC mode: another device, another baud rate, or PS0 and PS1 set for another mode"
+    )

@@ -11,7 +11,7 @@ from monstertruck_drivers.receiver.protocol import ChannelWords, position
 from monstertruck_drivers.receiver.sbus import SbusParser
 from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
@@ -177,17 +177,8 @@ class ReceiverDriver:
 
 
 async def first_frames(stream: DeviceStream[ReceiverFrame], config: ReceiverConfig) -> list[ReceiverFrame]:
-    """Wait for the first frames of a session.
-
-    Raises:
-        DeviceLostError: unplugged.
-        DeviceTimeoutError: silence.
-        WrongDeviceError: bytes, but no frame.
-    """
-    try:
-        # Seconds to receive a frame at the start; a receiver without its transmitter sends link statistics only.
-        listen = 1.0
-        return await stream.receive(listen)
-    except ProtocolError as error:
-        hint = "another protocol or baud rate" if isinstance(config, CrsfConfig) else "is the line inverted back?"
-        raise WrongDeviceError(f"{error} of a receiver: {hint}") from None
+    """Wait for the first frames of a session; raises as ``DeviceStream.first``."""
+    # Seconds to receive a frame at the start; a receiver without its transmitter sends link statistics only.
+    listen = 1.0
+    hint = "another protocol or baud rate" if isinstance(config, CrsfConfig) else "is the line inverted back?"
+    return await stream.first(listen, f"of a receiver: {hint}")

@@ -1,7 +1,6 @@
 """Drive service of several shafts on one stepper controller: ``cmd/drive*`` in, ``sensor/drive*`` out.
 
-One exchange a cycle: the set-points of all shafts go out, the status comes back and is the feedback of every shaft. The
-shafts have one state together: the most careful of their commands counts, and the oldest.
+One exchange a cycle: the set-points of all shafts go out, the status comes back and is the feedback of every shaft.
 
 The controller's watchdog stops the motors when the host is silent. The first request of every session is a quick stop,
 the last ones are quick stops until the motors rest, and coils off, whether they rest or not.
@@ -9,14 +8,14 @@ the last ones are quick stops until the motors rest, and coils off, whether they
 
 import contextlib
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Unpack
 
-from monstertruck_drivers.link import Port
+from monstertruck_drivers.link import Link, Port
+from monstertruck_drivers.motors import MotorBoard, ShaftEnds, requested
 from monstertruck_drivers.steppers.config import StepperConfig
-from monstertruck_drivers.steppers.protocol import Identity, MotorState, RefusalCode, Status, step_of
+from monstertruck_drivers.steppers.protocol import MotorState, RefusalCode, Status, step_of
 from monstertruck_drivers.steppers.session import ASK_ATTEMPTS, RequestRefusedByDeviceError, StepperSession
-from monstertruck_drivers.transaction import Misses
-from monstertruck_runtime.clock import POLLING, SECOND, Clock, Schedule
+from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import (
     DeviceError,
     DeviceLostError,
@@ -25,8 +24,8 @@ from monstertruck_runtime.errors import (
     DeviceStoppedError,
     ProtocolError,
 )
-from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_schemas.cmd import DriveAction, DriveCommand
+from monstertruck_runtime.ports import EventSink
+from monstertruck_schemas.cmd import DriveCommand
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveFeedback, DriveMode
@@ -58,13 +57,10 @@ def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: Stepp
         now: time, ns.
         config: signs, limits and time-outs.
     """
-    known = [command for command in commands if command is not None]
-    if len(known) < len(commands) or any(command.action is DriveAction.DISABLE for command in known):
-        return MotorSetpoints(MotorState.OFF)
-    age = max(now - command.stamp for command in known) / SECOND
-    if age > config.quick_stop_after or any(command.action is DriveAction.QUICK_STOP for command in known):
-        return MotorSetpoints(MotorState.STOPPED)
-    if age > config.command_timeout:
+    mode, known = requested(commands, now, config.quick_stop_after)
+    if mode is not DriveMode.ENABLED:
+        return MotorSetpoints(MotorState.OFF if mode is DriveMode.DISABLED else MotorState.STOPPED)
+    if any(now - command.stamp > config.command_timeout * SECOND for command in known):
         return MotorSetpoints(MotorState.RUN, (0,) * len(known))
     limit = config.max_rate
     steps = [min(max(command.motor_velocity / config.turn, -limit), limit) for command in known]
@@ -72,24 +68,8 @@ def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: Stepp
     return MotorSetpoints(MotorState.RUN, tuple(round(1000 * rate) for rate in rates))
 
 
-class StepperDriver:
-    """Service of all motors on one controller.
-
-    Args:
-        config: see ``StepperConfig``.
-        port: port of the controller.
-        clock: time.
-        commands: ``cmd/drive`` of the first shaft.
-        commands_2: the same for the second shaft.
-        commands_3: the same for the third shaft.
-        commands_4: the same for the fourth shaft.
-        out: ``sensor/drive`` of the first shaft, ``stamp`` in the middle of the exchange.
-        out_2: the same for the second shaft.
-        out_3: the same for the third shaft.
-        out_4: the same for the fourth shaft.
-        events: identity, restarts, a noisy line.
-        name: name of the service.
-    """
+class StepperDriver(MotorBoard[StepperConfig, StepperSession]):
+    """Service of all motors on one controller; see ``MotorBoard``."""
 
     def __init__(
         self,
@@ -97,53 +77,30 @@ class StepperDriver:
         port: Port,
         clock: Clock,
         *,
-        commands: Subscription[DriveCommand],
-        commands_2: Subscription[DriveCommand],
-        commands_3: Subscription[DriveCommand],
-        commands_4: Subscription[DriveCommand],
-        out: Publisher[DriveFeedback],
-        out_2: Publisher[DriveFeedback],
-        out_3: Publisher[DriveFeedback],
-        out_4: Publisher[DriveFeedback],
         events: EventSink,
         name: str = "wheels",
+        **ends: Unpack[ShaftEnds],
     ) -> None:
-        self.name = name
-        self._config = config
-        self._port = port
-        self._clock = clock
-        self._commands = (commands, commands_2, commands_3, commands_4)[: config.motors]
-        self._outs = (out, out_2, out_3, out_4)[: config.motors]
-        self._events = events
+        super().__init__(config, port, clock, config.motors, events, name, ends)
+        self._motors = config.motors
+        """Number of motors of the controller."""
         self._steps = [0] * config.motors
         """Counted over sessions and restarts of the controller."""
         self._last: tuple[Status, int] | None = None
         """Latest status and its arrival time."""
-        self._asked = MotorState.OFF
-        """State last requested from the controller."""
+        self._noise, self._noted = 0, 0
+        """Damaged lines at the begin of the current window, and its begin (ns)."""
 
-    async def run(self, ready: Ready) -> None:
-        """One session, from the stop of motors that may still turn to the stop at its end.
+    def _session(self, link: Link) -> StepperSession:
+        return StepperSession(link, self._clock, self._config.answer_timeout)
+
+    async def _start(self, session: StepperSession) -> None:
+        """See the base class.
 
         Raises:
-            DeviceLostError: nothing plugged in; the link went down.
-            DeviceRestartedError: the controller restarted while it was in use.
-            DeviceStoppedError: its watchdog stopped motors that were to turn.
             DeviceMismatchError: motors or steps per turn are not those configured.
             WrongDeviceError: something else answers.
-            PortBusyError: another process holds the port.
-            DeviceTimeoutError, ProtocolError: no usable answers.
         """
-        async with await self._port.open() as link:
-            session = StepperSession(link, self._clock, self._config.answer_timeout)
-            try:
-                motors = (await self._start(session)).motors
-                await self._serve(session, motors, ready)
-            finally:
-                if not link.is_lost:
-                    await self._make_safe(session)
-
-    async def _start(self, session: StepperSession) -> Identity:
         config = self._config
         session.send("Q")
         identity = await session.identify()
@@ -165,65 +122,52 @@ class StepperDriver:
             raise ProtocolError(f"{self._port.name}: settings {settings} were taken as {' '.join(taken.words)}")
         text = f"{identity.name} version {identity.version}, {identity.motors} motors"
         self._events(Reason.DEVICE_READY, Severity.INFO, self.name, text)
-        return identity
-
-    async def _serve(self, session: StepperSession, motors: int, ready: Ready) -> None:
-        schedule = Schedule(self._clock, self._config.rate, POLLING)
-        misses, reported = Misses(), False
-        noise, noted = session.splitter.bad, self._clock.now()
-        due = 0
-        while True:
-            if self._clock.now() >= due:
-                due = schedule.step()
-            await self._until(due)
-            setpoint = self._setpoint()
-            with misses:
-                status = await self._exchange(session, motors, setpoint)
-            if misses.count:
-                continue
-            self._publish(status, session)
-            if not reported:
-                reported = True
-                ready()
-            noise_window = 10 * SECOND
-            if self._clock.now() - noted > noise_window:
-                noise, noted = session.splitter.bad, self._clock.now()
-            elif session.splitter.bad - noise >= 5:  # damaged lines within ``noise_window`` that are reported
-                text = f"{session.splitter.bad - noise} damaged lines, newest {session.splitter.strange!r}"
-                self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, text)
-                noise = session.splitter.bad
+        self._motors = identity.motors
+        self._noise, self._noted = session.splitter.bad, self._clock.now()
 
     def _setpoint(self) -> MotorSetpoints:
-        return setpoint_of([commands.latest for commands in self._commands], self._clock.now(), self._config)
+        return setpoint_of(self._latest(), self._clock.now(), self._config)
 
-    def _is_urgent(self) -> bool:
-        """Whether a stop, or switching off the current, is still to be sent to the motors."""
-        wanted = self._setpoint().state
-        return wanted is not MotorState.RUN and wanted is not self._asked
+    def _wanted(self) -> DriveMode:
+        return MODES[self._setpoint().state]
 
-    async def _until(self, due: int) -> None:
-        """Wait for the next cycle, or for a command that stops running motors; the last shaft's is the latest."""
-        while (left := due - self._clock.now()) > 0:
-            last = self._commands[-1]
-            if await last.next_within(left / SECOND, lambda _: not self._is_urgent()) is None or self._is_urgent():
-                return
+    async def _exchange(self, session: StepperSession) -> None:
+        """See the base class.
 
-    async def _exchange(self, session: StepperSession, motors: int, setpoint: MotorSetpoints) -> Status:
-        self._asked = setpoint.state
-        if setpoint.state is MotorState.OFF:
-            status = await session.status("D", motors)
-        elif setpoint.state is MotorState.STOPPED:
-            status = await session.status("Q", motors)
-        else:
-            try:
-                status = await session.status("R", motors, *setpoint.rates, *(0,) * (motors - len(setpoint.rates)))
-            except RequestRefusedByDeviceError as error:
-                if error.code == RefusalCode.TRIPPED:
-                    text = f"{self._port.name}: the controller's watchdog stopped the motors"
-                    raise DeviceStoppedError(text) from error
-                raise
+        Raises:
+            DeviceRestartedError: the controller restarted while it was in use.
+            DeviceStoppedError: its watchdog stopped motors that were to turn.
+        """
+        setpoint = self._setpoint()
+        self._sent = MODES[setpoint.state]
+        status = await self._ask(session, setpoint)
         self._check(status)
-        return status
+        self._publish(status, session)
+        self._report_noise(session)
+
+    async def _ask(self, session: StepperSession, setpoint: MotorSetpoints) -> Status:
+        motors = self._motors
+        if setpoint.state is MotorState.OFF:
+            return await session.status("D", motors)
+        if setpoint.state is MotorState.STOPPED:
+            return await session.status("Q", motors)
+        try:
+            return await session.status("R", motors, *setpoint.rates, *(0,) * (motors - len(setpoint.rates)))
+        except RequestRefusedByDeviceError as error:
+            if error.code == RefusalCode.TRIPPED:
+                text = f"{self._port.name}: the controller's watchdog stopped the motors"
+                raise DeviceStoppedError(text) from error
+            raise
+
+    def _report_noise(self, session: StepperSession) -> None:
+        noise_window = 10 * SECOND
+        splitter = session.splitter
+        if self._clock.now() - self._noted > noise_window:
+            self._noise, self._noted = splitter.bad, self._clock.now()
+        elif splitter.bad - self._noise >= 5:  # damaged lines within ``noise_window`` that are reported
+            text = f"{splitter.bad - self._noise} damaged lines, newest {splitter.strange!r}"
+            self._events(Reason.DEVICE_PROTOCOL, Severity.WARNING, self.name, text)
+            self._noise = splitter.bad
 
     def _check(self, status: Status) -> None:
         """Notice a controller that restarted.

@@ -1,8 +1,7 @@
 """Driver of VESCs on one port: ``cmd/drive*`` and ``cmd/steering`` in; feedback of motors, servo and battery out.
 
 One exchange a cycle with every controller: its set-point goes out, its values come back. A quick stop is a brake
-current, sent again in every cycle; a disabled motor coasts. All motors have one state together: the most careful of
-their commands counts, and the oldest.
+current, sent again in every cycle; a disabled motor coasts.
 
 Every set-point feeds the controller's watchdog, which is set at the start of a session and brakes when the host is
 silent. The first packets of a session brake, and so do the last ones until the motors rest; then they coast.
@@ -11,11 +10,11 @@ silent. The first packets of a session brake, and so do the last ones until the 
 import contextlib
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Unpack
 
 from monstertruck_drivers.battery.monitor import BatteryMonitor
-from monstertruck_drivers.link import Port
-from monstertruck_drivers.transaction import Misses
+from monstertruck_drivers.link import Link, Port
+from monstertruck_drivers.motors import MotorBoard, ShaftEnds, requested
 from monstertruck_drivers.vesc.config import RAD_S_PER_RPM, VescConfig
 from monstertruck_drivers.vesc.protocol import (
     TICKS_PER_ELECTRICAL_TURN,
@@ -29,10 +28,10 @@ from monstertruck_drivers.vesc.protocol import (
     step,
 )
 from monstertruck_drivers.vesc.session import ATTEMPTS, VescSession
-from monstertruck_runtime.clock import POLLING, SECOND, Clock, Schedule
+from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceError, DeviceLostError, DeviceRestartedError
-from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
-from monstertruck_schemas.cmd import DriveAction, DriveCommand, SteeringCommand
+from monstertruck_runtime.ports import EventSink, Publisher, Subscription
+from monstertruck_schemas.cmd import DriveCommand, SteeringCommand
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, DriveFeedback, DriveMode, SteeringFeedback
@@ -55,12 +54,9 @@ def setpoint_of(commands: Sequence[DriveCommand | None], now: int, config: VescC
         now: time, ns.
         config: limits and time-outs.
     """
-    known = [command for command in commands if command is not None]
-    if len(known) < len(commands) or any(command.action is DriveAction.DISABLE for command in known):
-        return VescSetpoint(DriveMode.DISABLED)
-    stale = any(now - command.stamp > config.command_timeout * SECOND for command in known)
-    if stale or any(command.action is DriveAction.QUICK_STOP for command in known):
-        return VescSetpoint(DriveMode.QUICK_STOP)
+    mode, known = requested(commands, now, config.command_timeout)
+    if mode is not DriveMode.ENABLED:
+        return VescSetpoint(mode)
     limit = config.max_motor_rpm
     wanted = (command.motor_velocity / RAD_S_PER_RPM for command in known)
     return VescSetpoint(DriveMode.ENABLED, tuple(min(max(rpm, -limit), limit) for rpm in wanted))
@@ -76,27 +72,20 @@ def payload_of(setpoint: VescSetpoint, i: int, config: VescConfig) -> bytes:
     return set_rpm(round(rpm * config.pole_pairs) * (-1 if config.motors[i].inverted else 1))
 
 
-class VescDriver:
-    """Service of all motors on one port, with the servo output and the battery's voltage.
+class VescDriver(MotorBoard[VescConfig, VescSession]):
+    """Service of all motors on one port, with the servo output and the battery's voltage; see ``MotorBoard``.
 
     Args:
         config: see ``VescConfig``.
         port: port of the first controller.
         clock: time.
-        commands: ``cmd/drive`` of the first shaft.
-        commands_2: the same for the second shaft.
-        commands_3: the same for the third shaft.
-        commands_4: the same for the fourth shaft.
         steering_commands: ``cmd/steering``.
         drive: feedback of the first motor, whose current explains the battery's sag.
-        out: ``sensor/drive`` of the first shaft, ``stamp`` in the middle of the exchange.
-        out_2: the same for the second shaft.
-        out_3: the same for the third shaft.
-        out_4: the same for the fourth shaft.
         steering: position sent to the servo, as an angle; None when another device steers.
         battery: pack voltage; None when the battery is measured elsewhere.
         events: identity, restarts, faults.
         name: name of the service.
+        ends: topics of the shafts.
     """
 
     def __init__(
@@ -105,30 +94,17 @@ class VescDriver:
         port: Port,
         clock: Clock,
         *,
-        commands: Subscription[DriveCommand],
-        commands_2: Subscription[DriveCommand],
-        commands_3: Subscription[DriveCommand],
-        commands_4: Subscription[DriveCommand],
         steering_commands: Subscription[SteeringCommand],
         drive: Subscription[DriveFeedback],
-        out: Publisher[DriveFeedback],
-        out_2: Publisher[DriveFeedback],
-        out_3: Publisher[DriveFeedback],
-        out_4: Publisher[DriveFeedback],
         steering: Publisher[SteeringFeedback] | None,
         battery: Publisher[Battery] | None,
         events: EventSink,
         name: str = "actuators",
+        **ends: Unpack[ShaftEnds],
     ) -> None:
-        self.name = name
-        self._config = config
-        self._port = port
-        self._clock = clock
-        self._commands = (commands, commands_2, commands_3, commands_4)[: config.shafts]
-        self._outs = (out, out_2, out_3, out_4)[: config.shafts]
+        super().__init__(config, port, clock, config.shafts, events, name, ends)
         self._steering_commands = steering_commands
         self._steering = None if config.servo is None else steering
-        self._events = events
         self._battery: BatteryMonitor | None = None
         if battery is not None and config.battery is not None:
             self._battery = BatteryMonitor(config.battery, battery, events, name, drive)
@@ -138,31 +114,19 @@ class VescDriver:
         self._last: list[MotorValues | None] = [None] * config.shafts
         self._faults = [0] * config.shafts
         """Faults that were reported and are still there."""
-        self._sent = DriveMode.DISABLED
         self._position: float | None = None
         """Latest position sent to the servo."""
 
-    async def run(self, ready: Ready) -> None:
-        """One session, from the brake of motors that may still turn to the stop at its end.
-
-        Raises:
-            DeviceLostError: nothing plugged in; the link went down.
-            DeviceRestartedError: a controller restarted: its watchdog has its own setting again.
-            DeviceMismatchError: no controller at a CAN id, old firmware, or a watchdog that cannot be set.
-            WrongDeviceError: something else answers.
-            PortBusyError: another process holds the port.
-            DeviceTimeoutError, ProtocolError: no usable answers.
-        """
-        async with await self._port.open() as link:
-            session = VescSession(link, self._clock, self._config.answer_timeout)
-            try:
-                await self._start(session)
-                await self._serve(session, ready)
-            finally:
-                if not link.is_lost:
-                    await self._make_safe(session)
+    def _session(self, link: Link) -> VescSession:
+        return VescSession(link, self._clock, self._config.answer_timeout)
 
     async def _start(self, session: VescSession) -> None:
+        """See the base class.
+
+        Raises:
+            DeviceMismatchError: no controller at a CAN id, old firmware, or a watchdog that cannot be set.
+            WrongDeviceError: something else answers.
+        """
         config = self._config
         self._position = None
         self._send_all(session, VescSetpoint(DriveMode.QUICK_STOP))
@@ -178,36 +142,16 @@ class VescDriver:
             text = f"{identity.hardware}{where}, firmware {identity.major}.{identity.minor:02}"
             self._events(Reason.DEVICE_READY, Severity.INFO, self.name, text)
 
-    async def _serve(self, session: VescSession, ready: Ready) -> None:
-        schedule = Schedule(self._clock, self._config.rate, POLLING)
-        misses, reported = Misses(), False
-        due = 0
-        while True:
-            if self._clock.now() >= due:
-                due = schedule.step()
-            await self._until(session, due)
-            self._send_all(session, self._setpoint())
-            with misses:
-                for i in range(self._config.shafts):
-                    await self._read(session, i)
-            if not misses.count and not reported:
-                reported = True
-                ready()
-
     def _setpoint(self) -> VescSetpoint:
-        return setpoint_of([commands.latest for commands in self._commands], self._clock.now(), self._config)
+        return setpoint_of(self._latest(), self._clock.now(), self._config)
 
-    def _is_urgent(self) -> bool:
-        """Whether a stop is still to be sent to the motors."""
-        wanted = self._setpoint().mode
-        return wanted is not DriveMode.ENABLED and wanted is not self._sent
+    def _wanted(self) -> DriveMode:
+        return self._setpoint().mode
 
-    async def _until(self, session: VescSession, due: int) -> None:
-        """Wait for the next cycle, or for a command that stops running motors; the last shaft's is the latest."""
-        while (left := due - self._clock.now()) > 0:
-            last = self._commands[-1]
-            if await last.next_within(left / SECOND, lambda _: not self._is_urgent()) is None or self._is_urgent():
-                return
+    async def _exchange(self, session: VescSession) -> None:
+        self._send_all(session, self._setpoint())
+        for i in range(self._config.shafts):
+            await self._read(session, i)
 
     def _send_all(self, session: VescSession, setpoint: VescSetpoint) -> None:
         """Set-points of all motors and of the servo, in one go."""

@@ -8,7 +8,7 @@ from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_drivers.wt61.config import Wt61Config
 from monstertruck_drivers.wt61.protocol import RATE, TOGGLE_SLEEP, Wt61Kind, Wt61Packet, Wt61Parser
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.sensor import Imu
 
@@ -61,11 +61,9 @@ class Wt61Session:
                 self._link.write(remedy)
             try:
                 # 0.6: seconds to receive a packet of a streaming unit; it needs half of one after power-up
-                return await self.receive(0.6)
+                return await self._stream.first(0.6, "of a WT61: another device, or another baud rate")
             except DeviceTimeoutError:
                 continue
-            except ProtocolError as error:
-                raise WrongDeviceError(f"{error} of a WT61: another device, or another baud rate") from None
         raise DeviceTimeoutError(f"{self._link.name}: silence; expected a WT61 that streams")
 
 
