@@ -15,7 +15,6 @@ from monstertruckd.tools.cli import (
     explore,
     goto,
     kinematics,
-    lens,
     live,
     logs,
     maps,
@@ -85,7 +84,7 @@ app.command("goto", context_settings={"ignore_unknown_options": True})(goto.goto
 app.command("track")(goto.track)
 app.command("path")(goto.path)
 app.command("convert-path")(goto.convert_path)
-app.command("convert-lens")(lens.convert_lens)
+app.command("convert-lens")(config.convert_lens)
 app.command("import-urdf")(description.import_urdf)
 app.command("move")(move.move)
 app.command("get")(settings.get)
