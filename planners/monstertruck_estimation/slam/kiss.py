@@ -38,6 +38,10 @@ class KissMap:
         """Take points, (n, 2) (m)."""
         self._map.add_points(_spatial(points))
 
+    def update(self, points: Array, pose: Array) -> None:
+        """Take the points, (n, 2), of a scan at ``pose``, (3,), and forget those far from it."""
+        self._map.update(_spatial(points), _matrix(pose))
+
     def align(self, points: Array, guess: Array) -> Array:
         """Return a scan's pose, (3,): the guess if the map is empty, not finite if the registration failed."""
         if self._map.empty():
