@@ -482,6 +482,15 @@ DEVICES: Final = DeviceCatalog(
         usb=UsbIdentity("046d:080a", "Webcam C905", "video"),
     ),
     DeviceKind(
+        name="mjpeg",
+        doc="Camera with motion JPEG from a program's output or over the network",
+        roles=(CAMERA,),
+        settings="monstertruck_drivers.mjpeg.config:MjpegConfig",
+        implementation="monstertruck_drivers.mjpeg.driver:MjpegDriver",
+        emulator="monstertruck_drivers.mjpeg.emulator:emulated",
+        probe="monstertruck_drivers.mjpeg.probe:probe",
+    ),
+    DeviceKind(
         name="srf08",
         doc="Devantech SRF08 sonars behind a USB-ISS",
         roles=(SONAR,),

@@ -3,6 +3,7 @@
 Both have a key for every role of the catalog, and take the settings of every kind that fills the role.
 """
 
+import shlex
 from collections.abc import Iterator
 from functools import reduce
 from ipaddress import IPv4Address
@@ -81,7 +82,19 @@ class TcpPortConfig(Schema):
         return f"{self.address}:{self.tcp}"
 
 
-_WAYS: Final = {"hub": "port by hub", "address": "port by address"}
+class CommandPortConfig(Schema):
+    """Program whose output is the device."""
+
+    command: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Program and arguments, without a shell: [rpicam-vid, -t, "0", --codec, mjpeg, -o, "-"]"""
+
+    @property
+    def label(self) -> str:
+        """The command line."""
+        return shlex.join(self.command)
+
+
+_WAYS: Final = {"hub": "port by hub", "address": "port by address", "command": "port by command"}
 
 
 def _way(port: Any) -> str:
@@ -93,7 +106,8 @@ def _way(port: Any) -> str:
 AnyPort = Annotated[
     Annotated[PortConfig, Tag("port by path")]
     | Annotated[UsbPortConfig, Tag("port by hub")]
-    | Annotated[TcpPortConfig, Tag("port by address")],
+    | Annotated[TcpPortConfig, Tag("port by address")]
+    | Annotated[CommandPortConfig, Tag("port by command")],
     Discriminator(_way),
 ]
 
@@ -193,6 +207,13 @@ class _Devices(Schema):
                 raise ValueError(
                     f"{role}: a {device.kind.name} has no network address; expected a path, or hub and port"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _programs_give_pictures(self) -> Self:
+        for role, device in self.present().items():
+            if isinstance(device.port, CommandPortConfig) and device.kind.name != "mjpeg":
+                raise ValueError(f"{role}: only a camera of kind mjpeg is a program's output; expected another port")
         return self
 
     @model_validator(mode="after")

@@ -16,6 +16,8 @@ Framing = Literal["8N1", "8E2"]
 """Bits of a byte on a serial line: data bits, parity, stop bits."""
 BUFFER_LIMIT = 1 << 16
 """Unread bytes kept; beyond that the oldest are dropped, as a tty's buffer would."""
+STREAM_LIMIT = 1 << 22
+"""Unread bytes kept of a socket or a program, which give up to 256 KiB at once."""
 
 
 class Link:
@@ -26,6 +28,7 @@ class Link:
         transmit: sends bytes to the peer.
         hang_up: closes the underlying transport; called once.
         baud: baud rate of the line (bit/s); None where it has none.
+        limit: unread bytes kept.
     """
 
     def __init__(
@@ -34,9 +37,11 @@ class Link:
         transmit: Callable[[bytes], None],
         hang_up: Callable[[], None],
         baud: int | None = None,
+        limit: int = BUFFER_LIMIT,
     ) -> None:
         self.name = name
         self.baud = baud
+        self._limit = limit
         self._transmit = transmit
         self._hang_up = hang_up
         self._buffer = bytearray()
@@ -54,8 +59,8 @@ class Link:
     def feed(self, data: bytes) -> None:
         """Bytes arrived from the peer."""
         self._buffer += data
-        if len(self._buffer) > BUFFER_LIMIT:
-            del self._buffer[:-BUFFER_LIMIT]
+        if len(self._buffer) > self._limit:
+            del self._buffer[: -self._limit]
         if self._waiting is not None:
             self._waiting.on_bytes()
 

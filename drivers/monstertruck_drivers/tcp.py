@@ -6,7 +6,7 @@ import re
 import socket
 from typing import Final, cast
 
-from monstertruck_drivers.link import Link
+from monstertruck_drivers.link import STREAM_LIMIT, Link
 from monstertruck_runtime.errors import DeviceLostError
 
 PATIENCE: Final = 2.0
@@ -68,7 +68,7 @@ class _TcpProtocol(asyncio.Protocol):
         line: socket.socket = transport.get_extra_info("socket")
         line.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(MAX_AGE * 1000))
         stream = cast("asyncio.Transport", transport)
-        self.link = Link(self._name, stream.write, stream.abort)
+        self.link = Link(self._name, stream.write, stream.abort, limit=STREAM_LIMIT)
 
     def data_received(self, data: bytes) -> None:
         """Bytes came."""

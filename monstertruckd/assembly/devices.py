@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from monstertruck_drivers.catalog import DEVICES, Duty, RoleSpec
+from monstertruck_drivers.command import CommandPort
 from monstertruck_drivers.computer import Computer, Machine
-from monstertruck_drivers.config import AnyPort, Device, TcpPortConfig, kind_of
+from monstertruck_drivers.config import AnyPort, CommandPortConfig, Device, TcpPortConfig, kind_of
 from monstertruck_drivers.i2c.port import I2cPort
 from monstertruck_drivers.link import BAUD, Port
 from monstertruck_drivers.tcp import TcpPort
@@ -73,6 +74,8 @@ class Cabling:
             return HubPort(port, self._machine, self._events, self._hubs, self._power, role)
         if isinstance(port, TcpPortConfig):
             return TcpPort(port.address, port.tcp)
+        if isinstance(port, CommandPortConfig):
+            return CommandPort(port.command)
         return SerialPort(port.path, port.baud or BAUD, dtr=port.dtr, rts=port.rts, framing=port.framing or "8N1")
 
     def bus(self, role: str) -> Port:

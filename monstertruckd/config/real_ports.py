@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from monstertruck_drivers.config import AnyPort, TcpPortConfig
+from monstertruck_drivers.config import AnyPort, CommandPortConfig, TcpPortConfig
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruckd.config.truck import TruckConfig
 
@@ -52,6 +52,8 @@ def _is_real(port: AnyPort, *, own_tree: bool) -> bool:
             return own_tree
         case TcpPortConfig():
             return not port.is_local
+        case CommandPortConfig():
+            return True
         case _:
             return _is_device(port.path)
 

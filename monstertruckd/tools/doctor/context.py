@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from monstertruck_drivers.computer import ROOT, Computer
-from monstertruck_drivers.config import AnyPort, TcpPortConfig
+from monstertruck_drivers.config import AnyPort, CommandPortConfig, TcpPortConfig
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.tree import read_device
 from monstertruck_runtime.clock import Clock
@@ -177,7 +177,7 @@ class HostContext:
 
     def node(self, port: AnyPort, *, camera: bool = False) -> Path | None:
         """Device node of a port; None if nothing usable is plugged in, and of a network socket."""
-        if isinstance(port, TcpPortConfig):
+        if isinstance(port, TcpPortConfig | CommandPortConfig):
             return None
         if not isinstance(port, UsbPortConfig):
             path = self.at(port.path)

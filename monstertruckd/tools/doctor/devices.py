@@ -1,12 +1,14 @@
 """Checks of the devices: plugged in where the configuration says, and answering."""
 
 import asyncio
+import shutil
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any, Final
 
 from monstertruck_drivers.catalog import DeviceKind
-from monstertruck_drivers.config import Device, PortConfig, TcpPortConfig
+from monstertruck_drivers.command import CommandPort
+from monstertruck_drivers.config import CommandPortConfig, Device, PortConfig, TcpPortConfig
 from monstertruck_drivers.i2c.port import I2cPort
 from monstertruck_drivers.link import BAUD, Port
 from monstertruck_drivers.tcp import TcpPort
@@ -37,6 +39,8 @@ def wiring(context: HostContext) -> Iterator[Finding]:
             yield from _by_hub(context, tree, role, device, taken)
         elif isinstance(device.port, TcpPortConfig):
             yield fine(role, f"at {device.port.label} on the network")
+        elif isinstance(device.port, CommandPortConfig):
+            yield _by_command(role, device.port)
         else:
             yield _by_path(context, role, device)
     for name, count in tree.over_current.items():
@@ -44,6 +48,15 @@ def wiring(context: HostContext) -> Iterator[Finding]:
             yield warn(
                 "over-current", Reason.OVER_CURRENT, f"{place(name)}: {count} times since its hub came: {SUPPLY}"
             )
+
+
+def _by_command(role: str, port: CommandPortConfig) -> Finding:
+    program = port.command[0]
+    if shutil.which(program) is None:
+        return fail(
+            role, Reason.NOT_INSTALLED, f"{program}: no such program", f"apt-file search bin/{Path(program).name}"
+        )
+    return fine(role, f"output of {port.label}")
 
 
 def _by_path(context: HostContext, role: str, device: Device[Any]) -> Finding:
@@ -132,7 +145,7 @@ async def handshakes(context: HostContext) -> AsyncIterator[Finding]:
 
 def _reached(context: HostContext, device: Device[Schema]) -> str | None:
     """Where a device is asked: its node, or its address; None if it is not plugged in."""
-    if isinstance(device.port, TcpPortConfig):
+    if isinstance(device.port, TcpPortConfig | CommandPortConfig):
         return device.port.label
     node = context.node(device.port, camera=device.kind.opens == "video")
     return None if node is None else str(node)
@@ -170,6 +183,8 @@ async def _probe(
             line = I2cPort(Path(place))
         case UsbPortConfig():
             line = HubPort(port, machine, lambda *_, **__: None, role=role)
+        case CommandPortConfig():
+            line = CommandPort(port.command)
         case TcpPortConfig():
             line = TcpPort(port.address, port.tcp)
         case _:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from monstertruck_drivers.cable import MemoryPort, SocketPort
-from monstertruck_drivers.config import PortConfig, TcpPortConfig
+from monstertruck_drivers.config import CommandPortConfig, PortConfig, TcpPortConfig
 from monstertruck_drivers.link import Framing, Port
 from monstertruck_drivers.usb.config import UsbConfig, UsbPortConfig
 from monstertruck_runtime.clock import VirtualClock, WallClock, run_virtual
@@ -88,5 +88,16 @@ def test_a_bus_is_opened_by_its_path_or_given():
         bus, cable = Bus(clock), MemoryPort("given")
         assert Cabling(config, computer, bus, {}).bus("steering").name == "/dev/i2c-1"
         assert Cabling(config, computer, bus, {"steering": cable}).bus("steering") is cable
+
+    run_virtual(main)
+
+
+def test_a_program_is_a_port():
+    camera = SimpleNamespace(port=CommandPortConfig(command=("/usr/bin/rpicam-vid", "-o", "-")))
+    config: Any = SimpleNamespace(devices=SimpleNamespace(present=lambda: {"camera": camera}), usb=UsbConfig())
+
+    async def main(clock: VirtualClock) -> None:
+        computer: Any = SimpleNamespace(machine=SimpleNamespace(clock=clock))
+        assert Cabling(config, computer, Bus(clock), {}).port("camera").name == "rpicam-vid"
 
     run_virtual(main)

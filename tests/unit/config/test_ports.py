@@ -8,6 +8,7 @@ from monstertruck_drivers.config import PortConfig, TcpPortConfig
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_runtime.errors import ConfigError
 from monstertruckd.config.load import load_config
+from monstertruckd.config.real_ports import real_ports
 from monstertruckd.config.truck import TruckConfig
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -116,3 +117,14 @@ def test_an_i2c_bus_has_a_path(tmp_path: Path):
     assert any("a PCA9685 has no watchdog" in text for text in config.weakened())
     with pytest.raises(ConfigError, match="steering: a pca9685 is on an I2C bus; expected a path such as /dev/i2c-1"):
         truck(tmp_path, steering % '{hub: "1-1", port: 1}')
+
+
+def test_a_program_is_a_camera_only(tmp_path: Path):
+    at = "devices:\n  %s: {port: {command: [rpicam-vid, -o, '-']}, driver: {kind: %s}}\n"
+    config = truck(tmp_path, at % ("camera", "mjpeg"))
+    assert config.devices.camera is not None
+    assert config.devices.camera.port.label == "rpicam-vid -o -"
+    assert real_ports(config) == ("camera",)
+    for role, kind in (("drive", "epos"), ("camera", "webcam"), ("lidar", "ld19")):
+        with pytest.raises(ConfigError, match=f"{role}: only a camera of kind mjpeg is a program's output"):
+            truck(tmp_path, at % (role, kind))

@@ -148,3 +148,18 @@ def test_a_device_on_an_i2c_bus(tmp_path: Path):
     assert found.fix == "sudo usermod -aG i2c monstertruckd"
     shaken = see(tmp_path / "c", handshakes, closed)["steering handshake"]
     assert shaken.reason is Reason.DEVICE_LOST
+
+
+@pytest.mark.parametrize("program", ["sh", "rpicam-vid-that-is-not-there"])
+def test_a_camera_that_is_a_program(program: str, tmp_path: Path):
+    def camera(emulated: EmulatedHost) -> None:
+        assert emulated.context.config is not None
+        devices = emulated.context.config.devices.model_dump()
+        devices["camera"] = {"port": {"command": (program, "-c", "exit 3")}, "driver": {"kind": "mjpeg"}}
+        emulated.change(devices=devices)
+
+    found = see(tmp_path / "a", wiring, camera)["camera"]
+    if program == "sh":
+        assert found.seen == "output of sh -c 'exit 3'"
+    else:
+        assert (found.seen, found.fix) == (f"{program}: no such program", f"apt-file search bin/{program}")

@@ -1,0 +1,1 @@
+"""Motion JPEG from a program's output or over the network."""

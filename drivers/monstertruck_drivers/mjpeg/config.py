@@ -1,0 +1,46 @@
+"""Settings of a camera that sends motion JPEG over a link."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from monstertruck_schemas.base import FrameId, Schema
+from monstertruck_schemas.body import LensConfig
+
+
+class MjpegConfig(Schema):
+    """Motion JPEG from a program's output, from a TCP port or from an HTTP server."""
+
+    kind: Literal["mjpeg"] = "mjpeg"
+    http: Annotated[str, Field(pattern=r"^/[!-~]*$")] | None = None
+    """Path on the HTTP server at the port, such as /stream: multipart or single pictures; null = the port sends
+    pictures without HTTP"""
+    poll: Annotated[float, Field(gt=0, le=30)] | None = None
+    """Pictures to fetch a second, where ``http`` gives a single one; null = it gives a stream"""
+    width: Annotated[int, Field(ge=16, le=4096)] = 640
+    """Width that the camera is set to, pixels; others are reported"""
+    height: Annotated[int, Field(ge=16, le=4096)] = 480
+    """Height that the camera is set to, pixels"""
+    rate: Annotated[float, Field(gt=0, le=120)] = 15.0
+    """Pictures a second that the camera is set to"""
+    delay: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Time from exposure to arrival (s): the pictures carry no times of their own"""
+    most: Annotated[int, Field(ge=10_000, le=10_000_000)] = 2_000_000
+    """Maximum length of a picture (bytes)"""
+    watchdog: Annotated[float, Field(gt=0, le=60)] = 5.0
+    """Seconds without a whole picture that end the session; a program needs some of them to start its camera"""
+    frame: FrameId = "camera"
+    """Frame of the pictures"""
+    lens: LensConfig = LensConfig()
+    """Lens, for measurements by its pictures"""
+
+    @model_validator(mode="after")
+    def _polls_by_http(self) -> Self:
+        if self.poll is not None and self.http is None:
+            raise ValueError("poll: only an HTTP server is polled; set http to the path of its picture")
+        return self
+
+    @property
+    def buffers(self) -> int:
+        """Pictures kept: the latest."""
+        return 1

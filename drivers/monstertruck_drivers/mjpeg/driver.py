@@ -1,0 +1,45 @@
+"""Driver of a camera that sends motion JPEG over a link."""
+
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.mjpeg.config import MjpegConfig
+from monstertruck_drivers.mjpeg.source import LinkSource
+from monstertruck_drivers.webcam.driver import WebcamDriver
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_schemas.sensor import CompressedImage
+
+
+class MjpegDriver(WebcamDriver):
+    """Publishes every whole picture, stamped with its arrival minus the configured delay.
+
+    Args:
+        config: what comes, from where.
+        port: program, TCP port or emulated camera.
+        clock: time.
+        out: pictures.
+        events: sizes that differ, pictures refused.
+        name: service name.
+    """
+
+    def __init__(
+        self,
+        config: MjpegConfig,
+        port: Port,
+        clock: Clock,
+        out: Publisher[CompressedImage],
+        events: EventSink,
+        name: str = "camera",
+    ) -> None:
+        super().__init__(config, LinkSource(config, port, clock), clock, out, events, name)
+
+    async def run(self, ready: Ready) -> None:
+        """Serve one session; it is ready with its first whole picture.
+
+        Raises:
+            DeviceLostError: the program cannot be started or ended; no server, or it hung up.
+            DeviceTimeoutError: no picture within the watchdog's time.
+            DeviceMismatchError: the server refuses the path.
+            WrongDeviceError: the server gives something else than pictures.
+            ProtocolError: no HTTP, or pictures but no whole one within that time.
+        """
+        await super().run(ready)
