@@ -194,7 +194,8 @@ class _Polled(_Pictures):
     async def _take(self) -> CameraFrame:
         await self._schedule.next()
         self._connection = await self._source.connect()
-        splitter, content, found = self._source.splitter(), b"", []
+        splitter, content = self._source.splitter(), b""
+        found: list[bytes] = []
         try:
             while not found and not self._connection.ended:
                 data = await self._connection.read()

@@ -1,8 +1,7 @@
 """Camera driver: whole pictures become messages, at the camera's own times."""
 
-from typing import Final
+from typing import Final, Protocol
 
-from monstertruck_drivers.webcam.config import WebcamConfig
 from monstertruck_drivers.webcam.source import CameraFrame, FrameSource, FrameStream, Mode
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
@@ -68,6 +67,23 @@ OLDEST: Final = SECOND
 """Nanoseconds a picture may have taken to arrive; its stamp is not used beyond."""
 
 
+class CameraSettings(Protocol):
+    """Settings that every camera has; see ``WebcamConfig``."""
+
+    @property
+    def width(self) -> int: ...  # noqa: D102
+    @property
+    def height(self) -> int: ...  # noqa: D102
+    @property
+    def rate(self) -> float: ...  # noqa: D102
+    @property
+    def watchdog(self) -> float: ...  # noqa: D102
+    @property
+    def buffers(self) -> int: ...  # noqa: D102
+    @property
+    def frame(self) -> str: ...  # noqa: D102
+
+
 class WebcamDriver:
     """Publishes every whole picture.
 
@@ -82,7 +98,7 @@ class WebcamDriver:
 
     def __init__(
         self,
-        config: WebcamConfig,
+        config: CameraSettings,
         source: FrameSource,
         clock: Clock,
         out: Publisher[CompressedImage],

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
 
-from monstertruck_drivers.config import AnyPort, Device, PortConfig, TcpPortConfig
+from monstertruck_drivers.config import AnyPort, CommandPortConfig, Device, PortConfig, TcpPortConfig
 from monstertruck_drivers.shafts import stop_words
 from monstertruck_drivers.usb.config import CycleMethod, UsbPortConfig
 from monstertruck_drivers.usb.tree import is_topology, place, port_directory
@@ -118,7 +118,8 @@ def _stop(config: TruckConfig, program: Program) -> str:
     drives = [
         f"{_plain(node_of(role, device.port), without='=')}={_stop_words(device, words)}@{device.port.baud}"
         for role, device in config.devices.present().items()
-        if not isinstance(device.port, TcpPortConfig) and (words := stop_words(device.driver)) is not None
+        if not isinstance(device.port, TcpPortConfig | CommandPortConfig)
+        and (words := stop_words(device.driver)) is not None
     ]
     # Without site: the script must run even when the environment's packages do not load.
     return f"ExecStopPost={_plain(program.python)} -I -S {_plain(program.neutral)} {' '.join(drives)}" if drives else ""
