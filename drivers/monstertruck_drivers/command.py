@@ -33,14 +33,14 @@ class CommandPort:
         """
         try:
             _, protocol = await asyncio.get_running_loop().subprocess_exec(
-                lambda: _Output(self.name), *self._command, stdin=asyncio.subprocess.DEVNULL
+                lambda: _ProgramOutput(self.name), *self._command, stdin=asyncio.subprocess.DEVNULL
             )
         except OSError as error:
             raise DeviceLostError(f"{self._command[0]}: cannot be started: {error.strerror}") from error
         return protocol.link
 
 
-class _Output(asyncio.SubprocessProtocol):
+class _ProgramOutput(asyncio.SubprocessProtocol):
     """Feeds a ``Link`` from a program.
 
     Args:
