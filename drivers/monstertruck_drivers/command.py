@@ -65,7 +65,7 @@ class _ProgramOutput(asyncio.SubprocessProtocol):
             self._said = (self._said + data)[-LAST_WORDS:]
 
     def process_exited(self) -> None:
-        """It ended by itself, or was told to."""
+        """It ended by itself, or after SIGTERM."""
         said = self._said.decode(errors="backslashreplace").strip().rpartition("\n")[2]
         self.link.lose(f"ended with exit code {self._program.get_returncode()}{f': {said}' if said else ''}")
         self._program.close()
