@@ -25,7 +25,7 @@ sys.path.insert(0, str(ROOT))
 from benchmarks.service_parts.machine import PASSED_ON  # noqa: E402
 
 FILE = ROOT / "systemd" / "container" / "Dockerfile"
-CERTIFICATES = Path("/etc/ssl/certs")
+CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
 GOALS = {"failed_steps": 0, "lap": "path driven to its end"}
 
 
@@ -48,6 +48,7 @@ class Image:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._environment = {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root"}
+        self._environment["SSL_CERT_FILE"] = str(CERTIFICATES)
         self._passed = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
         self._place, self._user = "/", "0"
 
@@ -57,11 +58,7 @@ class Image:
             case "FROM":
                 suite = rest.removeprefix("debian:").removesuffix("-slim")
                 words = ["mmdebstrap", "--quiet", "--variant=minbase", suite, str(self.folder)]
-                code = subprocess.run(words, check=False).returncode
-                for file in (Path("/etc/resolv.conf"), CERTIFICATES / "ca-certificates.crt"):
-                    (self.folder / file.relative_to("/")).parent.mkdir(parents=True, exist_ok=True)
-                    shutil.copy(file, self.folder / file.relative_to("/"))
-                return code
+                return subprocess.run(words, check=False).returncode
             case "RUN":
                 return self.run(rest).returncode
             case "COPY":
@@ -79,7 +76,11 @@ class Image:
         return 0
 
     def run(self, command: str) -> "subprocess.CompletedProcess[str]":
-        """Run a shell command as the present user in the present folder."""
+        """Run a shell command as the present user in the present folder, with this computer's certificates."""
+        for file in (Path("/etc/resolv.conf"), CERTIFICATES):  # each time: a step may install Debian's own
+            there = self.folder / file.relative_to("/")
+            there.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(file, there)
         return subprocess.run(
             ["chroot", f"--userspec={self._user}:{self._user}", str(self.folder), "/bin/sh", "-c",
              f"cd {self._place} && {command}"],
