@@ -42,7 +42,7 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import TOPICS, Topic, Writer
 from monstertruckd.assembly.devices import Cabling, build_drivers, measures_battery, of_duty, sensor_services
 from monstertruckd.assembly.estimation import Body, build_estimation, build_slam
-from monstertruckd.assembly.planning import build_planners
+from monstertruckd.assembly.planning import build_planners, build_zones
 from monstertruckd.bus.local import Bus, Tap
 from monstertruckd.bus.peers import PeerService, PeerSubscriber
 from monstertruckd.bus.rpc import Rpc
@@ -190,6 +190,8 @@ class Daemon:
                 self._start_serving(estimation, service)
             for service in self._peer_services():
                 self._start(estimation, service)
+            if (zones := build_zones(self.config, self.bus, self.clock, self._body)) is not None:
+                self._start_serving(planners, zones)
             for service in build_planners(*parts, slam.save_soon if isinstance(slam, SlamService) else None):
                 self._start_serving(planners, service)
             if self._notify is not None:
@@ -376,6 +378,7 @@ class Daemon:
             rear_sonars=self._body.rear_sonars,
             peers=self._body.peers,
             compared=True,
+            zones=config.zones,
             own=config.checks,
         )
         shafts = len(self._body.chassis.shafts)

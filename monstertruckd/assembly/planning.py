@@ -24,6 +24,7 @@ from monstertruck_planners.steps import DEFORMING, EXPLORING, PLANNING, PLANNING
 from monstertruck_planners.track.config import TrackerConfig
 from monstertruck_planners.track.paths import PathService, load_path
 from monstertruck_planners.track.service import TrackerService, TrackSetup
+from monstertruck_planners.zones.service import ZoneInputs, ZoneService
 from monstertruck_runtime.actors.actor import ActorFactory
 from monstertruck_runtime.clock import Clock, VirtualClock
 from monstertruck_runtime.errors import InputError
@@ -137,6 +138,26 @@ def build_planners(
         )
 
 
+def build_zones(config: TruckConfig, bus: Bus, clock: Clock, body: Body) -> ZoneService | None:
+    """Build what keeps the zones of the map; None without zones."""
+    zones = config.zones
+    if zones is None:
+        return None
+    virtual = isinstance(clock, VirtualClock)
+    return ZoneService(
+        zones,
+        clock,
+        max_speed=config.gate.speed,
+        footprint=body.footprint,
+        file=None if virtual else config.state_directory / "zones.json",
+        inputs=ZoneInputs(gate=bus.subscribe(topics.GATE, latest()), pose=bus.subscribe(topics.POSE, latest())),
+        out=bus.publisher(topics.ZONES, Writer.PLANNER),
+        events=bus.event_sink(),
+        offload=inline if virtual else in_thread,
+        max_age=config.gate.max_request_age,
+    )
+
+
 def _build_tracker(
     config: TruckConfig, tracker: TrackerConfig, bus: Bus, clock: Clock, body: Body, requests: Publisher[DriveRequest],
     actors: ActorFactory,
@@ -211,6 +232,7 @@ def build_goals(
         footprint,
         mount,
         cusp_clearance=obstacle.side_clearance + obstacle.ahead,
+        zone_margin=0.0 if config.zones is None else config.zones.margin,
         seen_for=obstacle.memory_time if obstacle.unseen == "stop" else None,
         timed=not isinstance(clock, VirtualClock),
     )
@@ -240,6 +262,7 @@ def build_goals(
             behaviour=bus.subscribe(topics.BEHAVIOUR, latest()),
             slam=bus.subscribe(topics.SLAM, latest()) if mapped else None,
             seen=bus.subscribe(topics.SEEN, latest()) if lidar is not None else None,
+            zones=None if config.zones is None else bus.subscribe(topics.ZONES, latest()),
         ),
         outputs=GoalOutputs(path, planner_request, bus.publisher(topics.GOAL, Writer.PLANNER), bus.event_sink()),
         deformation=_deformation(config, setup, bus, clock, actors),
@@ -261,6 +284,7 @@ def _build_explorer(
         planner.route.margin,
         lidar.mount.planar,
         CameraView() if camera is None else CameraView(mount=camera.mount.planar),
+        zone_margin=0.0 if config.zones is None else config.zones.margin,
     )
     actor = actors.actor(
         config.placement.explorer,
@@ -281,6 +305,7 @@ def _build_explorer(
         events=bus.subscribe(topics.EVENT, fifo(256)),
         health=bus.subscribe(topics.HEALTH, latest()),
         points=None if config.points is None or camera is None else bus.subscribe(topics.POINTS, latest()),
+        zones=None if config.zones is None else bus.subscribe(topics.ZONES, latest()),
     )
     return ExplorerService(
         setup,
@@ -347,4 +372,5 @@ def _deformation(
         pose=bus.subscribe(topics.POSE if mapped else topics.ODOMETRY, latest()),
         grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
         events=bus.event_sink(),
+        zones=None if config.zones is None else bus.subscribe(topics.ZONES, latest()),
     )

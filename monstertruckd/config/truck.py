@@ -31,6 +31,7 @@ from monstertruck_planners.explore.catalog import AnyExplorer
 from monstertruck_planners.goals.config import DRIVEN, PlannerConfig
 from monstertruck_planners.track.catalog import AnyTracker
 from monstertruck_planners.track.config import STEERING_MODES
+from monstertruck_planners.zones.config import ZonesConfig
 from monstertruck_runtime.bodies import AnyBody, build_chassis
 from monstertruck_runtime.slowness import Board
 from monstertruck_schemas.base import Name, Schema
@@ -117,7 +118,13 @@ class PlacementConfig(Schema):
 class TruckConfig(Schema):
     """The configuration of one robot: the root of the YAML file."""
 
-    FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (("path", "file"), ("planner", "map"))
+    FILE_KEYS: ClassVar[tuple[tuple[str, ...], ...]] = (
+        ("path", "file"),
+        ("planner", "map"),
+        ("zones", "file"),
+        ("zones", "keepout_mask", "map"),
+        ("zones", "speed_mask", "map"),
+    )
     """Keys that name files which must exist; relative to the configuration file that names them."""
 
     version: Literal[2]
@@ -162,6 +169,8 @@ class TruckConfig(Schema):
     """Tilt and roughness of the ground, for the routes of a robot with a compass; null = not estimated"""
     points: PointsConfig | None = None
     """Points of interest in the map: tags that the camera sees (extra vision), and marked places; null = none"""
+    zones: ZonesConfig | None = None
+    """Keepout and speed zones of the map; null = none, and operators cannot add any"""
     recorder: RecorderConfig | None = None
     blackbox: BlackBoxConfig | None = BlackBoxConfig()
     """Saves the minute before every stop by the gate; null = off"""

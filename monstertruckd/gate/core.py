@@ -18,6 +18,7 @@ from typing import Any, Final, NamedTuple, assert_never
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_planners.collision import Footprint, ScanPoints
+from monstertruck_planners.zones.config import ZonesConfig
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.requests import OPERATORS, late_text
 from monstertruck_runtime.stop_text import causes_text
@@ -54,6 +55,7 @@ from monstertruckd.gate.sensors import (
 )
 from monstertruckd.gate.sonars import Place, SonarCheck
 from monstertruckd.gate.stops import Outages, StopLog, lease_cause
+from monstertruckd.gate.zones import ZoneCheck
 
 URGENT: Final = frozenset(
     {Reason.DRIVE_STALE, Reason.DRIVE_FAULT, Reason.TICK_STALLED, Reason.SERVICE_FAILED, Reason.SHUTDOWN}
@@ -78,6 +80,7 @@ HALTS: Final = frozenset(
         Reason.OBSTACLE_STOP,
         Reason.UNSEEN_STOP,
         Reason.CONTACT,
+        Reason.KEEPOUT,
         Reason.LIDAR_BLIND,
         Reason.SONAR_STALE,
         Reason.SONAR_BLIND,
@@ -197,6 +200,7 @@ class Gate:
         rear_sonars: rear-facing sonars of a robot with a lidar, as ``sonars``.
         peers: outlines of other robots whose poses are received, by name.
         compared: whether the robot has to compare its measures of motion.
+        zones: settings of the zones; None without zones.
         own: settings of checks added by the configuration, by name.
     """
 
@@ -215,6 +219,7 @@ class Gate:
         rear_sonars: Mapping[str, Place] | None = None,
         peers: Mapping[str, Footprint] | None = None,
         compared: bool = False,
+        zones: ZonesConfig | None = None,
         own: Mapping[str, CheckConfig] = MappingProxyType({}),
     ) -> None:
         self._limits = InForce(config)
@@ -233,6 +238,7 @@ class Gate:
                 self._limiter,
                 *(() if self._contact is None else (self._contact,)),
                 *obstacle_checks(view, points, sonars, rear_sonars, peers),
+                *(() if zones is None else (ZoneCheck(zones, view),)),
                 *(OwnCheck(view, name, settings) for name, settings in own.items()),
             )
         )

@@ -5,11 +5,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import placed
 from monstertruck_planners.collision import UnitTwist, swept_poses
+from monstertruck_planners.zones.shapes import inside
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.event import Measurement
@@ -83,21 +82,3 @@ class FenceCheck(Check):
         if self._free is not None and math.isfinite(self._free):
             limit = self.view.config.obstacle.ahead
             yield Measurement(name="distance to the fence", value=self._free, unit="m", limit=limit)
-
-
-def inside(points: Array, corners: Array) -> NDArray[np.bool_]:
-    """Return which points lie inside a polygon, by the even-odd rule.
-
-    Args:
-        points: points, shape (..., 2), m.
-        corners: corners of the polygon, shape (n, 2), m.
-
-    Returns:
-        Shape (...,).
-    """
-    x, y = points[..., 0, None], points[..., 1, None]
-    (x0, y0), (x1, y1) = corners.T, np.roll(corners, -1, axis=0).T
-    crosses = (y0 > y) != (y1 > y)
-    rise = np.where(y1 == y0, 1.0, y1 - y0)
-    left = x < x0 + (y - y0) / rise * (x1 - x0)
-    return np.asarray((crosses & left).sum(axis=-1) % 2 == 1)

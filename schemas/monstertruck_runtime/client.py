@@ -65,6 +65,7 @@ from monstertruck_schemas.topics import (
     estop_key,
     rpc_key,
 )
+from monstertruck_schemas.zones import OFF_FOR, ZoneArea, ZoneOrder
 
 log = logging.getLogger(__name__)
 
@@ -461,6 +462,28 @@ class TruckClient(Operator):
         x, y = (None, None) if place is None else place
         return await self.call(
             "points", {**await self.header(), "order": order, "name": name, "x": x, "y": y, "yaw": yaw}
+        )
+
+    async def zone(
+        self, order: ZoneOrder, name: str, area: ZoneArea | None = None, seconds: float = OFF_FOR
+    ) -> dict[str, Any]:
+        """Add or remove a zone, or turn one on, or off for a while; all are on ``state/zones``.
+
+        Args:
+            order: what.
+            name: of the zone.
+            area: polygon of a new zone.
+            seconds: how long it is off (s).
+
+        Raises:
+            RequestRefusedError: why not.
+            NotFoundError: the robot, or the zone, is not there, or the robot keeps none.
+            InputError: the zone is one of the configuration's.
+            NoAnswerError: no answer in time.
+        """
+        polygon = None if area is None else area.model_dump(mode="json")
+        return await self.call(
+            "zones", {**await self.header(), "order": order, "name": name, "area": polygon, "seconds": seconds}
         )
 
     async def mission(

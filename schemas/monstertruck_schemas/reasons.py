@@ -1,7 +1,7 @@
 """One enum of reason codes, shared by gate, services, RPC, events and CLI exit codes.
 
-Members only ever get added; a value or an exit code is never reused, and exit codes stay below 126. Plug-ins use the
-members there are.
+Members only ever get added; a value is never reused, and exit codes stay below 126. All of those are taken: a failure
+added later has the exit code of the broader failure next to it. Plug-ins use the members there are.
 """
 
 from collections.abc import Iterable
@@ -77,6 +77,8 @@ class Reason(StrEnum):
     TILT_STOP = "tilt_stop", 54, "dangerous tilt"
     OBSTACLE_SLOW = "obstacle_slow", 55, "obstacle ahead: speed limited"
     OBSTACLE_STOP = "obstacle_stop", 56, "obstacle within the stopping distance"
+    KEEPOUT = "keepout", 56, "a keepout zone is ahead, or the robot is in one"
+    ZONE_SLOW = "zone_slow", 0, "speed zone: speed limited"
     BATTERY_LOW = "battery_low", 57, "battery low: speed limited"
     BATTERY_CRITICAL = "battery_critical", 58, "battery critical"
     BATTERY_STALE = "battery_stale", 59, "no fresh battery voltage"
@@ -216,6 +218,11 @@ class Reason(StrEnum):
     POINT_FOUND = "point_found", 0, "the camera found a point of interest"
     POINT_CHANGED = "point_changed", 0, "an operator marked or removed a point of interest"
     POINTS_FOUND = "points_found", 0, "as many points of interest as were asked for are found"
+    ZONE_CHANGED = "zone_changed", 0, "an operator added or removed a zone"
+    ZONE_OFF = "zone_off", 0, "an operator turned a zone off for a while"
+    ZONE_ON = "zone_on", 0, "a zone is in force again"
+    ZONE_ENTERED = "zone_entered", 0, "the robot reaches into a zone"
+    ZONE_LEFT = "zone_left", 0, "the robot is out of a zone"
     MISSION_STARTED = "mission_started", 0, "a mission was started"
     MISSION_STEP = "mission_step", 0, "a step of a mission begins"
     MISSION_NOTE = "mission_note", 0, "a note that a mission leaves in the log"

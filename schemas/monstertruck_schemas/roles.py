@@ -67,6 +67,7 @@ class ServiceName(StrEnum):
     TRANSFORMS = "transforms"
     USB = "usb"
     ZENOH = "zenoh"
+    ZONES = "zones"
 
 
 class AccessRole(StrEnum):

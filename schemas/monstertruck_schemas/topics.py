@@ -73,6 +73,7 @@ from monstertruck_schemas.state import (
     Transforms,
 )
 from monstertruck_schemas.usb import UsbTree
+from monstertruck_schemas.zones import Zones
 
 M = TypeVar("M", bound=Message)
 
@@ -235,6 +236,13 @@ POINTS: Final = Topic(
     PointsOfInterest,
     W.ESTIMATION,
     "Points of interest in map: tags that the camera found, places that were marked",
+    retained=True,
+)
+ZONES: Final = Topic(
+    "state/zones",
+    Zones,
+    W.PLANNER,
+    "Keepout and speed zones of the map, those that are off, and those that the robot is in",
     retained=True,
 )
 PEERS: Final = Topic(

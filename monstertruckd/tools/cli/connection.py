@@ -87,7 +87,7 @@ async def not_ready(client: "TruckClient") -> str:
     return f"; not ready: {named}" if named else ""
 
 
-EXAMPLES = {"explorer": "explore", "planner": "goals", "points": "points"}
+EXAMPLES = {"explorer": "explore", "planner": "goals", "points": "points", "zones": "zones"}
 """Bundled configurations that have a section."""
 
 

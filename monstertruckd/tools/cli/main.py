@@ -35,6 +35,7 @@ from monstertruckd.tools.cli import (
     tryout,
     tune,
     usb,
+    zones,
 )
 from monstertruckd.tools.cli.output import HELP_SETTINGS, HELP_STYLE, CommandGroup, Commands
 
@@ -112,6 +113,7 @@ app.add_typer(tune.app, name="tune")
 app.add_typer(stand.app, name="stand")
 app.add_typer(maps.app, name="map")
 app.add_typer(points.app, name="points")
+app.add_typer(zones.app, name="zone")
 app.add_typer(security.app, name="security")
 
 

@@ -57,7 +57,8 @@ GIVEN: Final = frozenset({topics.PATH.name, topics.GATE.name})
 ASKED: Final = frozenset(
     topic.name
     for topic in (
-        topics.GATE, topics.SEEN, topics.GROUND, topics.REQ_GOAL, topics.REQ_GOAL_CONTROL, topics.REQ_PATH,
+        topics.GATE, topics.SEEN, topics.GROUND, topics.ZONES,
+        topics.REQ_GOAL, topics.REQ_GOAL_CONTROL, topics.REQ_PATH,
     )
 )  # fmt: skip
 """Not computed again, but read by planner and tracker where the robot drives to goals, whose paths are computed. Ground

@@ -7,6 +7,7 @@ from monstertruck_planners.collision import Footprint
 from monstertruck_planners.explore.catalog import AnyExplorer
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Grid
+from monstertruck_schemas.zones import Zones
 
 Point = tuple[float, float]
 """x, y (m)."""
@@ -41,6 +42,8 @@ class ExploreSetup:
     lidar: Pose2 = (0.0, 0.0, 0.0)
     """Lidar pose in base."""
     camera: CameraView = CameraView()
+    zone_margin: float = 0.0
+    """Clearance from keepout zones required by the gate (m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +71,8 @@ class ExploreTask:
     """Home pose, if the path to it is requested."""
     find: bool = False
     """Whether walls are viewed once no frontier is left."""
+    zones: Zones | None = None
+    """Zones of the map, if they have changed; then the map comes as a whole."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from monstertruck_planners.explore.config import InformationConfig
 from monstertruck_planners.explore.exchange import CameraView, ExploreAnswer, ExploreSetup, ExploreTask, Viewpoint
 from monstertruck_planners.explore.frontier import FrontierMap
 from monstertruck_planners.explore.look import WallLooks
+from monstertruck_planners.zones.shapes import ZoneLayer, in_force
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.state import Grid
@@ -29,6 +30,7 @@ class ExploringStep:
         self._setup: ExploreSetup | None = None
         self._explorer: Explorer | None = None
         self._map: FrontierMap | None = None
+        self._layer = ZoneLayer()
         self._memory = Remembered()
         self._looks = WallLooks(CameraView())
 
@@ -43,7 +45,9 @@ class ExploringStep:
             self._looks = WallLooks(task.setup.camera)
         if self._setup is None or self._explorer is None:
             raise InputError("exploring: expected a setup before anything else")
-        self._take(task)
+        if task.zones is not None:
+            self._layer = ZoneLayer(in_force(task.zones), self._layer)
+        self._take(task, self._setup.zone_margin)
         known = self._map
         if known is None:
             return ExploreAnswer()
@@ -64,11 +68,12 @@ class ExploringStep:
             home=None if task.home is None else view.path_length_to(task.home[:2]),
         )
 
-    def _take(self, task: ExploreTask) -> None:
-        for grid, whole in (
+    def _take(self, task: ExploreTask, margin: float) -> None:
+        for news, whole in (
             *(((task.whole, True),) if task.whole is not None else ()),
             *((t, False) for t in task.tiles),
         ):
+            grid = zoned(news, self._layer, margin)
             if self._map is None:
                 self._map = FrontierMap(grid)
             else:
@@ -82,6 +87,15 @@ class ExploringStep:
         # 1.0: a frontier within this distance (m) of the current one is its successor
         near = [option for option in view.options if math.dist(option.frontier.middle, current.frontier) < 1.0]
         return min(near, key=lambda option: math.dist(option.frontier.middle, current.frontier), default=None)
+
+
+def zoned(grid: Grid, layer: ZoneLayer, margin: float) -> Grid:
+    """Return a grid with the cells of keepout zones occupied: no viewpoint and no way there, and nothing to find."""
+    if not layer.shapes:
+        return grid
+    origin = (grid.origin.x, grid.origin.y, grid.origin.yaw)
+    closed = layer.keepout_cells((grid.height, grid.width), grid.resolution, origin, margin)
+    return grid.model_copy(update={"cells": np.where(closed.ravel(), np.int8(100), grid.cells)})
 
 
 class ExploringWorker(ExploringStep):

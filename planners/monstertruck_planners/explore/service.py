@@ -15,6 +15,7 @@ from monstertruck_planners.explore.exploration import Action, Cancel, Choose, Ex
 from monstertruck_planners.goals.exchange import pose_of
 from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.tasks import TaskServer
+from monstertruck_planners.zones.shapes import changed
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
@@ -32,6 +33,7 @@ from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Battery, BatteryLevel
 from monstertruck_schemas.state import GateMode, GateState, Grid, Odometry
 from monstertruck_schemas.topics import BATTERY, POSE, SLAM
+from monstertruck_schemas.zones import Zones
 
 SOURCE: Final = ServiceName.EXPLORER.value
 """Source of the goals."""
@@ -56,6 +58,7 @@ class ExplorerInputs:
     events: Mailbox[Event]
     health: Subscription[HealthTable]
     points: Subscription[PointsOfInterest] | None = None
+    zones: Subscription[Zones] | None = None
 
 
 class ExplorerService:
@@ -102,6 +105,7 @@ class ExplorerService:
         self._whole: Grid | None = None
         self._sent_whole: Grid | None = None
         self._sent_tiles = 0
+        self._sent_zones: Zones | None = None
         self._fresh = True
         self._deciding: asyncio.Task[ExploreAnswer] | None = None
         self._tasks: asyncio.TaskGroup | None = None
@@ -311,7 +315,10 @@ class ExplorerService:
     def _choose(self, run: Exploration) -> None:
         assert self._tasks is not None
         assert run.before is not None
-        whole = self._whole if self._fresh or self._whole is not self._sent_whole else None
+        newest = None if self._in.zones is None else self._in.zones.latest
+        zones = newest if self._fresh else changed(newest, self._sent_zones)
+        resent = self._fresh or zones is not None or self._whole is not self._sent_whole
+        whole = self._whole if resent else None
         if whole is not None:
             self._sent_tiles = 0
         tiles = tuple(self._tiles)[self._sent_tiles :]
@@ -328,7 +335,9 @@ class ExplorerService:
             avoided=run.unreached.banned(now),
             home=run.home,
             find=run.find is not None,
+            zones=zones,
         )
+        self._sent_zones = newest
         self._fresh, self._sent_whole, self._sent_tiles = False, self._whole, len(self._tiles)
         self._deciding = self._tasks.create_task(self._ask(task))
 

@@ -26,6 +26,7 @@ from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.api import Vehicle, make_planner, warm_up
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import moved
+from monstertruck_planners.zones.shapes import ZoneLayer, in_force
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.reasons import Reason
@@ -109,11 +110,12 @@ class Window:
         column, row = self._corner or (0, 0)
         return column * self.config.resolution, row * self.config.resolution
 
-    def field(self, known: DistanceField | None = None) -> DistanceField:
+    def field(self, known: DistanceField | None = None, closed: NDArray[np.bool_] | None = None) -> DistanceField:
         """Return the distance field of the window.
 
         Args:
             known: map obstacles, added to the seen ones; outside the map nothing is added.
+            closed: further cells to keep out of, same shape as ``cells``.
         """
         x, y = self.corner
         res = self.config.resolution
@@ -127,6 +129,8 @@ class Window:
             middles = np.stack((px, py), axis=-1)
             near = known.lookup(middles) < 0.5 * max(res, known.resolution)
             occupied = occupied | (near & known.inside(middles))
+        if closed is not None:
+            occupied = occupied | closed
         return DistanceField(occupied, res, (x, y, 0.0))
 
     def _move(self, base: tuple[float, float]) -> None:
@@ -155,6 +159,7 @@ class DeformStep:
     def __init__(self) -> None:
         self._setup: Setup | None = None
         self._walls: DistanceField | None = None
+        self._layer = ZoneLayer()
         self._number = 0
         """Number of the route; 0 before the first one."""
         self._rest: PosePath | None = None
@@ -173,6 +178,9 @@ class DeformStep:
             raise InputError("deforming: expected a setup before anything else")
         if task.grid is not None:
             self._walls = DistanceField.from_grid(task.grid, unknown_blocks=False)
+        if task.zones is not None:
+            self._layer = ZoneLayer(in_force(task.zones), self._layer)
+        zones, margin = self._layer.outside(setup.footprint, task.pose), setup.zone_margin
         points, mapped = self._observe(setup, task)
         if task.route is not None:
             self._begin(task.route, task.number, drivable=task.drivable)
@@ -180,12 +188,16 @@ class DeformStep:
             return DeformAnswer(0, "idle")
         here = self._vehicle.reference_pose(task.pose)
         self._advance(here)
-        if self._drivable and self._free(setup, here, task.pose, points, mapped):
+        if (
+            self._drivable
+            and self._free(setup, here, task.pose, points, mapped)
+            and self._outside(setup, here, task.pose, zones, margin)
+        ):
             self._rest, self._state = None, LocalPlannerState()
             return DeformAnswer(self._number, "free", place=self._place, complete=True)
         if self._rest is None:
             self._rest = self._guide.part(self._place, len(self._guide.poses))
-        result = self._planner.plan(self._rest, self._window.field(self._walls), here, self._state)
+        result = self._planner.plan(self._rest, self._field(zones, margin), here, self._state)
         self._state = result.state
         return self._answer(result)
 
@@ -249,14 +261,34 @@ class DeformStep:
         deformed = self._rest is not None
         if deformed and pose_distance(guide.poses[at], here) > local.rejoin_distance:
             return False
-        end = int(np.searchsorted(self._travelled, self._travelled[at] + setup.config.look_ahead)) + 1
-        rest = np.vstack((here, guide.poses[at + 1 : end]))
         margin = local.clearance + (local.rejoin_clearance if deformed else 0.0)
-        relative = poses_relative(moved(rest, -self._vehicle.reference), pose)
+        relative = poses_relative(self._ahead(here, setup.config.look_ahead), pose)
         return (
             first_contact(setup.footprint, relative, points[~mapped], margin) is None
             and first_contact(setup.footprint, relative, points[mapped]) is None
         )
+
+    def _outside(self, setup: Setup, here: Array, pose: Pose2, zones: ZoneLayer, margin: float) -> bool:
+        """Whether the route ahead keeps ``margin`` (m) away from the zones."""
+        reach = setup.config.look_ahead
+        edges = zones.keepout_near(pose[:2], reach + setup.footprint.circumscribed_radius + margin)
+        relative = poses_relative(self._ahead(here, reach), pose)
+        return first_contact(setup.footprint, relative, points_relative(edges, pose), margin) is None
+
+    def _ahead(self, here: Array, reach: float) -> Array:
+        """Return the poses of the base here and on the route ahead, up to ``reach`` (m), shape (m, 3)."""
+        at = self._place
+        end = int(np.searchsorted(self._travelled, self._travelled[at] + reach)) + 1
+        return moved(np.vstack((here, self._guide.poses[at + 1 : end])), -self._vehicle.reference)
+
+    def _field(self, zones: ZoneLayer, margin: float) -> DistanceField:
+        """Return the distance field of the window, the map's obstacles and the zones."""
+        window = self._window
+        closed = None
+        if zones.shapes:
+            corner = (*window.corner, 0.0)
+            closed = zones.keepout_cells(window.cells.shape, window.config.resolution, corner, margin)
+        return window.field(self._walls, closed)
 
     def _answer(self, result: LocalPlan) -> DeformAnswer:
         number, path = self._number, result.path

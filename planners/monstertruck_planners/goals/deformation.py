@@ -14,6 +14,7 @@ from monstertruck_planners.goals.exchange import (
     twist_of,
 )
 from monstertruck_planners.pose_path import PosePath
+from monstertruck_planners.zones.shapes import changed
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import WorkerError
@@ -25,6 +26,7 @@ from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Odometry
 from monstertruck_schemas.topics import ODOMETRY
+from monstertruck_schemas.zones import Zones
 
 DEFORM_RETRY: Final = 10.0
 """Delay until a deforming step that did not start is started again (s)."""
@@ -40,6 +42,7 @@ class RouteDeformation:
         scan: mailbox of all scans.
         pose: pose of the truck in the frame of the routes.
         grid: map; None for the configured map.
+        zones: zones of the map; None without zones.
         events: event sink.
     """
 
@@ -55,11 +58,14 @@ class RouteDeformation:
         pose: Subscription[Odometry],
         grid: Subscription[Grid] | None,
         events: EventSink,
+        zones: Subscription[Zones] | None = None,
     ) -> None:
         self._setup, self._local, self._clock, self._actor = setup, setup.config.local, clock, actor
         self._scan, self._pose, self._grid, self._events = scan, pose, grid, events
+        self._zones = zones
         self._fresh = True
         self._sent_grid: Grid | None = None
+        self._sent_zones: Zones | None = None
         self._number = 0
         self._route: RouteAnswer | None = None
         self._sent_route = 0
@@ -173,6 +179,7 @@ class RouteDeformation:
         if odometry is None or self._clock.now() - odometry.received > ODOMETRY.fresh_for() * SECOND:
             return None
         grid = None if self._grid is None else self._grid.latest
+        zones = None if self._zones is None else self._zones.latest
         route = None
         if self._route is not None and (self._fresh or self._sent_route != self._number):
             route, self._sent_route = self._path, self._number
@@ -187,8 +194,9 @@ class RouteDeformation:
             deviation=odometry.position_deviation,
             stamp=odometry.stamp,
             twist=twist_of(odometry),
+            zones=zones if self._fresh else changed(zones, self._sent_zones),
         )
-        self._fresh, self._sent_grid = False, grid
+        self._fresh, self._sent_grid, self._sent_zones = False, grid, zones
         return task
 
     def _note(self, answer: DeformAnswer) -> None:

@@ -14,6 +14,7 @@ from monstertruck_schemas.health import PLACELESS, SlamHealth
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import Grid, Ground, Odometry
+from monstertruck_schemas.zones import Zones
 
 Place = tuple[float, float, float | None]
 """x, y (m), and yaw (rad), or None for any yaw."""
@@ -30,6 +31,8 @@ class Setup:
     """Pose of the lidar in base."""
     cusp_clearance: float = 0.0
     """Clearance required by the gate at a cusp (m)."""
+    zone_margin: float = 0.0
+    """Clearance from keepout zones required by the gate (m)."""
     seen_for: float | None = None
     """Maximum age of seen ground in the gate (s); None if the gate lets the robot reverse anywhere."""
     timed: bool = False
@@ -88,6 +91,8 @@ class PlanTask:
     """Scans since the previous task, oldest first."""
     ground_seen: SeenGround | None = None
     """Seen ground; None if unknown: routes may reverse anywhere."""
+    zones: Zones | None = None
+    """Zones of the map, if newer than in the previous task."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +136,8 @@ class DeformTask:
     """Time stamp of the pose (ns)."""
     twist: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Vx, vy (m/s), wz (rad/s) of the base since the scan."""
+    zones: Zones | None = None
+    """Zones of the map, if newer than with the previous scan."""
 
 
 Finding = Literal["idle", "free", "kept", "new", "blocked"]

@@ -26,6 +26,7 @@ REFUSED: Final = frozenset(
         Reason.BAD_INPUT,
         Reason.NO_MAP,
         Reason.UNSEEN_STOP,
+        Reason.KEEPOUT,
     }
 )
 """Reasons that refuse a goal if its first route fails; later they may be temporary."""

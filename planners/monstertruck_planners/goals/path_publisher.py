@@ -24,6 +24,7 @@ from monstertruck_schemas.req import DriveRequest, GoalControl, GoalRequest
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import GateState, Grid, Ground, Odometry
+from monstertruck_schemas.zones import Zones
 
 SOURCE: Final = ServiceName.GOALS.value
 AT_REST: Final = 0.01
@@ -48,6 +49,7 @@ class GoalInputs:
     behaviour: Subscription[BehaviourState] | None = None
     slam: Subscription[SlamHealth] | None = None
     seen: Subscription[Grid] | None = None
+    zones: Subscription[Zones] | None = None
 
 
 @dataclass(frozen=True, slots=True)

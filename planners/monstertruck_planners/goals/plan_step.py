@@ -28,12 +28,14 @@ from monstertruck_planners.route.config import GoalConfig, GridAstarConfig, Hybr
 from monstertruck_planners.route.departure import leaving
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.replan import ViaPoint, replan, with_headings
+from monstertruck_planners.zones.shapes import ZoneLayer, in_force
 from monstertruck_runtime.clock import processor_time
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.plan import MAX_COORDINATE, MAX_POSES, MAX_RUNS, Steering
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GROUND_UNKNOWN, ROUGHNESS_STEP, TILT_STEP, Grid, Ground
+from monstertruck_schemas.zones import Zone
 
 log = logging.getLogger(__name__)
 
@@ -268,6 +270,9 @@ class PlanningStep:
         self._layers: tuple[Array, Array] | None = None
         """Tilt and roughness of the map cells."""
         self._route_map: RouteMap | None = None
+        self._layer = ZoneLayer()
+        self._keepout: NDArray[np.bool_] | None = None
+        """Map cells closed by keepout zones; None if they are to be computed."""
         self._memory = ObstacleMemory(SQUARE)
         self._route: MotionPath | None = None
         self._closed: Array = np.empty((0, 2))
@@ -285,7 +290,9 @@ class PlanningStep:
         if self._setup is None:
             raise InputError("planning: expected a setup before anything else")
         if task.grid is not None:
-            self._map, self._layers = StaticMap.of(task.grid, self._map), None
+            self._map, self._layers, self._keepout = StaticMap.of(task.grid, self._map), None, None
+        if task.zones is not None:
+            self._layer, self._keepout = ZoneLayer(in_force(task.zones), self._layer), None
         if task.ground is not None:
             self._ground, self._layers = task.ground, None
         if self._map is None:
@@ -320,7 +327,7 @@ class PlanningStep:
                 return
             for remark in world.remarks:
                 log.warning("%s", remark)
-            self._layers = None
+            self._layers = self._keepout = None
             self._map = StaticMap(world.cells, world.resolution, (*world.origin, 0.0))
 
     def _observe(self, setup: Setup, static_map: StaticMap, task: PlanTask) -> None:
@@ -342,6 +349,8 @@ class PlanningStep:
         Unseen ground covered by one route is closed to the next.
         """
         self._closed = np.empty((0, 2))
+        if inside := self._zones_around(task.pose):
+            return self._leave(static_map, task, inside)
         answer = self._plan_known(static_map, task)
         unseen = self._unseen(task)
         if unseen is None or not answer.drivable or not len(met := self._met(unseen, answer)):
@@ -359,6 +368,56 @@ class PlanningStep:
         remedy = "drive it forward by hand first, or back with the second control"
         text = f"every way found leads back onto ground that no sensor has seen, at {x:.1f}, {y:.1f}: {remedy}"
         return look or RouteAnswer(Reason.UNSEEN_STOP, text)
+
+    def _zones_around(self, pose: Pose2) -> list[Zone]:
+        """Return the keepout zones that the robot is in."""
+        assert self._setup is not None
+        return [shape.zone for shape, limit in self._layer.reached(self._setup.footprint, pose) if limit == 0.0]
+
+    def _leave(self, static_map: StaticMap, task: PlanTask, inside: list[Zone]) -> RouteAnswer:
+        """Plan the shortest of some ways out of keepout zones, which are open on this way only."""
+        assert self._setup is not None
+        if held := [zone.name for zone in inside if zone.inside == "stop"]:
+            return RouteAnswer(Reason.KEEPOUT, f"the robot is in the keepout zone {', '.join(held)}")
+        names = [zone.name for zone in inside]
+        closed = self._map_of(self._with_zones(static_map.cells, static_map), static_map).field
+        directions = np.arange(16) * (math.tau / 16)
+        # 0.1: distance between tried places (m); 4.0: farthest (m)
+        around = [(r, a, yaw) for r in np.arange(0.1, 4.0, 0.1) for a in directions for yaw in directions]
+        far, bearing, yaw = np.array(around).T
+        poses = np.column_stack(
+            (task.pose[0] + far * np.cos(bearing), task.pose[1] + far * np.sin(bearing), task.pose[2] + yaw)
+        )
+        poses = poses[closed.free(self._setup.footprint, poses, self._planner.config.margin)]
+        there = np.array([self._vehicle.reference_pose(pose) for pose in poses]).reshape(-1, 3)
+        start = np.tile(self._vehicle.reference_pose(task.pose), (len(there), 1))
+        far = self._vehicle.reeds_shepp().distance(start, there) if len(there) else np.empty(0)
+        layer, self._layer = (
+            self._layer,
+            ZoneLayer([shape.zone for shape in self._layer.shapes if shape.zone.name not in names], self._layer),
+        )
+        self._keepout = self._route = None
+        try:
+            for index in np.argsort(far)[:4].tolist():  # maximum number of tried places
+                x, y, heading = poses[index].tolist()
+                answer = self._plan_known(static_map, replace(task, goal=(x, y, heading), via=()))
+                if answer.path is not None:
+                    text = f"{answer.length:.2f} m out of the keepout zone {', '.join(names)}"
+                    return replace(answer, text=text, complete=False)
+        finally:
+            self._layer, self._keepout, self._route = layer, None, None
+        return RouteAnswer(Reason.KEEPOUT, f"no way out of the keepout zone {', '.join(names)} was found")
+
+    def _with_zones(self, cells: Cells, static_map: StaticMap) -> Cells:
+        """Return the cells of the map, those of keepout zones occupied."""
+        assert self._setup is not None
+        if not self._layer.shapes:
+            return cells
+        if self._keepout is None:
+            self._keepout = self._layer.keepout_cells(
+                static_map.cells.shape, static_map.resolution, static_map.origin, self._setup.zone_margin
+            )
+        return np.where(self._keepout, np.int8(100), cells)
 
     def _look(self, static_map: StaticMap, task: PlanTask, unseen: Unseen) -> RouteAnswer | None:
         """Plan a route to a viewpoint on the closed ground; None if none was found."""
@@ -428,6 +487,7 @@ class PlanningStep:
             touching = rectangle_distance(self._setup.footprint, pose, points)[0] < 1.5 * static_map.resolution
             points = points[~touching]
         cells = static_map.with_points(points) if len(points) else static_map.cells
+        cells = self._with_zones(cells, static_map)
         self._route_map = route_map = self._map_of(cells, static_map)
         start, goal = (self._vehicle.reference_pose(p) for p in (task.pose, task.goal))
         through = with_headings(task.pose, [ViaPoint(*place) for place in (*task.via, task.goal)])
@@ -521,7 +581,8 @@ class PlanningStep:
         assert setup is not None
         config = setup.config
         known = np.vstack((self._memory.places, self._memory.suspended))
-        near = static_map.obstacles(static_map.with_points(known), task.pose, NEARBY)
+        cells = self._with_zones(static_map.with_points(known), static_map)
+        near = static_map.obstacles(cells, task.pose, NEARBY)
         found = escape(
             config.escape,
             setup.geometry,

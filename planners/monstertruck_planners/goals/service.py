@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import Pose2, placed, points_placed, poses_relative
+from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_relative, poses_relative
 from monstertruck_planners.collision import scan_points_at
 from monstertruck_planners.goals import goal_run
 from monstertruck_planners.goals.deformation import RouteDeformation, event_of
@@ -38,6 +38,7 @@ from monstertruck_planners.goals.path_publisher import (
     poses_ahead,
 )
 from monstertruck_planners.tasks import TaskServer
+from monstertruck_planners.zones.shapes import ZoneLayer, changed, in_force
 from monstertruck_runtime.actors.actor import Actor
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.errors import RequestRefusedError, TruckError
@@ -52,6 +53,7 @@ from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.state import GateMode, GateState, Grid, Ground, Odometry
 from monstertruck_schemas.topics import ODOMETRY, SCAN
+from monstertruck_schemas.zones import Zones
 
 REPORT: Final = SECOND // 2
 """Report period without a change (ns)."""
@@ -123,6 +125,10 @@ class GoalService:
         self._fresh = True
         self._sent_grid: Grid | None = None
         self._sent_ground: Ground | None = None
+        self._zones: Zones | None = None
+        """Zones of the layer."""
+        self._layer = ZoneLayer()
+        self._sent_zones: Zones | None = None
         self._scanned: tuple[LaserScan, Odometry] | None = None
         self._points: Array = np.empty((0, 2))
         self._seen: deque[tuple[Pose2, Array]] = deque(maxlen=40)  # latest scans kept for the next plan
@@ -204,7 +210,24 @@ class GoalService:
             raise RequestRefusedError(Reason.BAD_INPUT, f"goal: expected at most {MAX_COORDINATE:g} m and rad")
         if _estopped(self._in.gate.latest):
             raise RequestRefusedError(Reason.ESTOPPED)
+        self._require_outside_zones(goal, via)
         return goal, via
+
+    def _require_outside_zones(self, goal: Pose2, via: tuple[Place, ...]) -> None:
+        layer, margin = self._zone_layer(), self._setup.zone_margin
+        if (name := layer.keepout(self._setup.footprint, goal, margin)) is not None:
+            raise RequestRefusedError(Reason.KEEPOUT, f"goal: the robot would reach into the keepout zone {name}")
+        for number, place in enumerate(via, 1):
+            if (name := layer.keepout_at(place[:2])) is not None:
+                text = f"waypoint {number} of {len(via)}: in the keepout zone {name}"
+                raise RequestRefusedError(Reason.KEEPOUT, text)
+
+    def _zone_layer(self) -> ZoneLayer:
+        """Return the ground of the zones in force."""
+        newest = None if self._in.zones is None else self._in.zones.latest
+        if (news := changed(newest, self._zones)) is not None:
+            self._zones, self._layer = news, ZoneLayer(in_force(news), self._layer)
+        return self._layer
 
     def begin(self, accepted: Route, request: GoalRequest | GoalControl, number: int) -> None:
         """Replace the current goal by a new one."""
@@ -309,10 +332,13 @@ class GoalService:
     def _blocked(self, followed: Followed, along: float, odometry: Odometry, now: int) -> bool:
         if self._deformation is not None and self._deformation.active:
             return self._deformation.blocked(now)
-        points = self._scan(odometry, now)
+        pose = pose_of(odometry)
+        zones = self._zone_layer().outside(self._setup.footprint, pose)
+        reach = self._config.look_ahead + self._setup.footprint.circumscribed_radius
+        edges = points_relative(zones.keepout_near(pose[:2], reach), pose)
+        points = np.vstack((self._scan(odometry, now), edges))
         if not len(points):
             return False
-        pose = pose_of(odometry)
         ahead = poses_ahead(followed.path, along, self._config.look_ahead, pose)
         return path_blocked(self._setup.footprint, ahead, points, pose)
 
@@ -393,6 +419,7 @@ class GoalService:
         ground = None if self._in.ground is None else self._in.ground.latest
         if ground is not None and ground.frame != odometry.frame:
             ground = None
+        zones = None if self._in.zones is None else self._in.zones.latest
         lidar = np.array([self._setup.lidar[:2]])
         seen = tuple(SeenScan(points_placed(points, at), points_placed(lidar, at)[0]) for at, points in self._seen)
         self._seen.clear()
@@ -410,8 +437,9 @@ class GoalService:
             deviation=odometry.position_deviation,
             seen=seen,
             ground_seen=self._ground_seen(),
+            zones=zones if self._fresh else changed(zones, self._sent_zones),
         )
-        self._fresh, self._sent_grid, self._sent_ground = False, grid, ground
+        self._fresh, self._sent_grid, self._sent_ground, self._sent_zones = False, grid, ground, zones
         self._planning = self._tasks.create_task(self._ask(task))
 
     async def _ask(self, task: PlanTask) -> RouteAnswer:

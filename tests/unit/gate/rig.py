@@ -69,6 +69,7 @@ def make_gate(
     battery_measured=False,
     rear_sonars=None,
     peers=None,
+    zones=None,
     own=None,
     **config,
 ):
@@ -83,6 +84,7 @@ def make_gate(
         latched=latched,
         rear_sonars=rear_sonars,
         peers=peers,
+        zones=zones,
         own=own or {},
     )
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from monstertruck_planners.zones.shapes import inside
 from monstertruck_runtime.plugins import Catalog
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D, Twist2D
@@ -14,7 +15,6 @@ from monstertruck_schemas.req import Order
 from monstertruck_schemas.state import GateMode, Odometry
 from monstertruckd.gate.catalog import CheckConfig, FenceConfig
 from monstertruckd.gate.checks import Check, Checks, PaceLimit
-from monstertruckd.gate.fence import inside
 from tests.unit.gate.rig import Rig, header, make_gate, show
 
 

@@ -107,8 +107,10 @@ def test_keys_that_are_no_topics():
 
 
 def test_reasons_have_stable_exit_codes_and_texts():
-    failing = [reason.exit_code for reason in Reason if reason.exit_code]
+    later = {Reason.KEEPOUT: Reason.OBSTACLE_STOP}
+    failing = [reason.exit_code for reason in Reason if reason.exit_code and reason not in later]
     assert len(failing) == len(set(failing))
+    assert all(reason.exit_code == broader.exit_code for reason, broader in later.items())
     assert all(0 <= reason.exit_code < 126 and reason.text for reason in Reason)
     assert Reason("tilt_stop") is Reason.TILT_STOP
     assert Reason.BAD_CONFIG.exit_code == 2

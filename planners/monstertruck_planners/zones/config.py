@@ -1,0 +1,70 @@
+"""Settings of the zones; light, for the daemon's start."""
+
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+from pydantic import Field, field_validator
+
+from monstertruck_schemas.base import Name, NotNegative, Schema
+from monstertruck_schemas.zones import ZoneArea
+
+KEEPOUT_MASK: Final = "keepout_mask"
+SPEED_MASK: Final = "speed_mask"
+"""Names of the zones of the two masks."""
+
+
+class KeepoutMaskConfig(Schema):
+    """Keepout zones as a picture."""
+
+    map: Path
+    """map_server YAML file; cells of value 100 are keepout"""
+    inside: Literal["stop", "leave"] = "stop"
+    """What a robot does that finds itself inside: stand and report, or leave slowly"""
+
+
+class SpeedMaskConfig(Schema):
+    """Speed zones as a picture, with the numbers of Nav2's CostmapFilterInfo.
+
+    The limit of a cell is ``base + multiplier * value``. Cells of value 0, unknown cells and limits that are not above
+    0 mean no limit.
+    """
+
+    map: Path
+    """map_server YAML file"""
+    type: Literal["percent", "absolute"] = "percent"
+    """Unit of the limit: percent of `gate.speed` (type 1 of Nav2; none above 100), or m/s (type 2)"""
+    base: float = 0.0
+    multiplier: float = 1.0
+
+
+class ZonesConfig(Schema):
+    """Keepout and speed zones of the map; operators add more by command and on the page."""
+
+    areas: dict[Name, ZoneArea] = Field(default_factory=dict)
+    """Polygons by name"""
+    file: Path | None = None
+    """YAML file with more polygons: the key `zones`, as `areas` here"""
+    keepout_mask: KeepoutMaskConfig | None = None
+    """Mask image of keepout zones, such as one made for Nav2"""
+    speed_mask: SpeedMaskConfig | None = None
+    """Mask image of speed zones"""
+    margin: NotNegative = 0.05
+    """Clearance from zones (m), for errors of the pose"""
+    leave_speed: Annotated[float, Field(ge=0.02, le=1)] = 0.1
+    """Maximum speed inside a keepout zone that the robot leaves (m/s)"""
+
+    @field_validator("areas")
+    @classmethod
+    def _named(cls, areas: dict[str, ZoneArea]) -> dict[str, ZoneArea]:
+        return require_free_names(areas)
+
+
+def require_free_names(areas: dict[str, ZoneArea]) -> dict[str, ZoneArea]:
+    """Return the areas.
+
+    Raises:
+        ValueError: one has the name of a mask.
+    """
+    if taken := areas.keys() & {KEEPOUT_MASK, SPEED_MASK}:
+        raise ValueError(f"{min(taken)}: expected another name, this one is a mask's")
+    return areas

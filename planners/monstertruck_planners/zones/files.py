@@ -1,0 +1,123 @@
+"""Zones from files: polygons, mask images, and those that operators made."""
+
+import json
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from monstertruck_planners.zones.config import (
+    KEEPOUT_MASK,
+    SPEED_MASK,
+    SpeedMaskConfig,
+    ZonesConfig,
+    require_free_names,
+)
+from monstertruck_planners.zones.shapes import mask_of
+from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.map_files import OCCUPIED, WorldMap, load_map
+from monstertruck_runtime.outside import contents, reading
+from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.yaml_files import read_yaml
+from monstertruck_schemas.base import Name, Schema
+from monstertruck_schemas.zones import Zone, ZoneArea
+
+_EXPECTED: Final = "zones"
+LARGEST: Final = 2_000_000
+"""Maximum size of the file of the operators' zones (bytes)."""
+
+
+class ZoneFile(Schema):
+    """A file of polygons."""
+
+    zones: dict[Name, ZoneArea] = Field(default_factory=dict)
+    """Polygons by name."""
+
+    @field_validator("zones")
+    @classmethod
+    def _named(cls, areas: dict[str, ZoneArea]) -> dict[str, ZoneArea]:
+        return require_free_names(areas)
+
+
+def zone_of(name: str, area: ZoneArea, *, saved: bool) -> Zone:
+    """Zone of a polygon; ``saved``: an operator made it."""
+    return Zone(name=name, kind=area.kind, corners=area.corners, limit=area.limit, inside=area.inside, saved=saved)
+
+
+def configured(config: ZonesConfig, max_speed: float) -> tuple[list[Zone], list[str]]:
+    """Zones of a configuration, and remarks on its mask images.
+
+    Args:
+        config: of the zones.
+        max_speed: to which percents of a speed mask refer (m/s).
+
+    Raises:
+        InputError: file, key and expectation of whatever is wrong.
+    """
+    zones = [zone_of(name, area, saved=False) for name, area in config.areas.items()]
+    if config.file is not None:
+        with reading(config.file, _EXPECTED):
+            more = ZoneFile.model_validate_json(json.dumps(read_yaml(config.file)))
+        if twice := more.zones.keys() & config.areas.keys():
+            raise InputError(f"{config.file}: zones.{min(twice)}: the configuration has a zone of this name")
+        zones += [zone_of(name, area, saved=False) for name, area in more.zones.items()]
+    remarks: list[str] = []
+    if (keepout := config.keepout_mask) is not None:
+        world = load_map(keepout.map)
+        partly = np.count_nonzero((world.cells > 0) & (world.cells < OCCUPIED))
+        if partly:
+            remarks.append(
+                f"{keepout.map}: {partly} cells of values 1 to 99, which Nav2 takes for costs: they are free here"
+            )
+        limits = np.where(world.cells == OCCUPIED, 0.0, np.inf)
+        zones += _masked(KEEPOUT_MASK, limits, world, keepout.inside, keepout.map)
+    if (speed := config.speed_mask) is not None:
+        world = load_map(speed.map)
+        zones += _masked(SPEED_MASK, speed_limits(world, speed, max_speed), world, "stop", speed.map)
+    return zones, remarks
+
+
+def speed_limits(world: WorldMap, config: SpeedMaskConfig, max_speed: float) -> np.ndarray:
+    """Speed limit of each cell of a mask, as Nav2's speed filter reads it, m/s; +inf without a limit.
+
+    Args:
+        world: the mask.
+        config: how values become limits.
+        max_speed: 100 percent (m/s).
+    """
+    limits = config.base + config.multiplier * world.cells.astype(np.float64)
+    none = (world.cells <= 0) | (limits <= 0.0)
+    if config.type == "percent":
+        none |= limits > 100.0
+        limits = limits / 100.0 * max_speed
+    return np.where(none, np.inf, limits)
+
+
+def _masked(name: str, limits: np.ndarray, world: WorldMap, inside: str, file: Path) -> list[Zone]:
+    mask = mask_of(limits, world.resolution, world.origin)
+    if mask is None:
+        raise InputError(f"{file}: not one cell of a zone: check image, mode and thresholds")
+    kind = "keepout" if name == KEEPOUT_MASK else "speed"
+    return [Zone.model_validate({"name": name, "kind": kind, "mask": mask, "inside": inside})]
+
+
+def load_saved(file: Path) -> dict[str, ZoneArea]:
+    """Zones that operators made, by name; empty if there is no file.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    if not file.exists():
+        return {}
+    with reading(file, _EXPECTED):
+        return ZoneFile.model_validate_json(contents(file, _EXPECTED, LARGEST)).zones
+
+
+def save(file: Path, areas: dict[str, ZoneArea]) -> None:
+    """Write the zones that operators made.
+
+    Raises:
+        OSError: it could not be written; the file is the one before.
+    """
+    replace_file(file, ZoneFile(zones=areas).model_dump_json(indent=1, exclude_none=True))
