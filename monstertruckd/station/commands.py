@@ -9,6 +9,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import first_mistake
 from monstertruck_schemas.req import UNCONDITIONAL, BehaviourOrder, ExploreOrder, GoalOrder, MissionOrder, Order, Role
 from monstertruck_schemas.roles import AccessRole
+from monstertruck_schemas.zones import LONGEST_OFF, OFF_FOR, ZoneArea, ZoneOrder
 
 LONGEST_MESSAGE: Final = 262_144
 """Maximum size of a command (bytes): enough for the file of a raceline of a few kilometres."""
@@ -153,6 +154,17 @@ class StartPath(Asked):
     path: Annotated[str, Field(max_length=128)]
 
 
+class ChangeZone(Asked):
+    """Add or remove a zone, or turn one off or on."""
+
+    do: Literal["zone"]
+    order: ZoneOrder
+    name: Annotated[str, Field(max_length=32)]
+    area: ZoneArea | None = None
+    seconds: Annotated[float, Field(gt=0, le=LONGEST_OFF)] = OFF_FOR
+    """How long the zone is off (s)."""
+
+
 class AskToDrive(Asked):
     """Ask the current driver to hand over."""
 
@@ -273,6 +285,7 @@ AnyCommand = (
     | Track
     | TrackFile
     | StartPath
+    | ChangeZone
     | AskToDrive
     | HandOver
     | Acknowledge

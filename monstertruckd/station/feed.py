@@ -84,6 +84,7 @@ SHOWN: Final[tuple[Shown[Any], ...]] = (
     _whole(topics.USB, "usb"),
     Shown(topics.CAMERA, "camera", frames.picture, 0.1, 300_000.0),
     _whole(topics.POINTS, "points", 0.5),
+    _whole(topics.ZONES, "zones", 0.5),
 )
 
 

@@ -41,6 +41,7 @@ from monstertruckd.station.commands import (
     Behave,
     ChangeGoal,
     ChangeSetting,
+    ChangeZone,
     DeleteRecording,
     DoMission,
     Explore,
@@ -227,6 +228,8 @@ def _other_call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]
             return client.ask_to_drive()
         case HandOver():
             return client.hand_over(command.to)
+        case ChangeZone():
+            return client.zone(command.order, command.name, command.area, command.seconds)
         case Acknowledge():
             return client.call("acknowledge", {"text": command.text})
         case ListSettings():

@@ -11,6 +11,7 @@ import { ReplayBar } from "./replay.js";
 import { Link } from "./socket.js";
 import { Tryout } from "./tryout.js";
 import { Work } from "./work.js";
+import { Zones } from "./zones.js";
 import { degrees, loadWords, number, reason, words } from "./words.js";
 
 const byId = (id) => document.getElementById(id);
@@ -76,6 +77,8 @@ function pointed(at) {
   map.take("cursor", at);
   panels.showPast(at);
 }
+
+const zones = new Zones(link, map, { outcome, hint });
 
 const tryout = new Tryout(link, { outcome, aim: (on) => aim(on, "tryout.hint") });
 
@@ -182,8 +185,17 @@ byId("tool-draw").onclick = () => {
   draw(!map.drawing);
 };
 
+byId("tool-zone").onclick = () => {
+  const on = !map.corners;
+  tryout.place(false);
+  aim(false);
+  draw(false);
+  zones.draw(on);
+};
+
 function aim(on, why = "goal.hint") {
   if (on) draw(false);
+  if (on && map.corners) zones.draw(false);
   map.setAiming(on);
   press("tool-goal", on && why === "goal.hint");
   hint(on ? why : null);
@@ -191,6 +203,7 @@ function aim(on, why = "goal.hint") {
 
 function draw(on) {
   if (on) aim(false);
+  if (on && map.corners) zones.draw(false);
   map.setDrawing(on);
   press("tool-draw", on);
   hint(on ? "map.draw.hint" : null);
@@ -226,7 +239,7 @@ function showWaypoints() {
   }));
 }
 
-const LAYERS = ["scan", "trail", "frontiers", "points", "ground"];
+const LAYERS = ["scan", "trail", "frontiers", "points", "zones", "ground"];
 for (const name of LAYERS) {
   const input = element("input", { type: "checkbox", checked: map.layers[name] });
   input.onchange = () => map.setLayer(name, input.checked);

@@ -2,7 +2,7 @@
 import { compose, moved, outline, wheelAngles, wrapped } from "./geometry.js";
 import { Past } from "./series.js";
 
-const COLOURS = ["map", "map-free", "map-wall", "map-grid", "scan", "trail", "route", "deformed", "goal", "ghost", "truck", "ink", "card", "accent", "frontier", "point"];
+const COLOURS = ["map", "map-free", "map-wall", "map-grid", "scan", "trail", "route", "deformed", "goal", "ghost", "truck", "ink", "card", "accent", "frontier", "point", "bad", "warn"];
 const TRAIL_STEP = 0.03;
 const TRAIL_LENGTH = 6000;
 const POSES = 60;
@@ -23,7 +23,7 @@ export class MapView {
     this.headingUp = false;
     this.aiming = false;
     this.drawing = false;
-    this.layers = { scan: true, trail: true, frontiers: false, points: true, ground: false, ...JSON.parse(localStorage.getItem("layers") ?? "{}") };
+    this.layers = { scan: true, trail: true, frontiers: false, points: true, ground: false, zones: true, ...JSON.parse(localStorage.getItem("layers") ?? "{}") };
     this.pointers = new Map();
     this.clear();
     this.readColours();
@@ -55,6 +55,8 @@ export class MapView {
     this.via = [];
     this.goal = null;
     this.ground = null;
+    this.zones = [];
+    this.corners = null;
     this.wanted = 0;
     this.dirty = true;
   }
@@ -85,6 +87,7 @@ export class MapView {
     link.on("map", (message) => this.takeMap(message));
     link.on("tile", (message) => this.takeTile(message));
     link.on("goal", (state) => this.take("goal", state.goal));
+    link.on("zones", (message) => this.takeZones(message));
     for (const kind of ["gate", "explore", "points"]) link.on(kind, () => (this.dirty = true));
     link.on("ground", (message) => this.takeGround(message));
     const { canvas } = this;
@@ -195,6 +198,22 @@ export class MapView {
     this.take("ground", { ...message, canvas });
   }
 
+  takeZones({ zones }) {
+    this.take("zones", zones.map((zone) => ({ ...zone, image: zone.mask && this.paintMask(zone.mask, zone.kind) })));
+  }
+
+  /** Draw a mask of runs into a canvas of its own, where it has a limit. */
+  paintMask({ width, height, resolution, x, y, runs }, kind) {
+    const canvas = Object.assign(document.createElement("canvas"), { width, height });
+    const data = canvas.getContext("2d").createImageData(width, height);
+    const colour = [...rgb(this.colour[kind === "keepout" ? "bad" : "warn"]), 110];
+    for (let i = 0, at = 0; i < runs.length; at += runs[i + 1], i += 2) {
+      if (runs[i]) for (let j = at; j < at + runs[i + 1]; j++) data.data.set(colour, 4 * j);
+    }
+    canvas.getContext("2d").putImageData(data, 0, 0);
+    return { canvas, origin: [x, y, 0], resolution };
+  }
+
   setLayer(name, shown) {
     this.layers[name] = shown;
     localStorage.setItem("layers", JSON.stringify(this.layers));
@@ -248,6 +267,11 @@ export class MapView {
     this.canvas.setPointerCapture(event.pointerId);
     this.pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
     if (this.drawing && this.pointers.size === 1) this.take("drawn", [this.toWorld(event.offsetX, event.offsetY)]);
+    if (this.corners && this.pointers.size === 1) {
+      this.corners.push(this.toWorld(event.offsetX, event.offsetY));
+      this.onCorners?.();
+      this.dirty = true;
+    }
     if (this.aiming && this.pointers.size === 1) {
       const [x, y] = this.toWorld(event.offsetX, event.offsetY);
       this.pending = [x, y, this.pose ? Math.atan2(y - this.pose[1], x - this.pose[0]) : 0];
@@ -264,6 +288,8 @@ export class MapView {
       const [x, y] = this.toWorld(...now);
       const [lx, ly] = this.drawn.at(-1);
       if (Math.hypot(x - lx, y - ly) > DRAWN_STEP && this.drawn.length < DRAWN_MOST) this.drawn.push([x, y]);
+    } else if (this.corners?.length && this.pointers.size === 1) {
+      this.corners[this.corners.length - 1] = this.toWorld(...now);
     } else if (this.aiming && this.pointers.size === 1) {
       const [x, y] = this.toWorld(...now);
       const [gx, gy] = this.pending;
@@ -334,6 +360,13 @@ export class MapView {
     this.dirty = true;
   }
 
+  /** Corners of a zone that is being drawn, to which presses add; null ends it. */
+  setCorners(corners) {
+    this.corners = corners;
+    this.canvas.classList.toggle("aiming", Boolean(corners) || this.aiming || this.drawing);
+    this.dirty = true;
+  }
+
   setDrawing(drawing) {
     this.drawing = drawing;
     if (drawing) this.pending = this.drawn = null;
@@ -386,6 +419,7 @@ export class MapView {
     for (const tile of this.tiles.values()) this.drawImage(c, tile);
     if (this.ground && this.layers.ground) this.drawImage(c, this.ground);
     this.drawLines(c, px);
+    if (this.layers.zones) this.drawZones(c, px);
     if (this.layers.trail) this.stroke(c, this.trail, this.colour.trail, 2 * px);
     if (this.path?.deformed && this.route) this.stroke(c, this.route, this.colour.route, 1.5 * px, [6 * px, 5 * px]);
     if (this.path) this.stroke(c, this.path.points, this.colour[this.path.deformed ? "deformed" : "route"], 3 * px);
@@ -408,6 +442,28 @@ export class MapView {
     c.imageSmoothingEnabled = false;
     c.drawImage(canvas, 0, 0);
     c.restore();
+  }
+
+  drawZones(c, px) {
+    for (const { kind, corners, image, off_until: off, name } of this.zones) {
+      c.globalAlpha = off === null ? 1 : 0.35;
+      if (image) this.drawImage(c, image);
+      else this.drawZone(c, px, corners, this.colour[kind === "keepout" ? "bad" : "warn"]);
+      c.globalAlpha = 1;
+      if (!image) this.label(c, px, ...corners[0], name);
+    }
+    if (this.corners?.length) this.drawZone(c, px, this.corners, this.colour.accent);
+  }
+
+  drawZone(c, px, corners, colour) {
+    this.polygon(c, [0, 0, 0], corners);
+    c.fillStyle = c.strokeStyle = colour;
+    c.lineWidth = 2 * px;
+    const alpha = c.globalAlpha;
+    c.stroke();
+    c.globalAlpha = 0.2 * alpha;
+    c.fill("evenodd");
+    c.globalAlpha = alpha;
   }
 
   drawLines(c, px) {
@@ -540,7 +596,10 @@ export class MapView {
     c.arc(x, y, 7 * px, 0, 2 * Math.PI);
     c.fillStyle = colour;
     c.fill();
-    if (!label) return;
+    if (label) this.label(c, px, x, y, label);
+  }
+
+  label(c, px, x, y, label) {
     c.save();
     c.translate(x, y);
     c.rotate(-this.rotation);
