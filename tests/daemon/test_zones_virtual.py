@@ -16,6 +16,11 @@ pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
 WALL = [[2.4, 4.0], [2.8, 4.0], [2.8, 4.7], [2.4, 4.7]]
 LATE = [[2.9, 4.0], [3.2, 4.0], [3.2, 4.7], [2.9, 4.7]]
+SLOW = [[1.4, 3.0], [1.8, 3.0], [1.8, 5.0], [1.4, 5.0]]
+AREAS = {
+    "wall": {"kind": "keepout", "corners": WALL},
+    "slow": {"kind": "speed", "limit": 0.08, "corners": SLOW},
+}
 BODY = Footprint(padding=0.0)
 
 
@@ -27,6 +32,27 @@ def layer(corners: list[list[float]]) -> ZoneLayer:
     return ZoneLayer([Zone(name="z", kind="keepout", corners=tuple(map(tuple, corners)))])
 
 
+def test_a_goal_is_reached_round_a_keepout_zone_and_slowly_over_a_speed_zone():
+    async def story(trip: Trip) -> None:
+        with pytest.raises(RequestRefusedError, match="keepout zone wall") as refused:
+            await trip.goal(2.6, 4.2, 0.0)
+        assert refused.value.refusal is Reason.KEEPOUT
+        await trip.goal(4.0, 3.95, 0.0)
+        await trip.arm()
+        assert (await trip.end()).outcome is Reason.GOAL_REACHED
+
+    rig = travel(story, zones={"areas": AREAS})
+    assert_at(rig, 4.0, 3.95, 0.0)
+    truth = rig.truth.array()
+    wall, slow = layer(WALL), layer(SLOW)
+    poses = [tuple(row) for row in truth[::5, 1:4].tolist()]
+    assert not any(wall.keepout(BODY, pose) for pose in poses)
+    speeds = np.hypot(np.diff(truth[::5, 1]), np.diff(truth[::5, 2])) / np.diff(truth[::5, 0])
+    on = [speed for pose, speed in zip(poses, speeds.tolist(), strict=False) if slow.keepout(BODY, pose)]
+    assert 0.05 < max(on) <= 0.085
+    assert max(speeds) > 0.12
+
+
 def test_a_zone_that_is_drawn_on_the_way_is_driven_round_and_one_that_is_off_is_crossed():
     async def story(trip: Trip) -> None:
         await order(trip, "wall", "off", seconds=600)
@@ -36,7 +62,7 @@ def test_a_zone_that_is_drawn_on_the_way_is_driven_round_and_one_that_is_off_is_
         await order(trip, "late", "add", area={"kind": "keepout", "corners": LATE})
         assert (await trip.end()).outcome is Reason.GOAL_REACHED
 
-    rig = travel(story, zones={"areas": {"wall": {"kind": "keepout", "corners": WALL}}})
+    rig = travel(story, zones={"areas": {"wall": AREAS["wall"]}})
     poses = [tuple(row) for row in rig.truth.array()[::5, 1:4].tolist()]
     assert any(layer(WALL).keepout(BODY, pose) for pose in poses)
     assert not any(layer(LATE).keepout(BODY, pose) for pose in poses)

@@ -52,6 +52,7 @@ SYMPTOMS: Final = (
             "unseen_drive": "",
             "unseen_slow": "It drives where no sensor looks: turn it around.",
             "sonar_slow": "",
+            "keepout": "Turn the zone off for a while (`zone off`), or drive back.",
             "own_check": "A check in the section `checks` stops it: the event names the check.",
             "peer_unknown": "A robot in `peers` is silent, or this robot has no pose: see `echo state/peers`.",
             "sonar_blind": "A sonar does not answer: check its plug.",

@@ -104,11 +104,11 @@ def test_a_zone_to_be_left_is_left_slowly_and_not_entered_again():
     rig.driving(speed=0.2)
     assert rig.out.speeds[0] == pytest.approx(0.1)
     assert Reason.KEEPOUT in rig.out.reasons
-    rig.tick(600)
+    rig.tick(150)
     assert rig.place[0] > 3.3
     assert rig.out.speeds[0] == pytest.approx(0.2)
     rig.driver = {"speed": -0.2}
-    rig.tick(600)
+    rig.tick(150)
     assert rig.place[0] - 0.47 / 2 > 3.05
 
 
@@ -128,7 +128,7 @@ def test_the_truck_is_slow_from_where_it_reaches_a_speed_zone_to_where_it_has_le
     rig = Zoned(slow)
     speeds = []
     rig.driving(ticks=1, speed=0.2)
-    for _ in range(300):
+    for _ in range(250):
         rig.tick(3)
         speeds.append((front(rig), rig.speed, rig.out.reasons))
     inside = [speed for at, speed, _ in speeds if 2.0 < at < 3.0 + 0.47]

@@ -211,6 +211,29 @@ async def parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page: Page)
     assert kept == [2, 4]
 
 
+async def a_zone_is_drawn_on_the_map_and_turned_off(page: Page) -> None:
+    assert not await page.is_visible("#tool-zone"), "the robot keeps none"
+    zone = {"name": "ramp", "kind": "speed", "corners": [[0, 0], [1, 0], [1, 1]], "mask": None, "limit": 0.1}
+    zone |= {"inside": "stop", "saved": True, "off_until": None}
+    await say(page, {"kind": "zones", "m": {"zones": [zone], "inside": ["ramp"]}})
+    await page.click("#tool-zone")
+    for x, y in ((300, 200), (420, 220), (380, 330)):
+        assert await page.is_disabled("#zone-add")
+        await page.click("#map", position={"x": x, "y": y})
+    await page.evaluate("void (window.sent = [])")
+    await page.click("#zone-add")
+    await page.click("#tab-tasks")
+    assert "ramp, speed limit 0.10 m/s, robot inside" in await page.inner_text("#zones")
+    await page.click("#zones button >> nth=0")
+    sent = json.loads(await page.evaluate("JSON.stringify(window.sent)"))
+    add, off = (each for each in sent if each["do"] == "zone")
+    assert (add["order"], add["area"]["kind"], add["area"]["inside"]) == ("add", "keepout", "stop")
+    assert len(add["area"]["corners"]) == 3
+    assert (off["order"], off["name"], off["seconds"]) == ("off", "ramp", 600)
+    await page.click("#zone-drop")
+    await page.click("#tab-drive")
+
+
 async def a_robot_without_a_map_is_called_so(page: Page) -> None:
     assert not await page.is_visible("#map-none")
     await say(page, FACTS | {"mapping": False})
@@ -839,6 +862,7 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await an_unknown_way_is_taken_to_be_slow(page)
         await parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page)
         await a_robot_without_a_map_is_called_so(page)
+        await a_zone_is_drawn_on_the_map_and_turned_off(page)
         await what_a_sensor_said_long_ago_is_not_shown_as_of_now(page)
         await a_stop_is_shown_with_its_chain_of_causes(page)
         await a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page)

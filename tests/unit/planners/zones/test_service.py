@@ -79,7 +79,7 @@ class Stage:
     def names(self) -> list[str]:
         return [zone.name for zone in self.zones.latest.zones]
 
-    def told(self) -> list[Reason]:
+    def reported(self) -> list[Reason]:
         return [reason for reason, _ in self.events]
 
 
@@ -116,7 +116,7 @@ def test_an_operator_adds_zones_that_outlast_a_restart_and_removes_them(tmp_path
         assert stage.names == ["ramp"]
 
     file = tmp_path / "zones.json"
-    assert play(add, file, ramp=SLOW).told() == [Reason.ZONE_CHANGED]
+    assert play(add, file, ramp=SLOW).reported() == [Reason.ZONE_CHANGED]
     assert list(json.loads(file.read_text())["zones"]) == ["stairs"]
     play(remove, file, ramp=SLOW)
     assert json.loads(file.read_text())["zones"] == {}
@@ -134,7 +134,7 @@ def test_a_zone_is_off_for_a_while_or_until_it_is_turned_on():
         assert stage.zones.latest.zones[0].off_until is None
 
     stage = play(story, stairs=AREA)
-    assert stage.told() == [Reason.ZONE_OFF, Reason.ZONE_ON, Reason.ZONE_OFF, Reason.ZONE_ON]
+    assert stage.reported() == [Reason.ZONE_OFF, Reason.ZONE_ON, Reason.ZONE_OFF, Reason.ZONE_ON]
     assert stage.events[0][1] == "keepout zone stairs is off for 5 s, by ann"
     assert stage.events[1][1] == "zone stairs is on: its time off is over"
 
@@ -147,7 +147,7 @@ def test_the_zones_that_the_robot_is_in_are_said_once_each():
             assert stage.zones.latest.inside == inside, x
             assert (x, stage.zones.latest.seq) in {(1.0, 0), (1.8, 1), (1.74, 1), (1.66, 2)}
 
-    assert play(story, stairs=AREA).told() == [Reason.ZONE_ENTERED, Reason.ZONE_LEFT]
+    assert play(story, stairs=AREA).reported() == [Reason.ZONE_ENTERED, Reason.ZONE_LEFT]
 
 
 def test_what_cannot_be_done_is_refused_and_changes_nothing(tmp_path):
@@ -170,7 +170,7 @@ def test_what_cannot_be_done_is_refused_and_changes_nothing(tmp_path):
         assert refused.value.refusal is Reason.RECORDING_FAILED
         assert stage.names == ["ramp"]
 
-    assert play(story, tmp_path / "none" / "zones.json", ramp=SLOW).told() == []
+    assert play(story, tmp_path / "none" / "zones.json", ramp=SLOW).reported() == []
 
 
 def test_a_damaged_file_ends_the_service_with_its_name(tmp_path):
