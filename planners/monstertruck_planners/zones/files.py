@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -16,12 +16,14 @@ from monstertruck_planners.zones.config import (
 )
 from monstertruck_planners.zones.shapes import mask_of
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.map_files import OCCUPIED, WorldMap, load_map
 from monstertruck_runtime.outside import contents, reading
 from monstertruck_runtime.small_files import replace_file
 from monstertruck_runtime.yaml_files import read_yaml
 from monstertruck_schemas.base import Name, Schema
 from monstertruck_schemas.zones import Zone, ZoneArea
+
+if TYPE_CHECKING:
+    from monstertruck_runtime.map_files import WorldMap
 
 _EXPECTED: Final = "zones"
 LARGEST: Final = 2_000_000
@@ -62,7 +64,18 @@ def configured(config: ZonesConfig, max_speed: float) -> tuple[list[Zone], list[
         if twice := more.zones.keys() & config.areas.keys():
             raise InputError(f"{config.file}: zones.{min(twice)}: the configuration has a zone of this name")
         zones += [zone_of(name, area, saved=False) for name, area in more.zones.items()]
+    masks, remarks = _masks(config, max_speed)
+    return zones + masks, remarks
+
+
+def _masks(config: ZonesConfig, max_speed: float) -> tuple[list[Zone], list[str]]:
+    """Zones of the mask images, and remarks on them; arguments as for ``configured``."""
+    zones: list[Zone] = []
     remarks: list[str] = []
+    if config.keepout_mask is None and config.speed_mask is None:
+        return zones, remarks
+    from monstertruck_runtime.map_files import OCCUPIED, load_map  # noqa: PLC0415  # loads the library of pictures
+
     if (keepout := config.keepout_mask) is not None:
         world = load_map(keepout.map)
         partly = np.count_nonzero((world.cells > 0) & (world.cells < OCCUPIED))
@@ -78,7 +91,7 @@ def configured(config: ZonesConfig, max_speed: float) -> tuple[list[Zone], list[
     return zones, remarks
 
 
-def speed_limits(world: WorldMap, config: SpeedMaskConfig, max_speed: float) -> np.ndarray:
+def speed_limits(world: "WorldMap", config: SpeedMaskConfig, max_speed: float) -> np.ndarray:
     """Speed limit of each cell of a mask, as Nav2's speed filter reads it, m/s; +inf without a limit.
 
     Args:
@@ -94,7 +107,7 @@ def speed_limits(world: WorldMap, config: SpeedMaskConfig, max_speed: float) -> 
     return np.where(none, np.inf, limits)
 
 
-def _masked(name: str, limits: np.ndarray, world: WorldMap, inside: str, file: Path) -> list[Zone]:
+def _masked(name: str, limits: np.ndarray, world: "WorldMap", inside: str, file: Path) -> list[Zone]:
     mask = mask_of(limits, world.resolution, world.origin)
     if mask is None:
         raise InputError(f"{file}: not one cell of a zone: check image, mode and thresholds")
