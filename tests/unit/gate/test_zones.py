@@ -128,7 +128,7 @@ def test_the_truck_is_slow_from_where_it_reaches_a_speed_zone_to_where_it_has_le
     rig = Zoned(slow)
     speeds = []
     rig.driving(ticks=1, speed=0.2)
-    for _ in range(250):
+    for _ in range(300):
         rig.tick(3)
         speeds.append((front(rig), rig.speed, rig.out.reasons))
     inside = [speed for at, speed, _ in speeds if 2.0 < at < 3.0 + 0.47]
