@@ -12,9 +12,9 @@ from monstertruckd.tools.shipped import shipped
 
 ENDPOINT = "tcp/127.0.0.1:7555"
 ROBOTS = sorted(file.stem for file in shipped("configs/robots").glob("*.yaml"))
-BY_HAND = {"synchro", "skid_stand", "sonar"}
+BY_HAND = {"donkeycar", "synchro", "skid_stand", "sonar"}
 """Robots for whose body, or without a tracker, there is no planner."""
-WITHOUT_LIDAR = {"skid_stand", "sonar"}
+WITHOUT_LIDAR = {"donkeycar", "skid_stand", "sonar"}
 
 
 @pytest.mark.parametrize("name", ROBOTS)
