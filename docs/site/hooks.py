@@ -8,7 +8,7 @@ from typing import Any
 
 from markdown.extensions.toc import slugify
 from mkdocs.structure.files import File, Files, InclusionLevel
-from pages import commands, configuration, devices, never_tried, symptoms, topics
+from pages import commands, configuration, devices, figures, never_tried, symptoms, topics
 from pages.markdown import Page, join
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,6 +35,7 @@ def on_config(config: Any) -> Any:
         *commands.pages(texts),
         *topics.pages(),
         *configuration.pages(),
+        *figures.pages(),
         never_tried.page(texts),
         symptoms.page(),
     ]
@@ -84,6 +85,8 @@ def _target(link: str, here: str) -> str | None:
     path = posixpath.normpath(posixpath.join(posixpath.dirname(here), link))
     if path in OUTSIDE:
         return OUTSIDE[path]
+    if path.startswith("docs/figures/"):
+        return f"{path.removeprefix('docs/').removesuffix('.json')}.md"
     if path.startswith("docs/"):
         return path.removeprefix("docs/")
     return f"files/{path}.md" if (ROOT / path).is_file() else None

@@ -193,6 +193,9 @@ FOREIGN = {
         "tests/unit/systemd/test_supervise.py supervises other programs"
     ),
     "python docs/site/build.py": "test_site.py builds it into another folder",
+    "python benchmarks/record.py deaths --measures monstertruckd/gate systemd/neutral.py -- benchmarks/deaths.py": (
+        "runs for minutes; test_figures.py checks what it writes"
+    ),
     "python -m benchmarks.thesis --only 5.1 5.5": "drives for minutes; slowness and scores have their tests",
     "pip install '.[ros2]'": "needs a package index; the extra is looked up",
     "pip install '.[tables,plot]'": "needs a package index; the extra is looked up",

@@ -41,8 +41,8 @@ def test_orders_to_move_and_what_guards_the_robot_are_not_among_them():
     assert limit_of("compass heading scaled") is None
 
 
-def test_the_page_on_safety_holds_the_table():
-    page = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
+def test_the_page_on_drills_holds_the_table():
+    page = (ROOT / "docs" / "drills.md").read_text(encoding="utf-8")
     for row in UNREVEALED:
         assert f"| {', '.join(f'`{each}`' for each in row.families)} | {row.why} | {row.limit} |" in page
 

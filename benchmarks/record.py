@@ -1,0 +1,82 @@
+"""Run a benchmark and write its figures, tables, commit and machine to ``docs/figures/NAME.json``.
+
+    python benchmarks/record.py NAME --measures PATH [PATH ...] -- benchmarks/deaths.py --trials 20
+
+NAME is that of the file. The benchmark's last line gives figures and goals; Markdown tables in its output become the
+tables ``1``, ``2`` ... ``python docs/site/figures.py`` then updates the pages that include the file.
+"""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+FOLDER: Final = ROOT / "docs" / "figures"
+
+
+def tables(output: str) -> dict[str, list[list[str]]]:
+    """Return the Markdown tables of ``output``, numbered from 1, without their rulers."""
+    found: dict[str, list[list[str]]] = {}
+    inside = False
+    for line in output.splitlines():
+        if not line.startswith("|"):
+            inside = False
+            continue
+        rows = found.setdefault(str(len(found) + (not inside)), [])
+        inside = True
+        if line.strip("|-: ") or not rows:
+            rows.append([cell.strip() for cell in line.strip().strip("|").split("|")])
+    return found
+
+
+def record(output: str, command: str, measures: list[str], commit: str, machine: str) -> dict[str, Any]:
+    """Return the content of a figures file.
+
+    Raises:
+        ValueError: the last line of ``output`` is not a benchmark's result.
+    """
+    try:
+        result = json.loads(output.strip().splitlines()[-1])
+        named = {key: result[key] for key in ("bench", "figures", "goals", "met")}
+    except (ValueError, IndexError, KeyError, TypeError) as error:
+        raise ValueError(f"the last line of the output is not a benchmark's result: {error!r}") from error
+    return {"command": command, "commit": commit, "machine": machine, "measures": measures, **named} | {
+        "tables": tables(output)
+    }
+
+
+def machine() -> str:
+    """Return processor count, architecture and load, as a phrase."""
+    return f"{os.cpu_count()} cores ({platform.machine()}, load {os.getloadavg()[0]:.1f} at the start)"
+
+
+def main() -> int:
+    """Run, record, and return the benchmark's exit code."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("name", help="name of the file in docs/figures")
+    parser.add_argument("--measures", nargs="+", required=True, help="paths whose change makes the figures old")
+    parser.add_argument("command", nargs="+", help="after --: the benchmark's file and arguments")
+    arguments = parser.parse_args()
+    before, commit = machine(), _git("rev-parse", "--short", "HEAD")
+    if _git("status", "--porcelain", "--untracked-files=no"):
+        parser.error("commit the changes first: the figures would belong to no commit")
+    done = subprocess.run(
+        [sys.executable, *arguments.command], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False
+    )
+    sys.stdout.write(done.stdout)
+    content = record(done.stdout, " ".join(["python", *arguments.command]), arguments.measures, commit, before)
+    (FOLDER / f"{arguments.name}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return done.returncode
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

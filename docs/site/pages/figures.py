@@ -1,0 +1,142 @@
+"""Measured figures: one file a benchmark in ``docs/figures``, included in the pages by name.
+
+A block below ``<!-- figures: FILE -->`` holds the figures and goals of a file, a block below
+``<!-- figures: FILE.TABLE -->`` one of its tables. A test fails if a block differs from its file, or if a page of
+``OWNED`` holds a measured number outside a block.
+"""
+
+import json
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pages.markdown import Page, join, table
+
+DOCS = Path(__file__).resolve().parents[2]
+FOLDER = DOCS / "figures"
+OWNED = ("benchmarks.md", "safety-case.md")
+"""Pages whose measured numbers all come from files."""
+BLOCK = re.compile(
+    r"^(?P<mark><!-- figures: (?P<file>\w+)(?:\.(?P<table>\w+))? -->)\n(?:\n?(?:\|.*\n)+)?(?:\n?Measured by .*\n)?",
+    re.MULTILINE,
+)
+NOT_PROSE = re.compile(r"^```.*?^```|`[^`\n]*`|\]\([^)]*\)|<!--.*?-->", re.MULTILINE | re.DOTALL)
+UNITS = r"(?:[num]?s|%|[kM]?B|[cm]?m|x|Hz|rad|degrees|seconds|minutes|metres)"
+NUMBER = re.compile(rf"(?<![\w.-])\d[\d ]*(?:\.\d+)? ?{UNITS}(?![\w-])")
+EXEMPT_COLUMNS = re.compile(r"goals?|condition|judged by")
+"""Headings of columns that hold what is required, not what was measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Result of one benchmark.
+
+    Attributes:
+        command: shell command that measures it.
+        commit: commit that was measured.
+        machine: computer and its load.
+        measures: files and folders on which the result depends.
+        figures: values by name; a nested object is a group.
+        goals: limits by the same names.
+        tables: rows of cells by name; the first row is the heading.
+    """
+
+    command: str
+    commit: str
+    machine: str
+    measures: tuple[str, ...]
+    figures: dict[str, Any]
+    goals: dict[str, Any]
+    tables: dict[str, list[list[str]]]
+
+    @property
+    def source(self) -> str:
+        """Sentence that names command, commit and machine."""
+        return f"Measured by `{self.command}` at {self.commit}, {self.machine}."
+
+
+def read(file: Path) -> Figures:
+    """Read one file.
+
+    Raises:
+        ValueError: a key is missing, or the file is not JSON; the message names the file.
+    """
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        return Figures(
+            *(found[key] for key in ("command", "commit", "machine")),
+            tuple(found["measures"]),
+            *(found[key] for key in ("figures", "goals", "tables")),
+        )
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{file.name}: {error!r}") from error
+
+
+def refreshed(markdown: str) -> str:
+    """Return ``markdown`` with the current figures below every mark.
+
+    Raises:
+        OSError: no such file.
+        KeyError: no such table in it.
+    """
+
+    def block(found: re.Match[str]) -> str:
+        figures = read(FOLDER / f"{found['file']}.json")
+        rows = figures.tables[found["table"]] if found["table"] else _values(figures)
+        return f"{found['mark']}\n\n{table(rows[0], rows[1:])}\n\n{figures.source}\n"
+
+    return BLOCK.sub(block, markdown)
+
+
+def pages() -> Iterator[Page]:
+    """Yield one page of the site for each file, with all its tables."""
+    for file in sorted(FOLDER.glob("*.json")):
+        figures = read(file)
+        values = _values(figures)
+        rows = [values] if values[1:] else []
+        blocks = [table(head, body) for head, *body in (*rows, *figures.tables.values())]
+        text = join(f"# Figures: {file.stem}", figures.source, *blocks)
+        yield Page(f"figures/{file.stem}.md", file.stem, text)
+
+
+def unowned(markdown: str) -> list[str]:
+    """Return the numbers with units that stand outside figures blocks, code, and columns of requirements."""
+    text = re.sub(
+        r"^```.*?^```|`[^`\n]*`|\]\([^)]*\)|<!--.*?-->", "", BLOCK.sub("", markdown), flags=re.MULTILINE | re.DOTALL
+    )
+    return [found[0] for line in _without_requirements(text.splitlines()) for found in NUMBER.finditer(line)]
+
+
+def _values(figures: Figures) -> list[list[str]]:
+    values, goals = dict(_flat(figures.figures)), dict(_flat(figures.goals))
+    return [
+        ["figure", "measured", *(["goal"] if goals else [])],
+        *([name, _text(value), *([_text(goals.get(name, ""))] if goals else [])] for name, value in values.items()),
+    ]
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}: ")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _text(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _without_requirements(lines: Iterable[str]) -> Iterator[str]:
+    exempt: set[int] | None = None
+    for line in lines:
+        if not line.startswith("|"):
+            exempt = None
+            yield line
+            continue
+        cells = line.strip("|").split("|")
+        if exempt is None:
+            exempt = {n for n, cell in enumerate(cells) if EXEMPT_COLUMNS.fullmatch(cell.strip())}
+        yield "|".join(cell for n, cell in enumerate(cells) if n not in exempt)
