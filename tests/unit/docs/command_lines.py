@@ -54,6 +54,7 @@ INSTEAD = {
         )
         for name in SHORTENED
     },
+    "monstertruckd drill --count 3": Instead("monstertruckd drill --count 1", "one fault shows the same"),
     "monstertruckd install-service --config configs/truck.yaml --start": Instead(
         "monstertruckd install-service --config configs/truck.yaml --start --root system --dry-run", SYSTEM
     ),
