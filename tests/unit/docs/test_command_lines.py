@@ -47,7 +47,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # For lines that add stations, whichever line is first.
     authority = CliRunner().invoke(app, ["security", "init", "--folder", str(folder / "security")])
     assert authority.exit_code == 0, authority.output
-    way = (ROOT / "configs" / "paths" / "loop.csv").read_text().splitlines(keepends=True)[:32]
+    way = (ROOT / "configs" / "paths" / "loop.csv").read_text().splitlines(keepends=True)[:16]
     (folder / "short.csv").write_text("".join(way))
     for name in SHORTENED:
         (folder / f"short_{name}.yaml").write_text(
