@@ -39,7 +39,7 @@ SYSTEM = "needs root"
 OWN_DEVICE = "needs the page's own package; tests/daemon/test_own_device.py installs and runs it"
 
 SHORTENED = ("full3d", "slam")
-"""Configurations whose demo drives 1.5 m instead of a lap."""
+"""Configurations whose demo drives 0.7 m instead of a lap."""
 
 INSTEAD = {
     "monstertruckd security router ann/security bob/security --address 192.168.1.2": Instead(
@@ -50,7 +50,7 @@ INSTEAD = {
     ),
     **{
         f"monstertruckd demo --fast --config configs/{name}.yaml": Instead(
-            f"monstertruckd demo --fast --config short_{name}.yaml", "a shorter way; tests/daemon drives laps"
+            f"monstertruckd demo --fast --config short_{name}.yaml", "a shorter path; tests/daemon drives laps"
         )
         for name in SHORTENED
     },
