@@ -36,18 +36,18 @@ PROGRAM_SHA256 = {
     "x86_64": "4a7607589912d9c20e86b860b032f7c7f2913c9a3e76f46aef136885387452b8",
     "aarch64": "5aa4427bd923cfdca2d56a3577f60d8fa7825aa3b496fef975dfd6f03db57d28",
 }
-"""Of the program in the wheel, as the wheel's RECORD states it; every file is compared before it is run."""
+"""Hash of the program in the wheel, from the wheel's RECORD; compared before it is run."""
 ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 TRACED = ("tests/unit/schemas", "tests/unit/gate", "tests/unit/runtime/wire", "tests/unit/drivers")
-"""Where the tests of the parts are whose coverage is a gate (marked in tests/conftest.py)."""
+"""Folders of the tests with a coverage gate (marked in tests/conftest.py)."""
 TESTS = ("--dist", "worksteal", "--hypothesis-profile", "ci", "--assert", "plain", "--showlocals")
-"""Neighbours run in one process, for what they share is cached; property tests have the same examples every time, and
+"""Neighbours run in one process, which caches their shared data; property tests have the same examples every time, and
 no time limit. Plain pytest draws new ones. Values of local variables stand for those in assertions, whose rewriting
 would take as long as a thousand tests."""
 FOUR = ("-n", "4")
-"""Tests at a time on the two cores of a small computer: some wait for a process or a time-out, and beside busy programs
-four get more of the cores than two."""
+"""Tests at a time on the two cores of a small computer: some wait for a process or a time-out, and next to busy
+programs four get more of the cores than two."""
 TWO = ("-n", "2")
 """Tests on the wall clock at a time: each runs a truck and a daemon, which must not be late."""
 ALONE = ("-n", "0")
@@ -68,7 +68,7 @@ OWN_CONFIG = frozenset({"--config", "-c"})
 
 
 def main(arguments: list[str]) -> int:
-    """Entry point; returns the exit code of what was run."""
+    """Entry point; returns the exit code of the command."""
     if not arguments or arguments[0] not in EXTRAS:
         print(__doc__)
         return 0 if arguments[:1] in ([], ["-h"], ["--help"]) else 2
@@ -177,17 +177,17 @@ def run(program: Path, *arguments: str) -> int:
 
 
 def check(arguments: list[str]) -> int:
-    """All checks but the long tests, those that take least first; stops at the first that fails.
+    """All checks but the long tests, fastest first; stops at the first failure.
 
     ``arguments`` go to pytest.
 
-    Tests that fail are run once more, one after the other: on a busy computer some miss a time-out while others run.
+    Failed tests are run once more, one at a time: on a busy computer some miss a time-out while others run.
     Both results are printed; one that fails again fails the check.
     """
     tools = VENV / "bin"
     pytest = tools / "pytest"
     run(KERNELS[0], *BYTECODE)
-    compiling = subprocess.Popen(KERNELS, cwd=ROOT)  # while what needs none runs: it keeps one core busy for a minute
+    compiling = subprocess.Popen(KERNELS, cwd=ROOT)  # while checks without it run: it keeps one core busy for a minute
     try:
         code = steps(
             (Path(find_uv()), ["lock", "--check", "--quiet", "--system-certs"]),
@@ -226,7 +226,7 @@ def steps(*programs: tuple[Path, list[str]]) -> int:
 
 
 def step(program: Path, arguments: list[str]) -> int:
-    """Run one check and print what it is; returns its exit code."""
+    """Run one check and print its name; return its exit code."""
     print(f"==> {program.name} {' '.join(arguments)}", flush=True)
     return run(program, *arguments)
 

@@ -204,7 +204,7 @@ class Daemon:
     # The scopes' contents
 
     def _hand_service(self) -> HandService:
-        """Build the service that drives by the radio control of the operator beside the robot."""
+        """Build the service that drives by the operator's radio control."""
         return HandService(
             self.config.hand,
             self.clock,
@@ -458,7 +458,7 @@ class Daemon:
 
 
 def recording(bus: Bus, clock: Clock) -> Callable[[str, str, str, Reason, str], None]:
-    """Return what publishes every call that was answered as ``event/call``."""
+    """Return a callback that publishes every answered call as ``event/call``."""
     out = bus.publisher(topics.CALL, Writer.DAEMON)
 
     def record(name: str, source: str, payload: str, reason: Reason, answer: str) -> None:

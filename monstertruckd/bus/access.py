@@ -1,8 +1,8 @@
 """Who may do what over Zenoh.
 
 Zenoh's access rules bind a name to a certificate: under ``req/<name>/...`` and ``rpc/.../<name>`` only that
-certificate's requests arrive. What the name may ask for is its grant, which the daemon looks up. So a source that asks
-for too much is answered, while one that uses another's name is dropped.
+certificate's requests arrive. The daemon looks up the grant of the name. So it answers a source that requests too much,
+and drops a request under another name.
 
 Groups out of the robot may only leave it and requests may only enter it, so that no other peer can forge the robot's
 state to the others. A rule covers a declaration only if it contains the whole declared key expression.
@@ -26,19 +26,19 @@ ANONYMOUS: Final = "anonymous"
 _SIDE_CHANNEL = "@adv/**"
 """Below a retained topic's key: history of its publisher; ``**`` alone never matches a part with an @."""
 _DESCRIPTIONS: Final = ("topics", "schema/**")
-"""Calls that say nothing of their caller: what the keys and their contents mean."""
+"""Calls without a caller: meaning of the keys and their contents."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """What one source may do."""
+    """Grant of one source."""
 
     role: AccessRole
     rank: Role
     """Highest priority it may claim."""
 
     def capped(self, role: Role) -> Role:
-        """``role``, or the rank if that is lower; the hand's is that of the receiver alone."""
+        """``role``, or the rank if that is lower; only the receiver has the role of the hand."""
         order = list(Role)
         return max(Role.GAMEPAD if role is Role.HAND else role, self.rank, key=order.index)
 
@@ -49,7 +49,7 @@ OBSERVING: Final = Grant(AccessRole.OBSERVER, Role.STATION)
 
 @dataclass(frozen=True, slots=True)
 class Sender:
-    """Who sent a request or a call, as its key says."""
+    """Sender of a request or a call, by its key."""
 
     source: str
     grant: Grant
@@ -59,13 +59,13 @@ class Sender:
         return self.grant.role.covers(needed)
 
     def refusal(self, needed: AccessRole) -> str:
-        """Why it may not do what takes ``needed``."""
+        """Why its role does not include ``needed``."""
         hint = "; the key names no source" if self.source == ANONYMOUS else ""
         return f"{self.source} has the role {self.grant.role}, this takes {needed}{hint}"
 
 
 def role_needed(request: Request) -> AccessRole:
-    """What a request takes; the emergency stop is everybody's, shaft speeds are an engineer's."""
+    """Role that a request requires: any for the emergency stop, engineer for shaft speeds."""
     if isinstance(request, DriveRequest) and request.form is DriveForm.SHAFTS:
         return AccessRole.ENGINEER
     estop = isinstance(request, ControlRequest) and request.order is Order.ESTOP
@@ -85,13 +85,13 @@ def in_groups() -> tuple[str, ...]:
 def access_rules(robot: str, owners: Iterable[str] | None = None, routers: Iterable[str] = ()) -> dict[str, Any]:
     """Zenoh ``access_control`` section for ``robot``.
 
-    The rules know no variables: each certificate has rules, a subject and a policy of its own.
+    The rules know no variables: each certificate has its own rules, subject and policy.
 
     Args:
         robot: name of the robot.
-        owners: common names of the certificates that may see, and ask under their own name; None = everybody who can
-            connect may, under any name.
-        routers: common names of a fleet's routers. What comes from one may have the name of any owner: the router
+        owners: common names of the certificates that may see, and request under their own name; None if every client
+            may, under any name.
+        routers: common names of a fleet's routers. Their messages may carry the name of any owner: the router
             has compared it with the certificate (``router_rules``).
     """
     common = _common(robot)
@@ -129,7 +129,7 @@ def router_rules(fleet: Mapping[str, Iterable[str]]) -> dict[str, Any]:
     policies: list[dict[str, Any]] = []
     seen_by: dict[str, list[str]] = {}
     for robot, owners in fleet.items():
-        # The robot's end of its link, seen from the other end: what leaves there enters here.
+        # The robot's end of its link, seen from the other end: messages that leave there enter here.
         behind = [
             _renamed(rule, f"{robot}-{rule['id']}", _OTHER_FLOW[rule["flows"][0]])
             for rule in (*_common(robot), *_own("fleet", *_all_keys(robot)))
@@ -174,7 +174,7 @@ def _common(robot: str) -> list[dict[str, Any]]:
             [*seen, *history, alive_key(robot)],
         ),
         _rule("requests-out", "egress", ["declare_subscriber"], [*requests, STAND_POSE.key(robot)]),
-        # Whoever may connect may say where it sees the robot: nothing in the robot reads it.
+        # Every client may publish an observed pose of the robot: nothing in the robot reads it.
         _rule("stand-in", "ingress", ["put"], [STAND_POSE.key(robot)]),
         _rule("calls-out", "egress", ["declare_queryable", "reply"], calls),
     ]

@@ -1,4 +1,4 @@
-"""Limits of remote calls, checked in the thread in which they arrive, so that a flood does not reach the event loop.
+"""Limits of remote calls, checked in the receiving thread, so that a flood does not reach the event loop.
 
 An emergency stop is refused only where as many of the same owner, or of all together, are being carried out.
 """
@@ -50,7 +50,7 @@ class CallLimits:
 
         Args:
             name: of the call.
-            source: who calls; None = the key names nobody.
+            source: caller; None if the key names no source.
             waiting: calls that wait to be served.
         """
         source = source or ANONYMOUS

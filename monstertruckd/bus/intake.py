@@ -1,9 +1,8 @@
 """Intake of requests: checked in Zenoh's thread, then passed to the event loop one at a time.
 
-Even in another thread a decoder holds the interpreter while it runs, so what may be decoded is bounded by size, by rate
-and by a look at the bytes. Every topic waits in a queue of its own, and every owner has a rate of its own: a flood of
-one delays no other. Orders that stop are never refused; those that repeat faster than the truck could notice are taken
-together.
+Even in another thread a decoder holds the interpreter while it runs, so input is bounded by size, by rate and by a look
+at the bytes before it is decoded. Every topic has its own queue, and every owner its own rate: a flood of one delays no
+other. Orders that stop are never refused; those that repeat faster than the truck could notice are taken together.
 """
 
 import asyncio
@@ -45,12 +44,12 @@ REQUEST_QUEUE: Final = 64
 MAX_OWNERS: Final = 64
 """Owners whose rates are known; the least recent one is dropped for a new one."""
 TOGETHER: Final = 5.0
-"""All together may send so many times what one owner may: without certificates names can be invented."""
+"""Ratio of the rate of all owners together to the rate of one owner: without certificates names can be invented."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """What one topic may bring."""
+    """Limits of one topic."""
 
     size: int = 2048
     """Bytes of one request."""
@@ -65,16 +64,16 @@ LIMITS: Final = {
     REQ_LOCALISATION.name: Limit(rate=20.0),
     REQ_MAP.name: Limit(size=524_288, rate=1.0),
 }
-"""All others: ``Limit()``. What an order asks is known once it is decoded: see ``ORDER_RATE``. A path of 2000 poses
+"""All others: ``Limit()``. The kind of an order is known once it is decoded: see ``ORDER_RATE``. A path of 2000 poses
 fits, and the map of a building: at the edges of its rooms a cell takes about one bit."""
 
 ORDER_RATE: Final = 5.0
 """Orders a second of one owner, those that stop not counted."""
 
 STOP_RATE: Final = 50.0
-"""Orders a second of one owner that stop and are taken at once; of further ones the newest follows."""
+"""Orders a second of one owner that stop and are taken at once; of further ones only the latest follows."""
 REPEAT: Final = 0.02
-"""Seconds after which it does."""
+"""Delay of that latest order, s."""
 MAX_REPEATS: Final = 8
 """Owners of whom it does; one more replaces the one heard least recently, for others are stopping the truck then."""
 
@@ -98,7 +97,7 @@ class _Budget:
 
 
 class OwnerRates:
-    """Limits what the programs of each owner may send a second, and all together; callable from any thread.
+    """Limits the request rates of each owner's programs, and of all together; callable from any thread.
 
     Args:
         rate: requests a second of one owner, in bursts of as many.
@@ -164,7 +163,7 @@ class Refusals:
 
 
 class Repeats:
-    """Holds the newest order of each owner for a moment, so that however many come, the loop gets few.
+    """Holds the latest order of each owner for a moment, so that the loop receives few, however many arrive.
 
     To be made on the loop.
 
@@ -210,9 +209,9 @@ class Intake:
         topic: one that outsiders write.
         bus: where the requests go.
         clock: time.
-        guard: runs what happens on the loop, so that a bug does not vanish there.
+        guard: runs callbacks on the loop, so that a bug does not vanish there.
         reporter: who reports refusals.
-        only: the one order that is taken, on a way of its own; None = all.
+        only: the one accepted order, on a separate path; None for all.
     """
 
     def __init__(
@@ -247,7 +246,7 @@ class Intake:
         """Judge, decode and queue one request; callable from any thread.
 
         Args:
-            sender: whose it is, whatever the request says.
+            sender: owner by the key, whatever the request claims.
             size: bytes it has.
             read: gets them.
         """
@@ -307,20 +306,20 @@ class Intake:
         return self._rates is None or self._rates.spend(source)
 
     def close(self) -> None:
-        """Discard what waits and everything to come."""
+        """Discard waiting and later messages."""
         self._requests.close()
         self._estops.close()
         self._refusals.close()
 
 
 class StandIntake:
-    """Takes in what a test stand sees of the robot, for the recorder; to be made on the loop.
+    """Receives a test stand's observations of the robot, for the recorder; to be made on the loop.
 
     Args:
         bus: whose taps get it.
         clock: time.
         guard: as of ``Intake``.
-        refusals: reports what is refused.
+        refusals: reports refused messages.
     """
 
     SIZE: Final = 1024
@@ -351,7 +350,7 @@ class StandIntake:
                 self._refusals.add(Reason.BAD_INPUT, name, str(error))
 
     def close(self) -> None:
-        """Discard what waits and everything to come."""
+        """Discard waiting and later messages."""
         self._poses.close()
 
 

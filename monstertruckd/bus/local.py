@@ -1,8 +1,8 @@
 """In-process hand-over: one write end per topic, any number of read ends, messages passed by reference.
 
-Everything happens on the event loop. A message reaches listeners at once, then its readers in the order in which they
-subscribed; then, at once or a moment later, the taps (recorder, Zenoh) get it with its wire bytes, encoded once for all
-of them.
+Everything happens on the event loop. A message reaches listeners at once, then its readers in the order of
+subscription; then, at once or a moment later, the taps (recorder, Zenoh) get it with its wire bytes, encoded once for
+all of them.
 """
 
 import math
@@ -75,8 +75,8 @@ class _ReadEnds:
 class Bus:
     """Topics of one daemon.
 
-    Write ends are handed out once each and only to the writer the topic table names, so that who may write what
-    is settled while the daemon is put together.
+    Write ends are handed out once each and only to the writer the topic table names, so that writing rights are settled
+    at assembly.
 
     Args:
         clock: time.
@@ -119,11 +119,11 @@ class Bus:
         return tuple(self._claim(topic) for topic in CMD_DRIVES[:shafts]), self._claim(CMD_STEERING)
 
     def event_sink(self) -> EventSink:
-        """Where any service reports what happened; all share one topic and its sequence numbers."""
+        """Sink of every service's events; all share one topic and its sequence numbers."""
         return self._emit
 
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """A read end of ``topic``; of a retained topic it holds the newest message at once.
+        """A read end of ``topic``; for a retained topic it holds the latest message at once.
 
         Raises:
             RuntimeError: it is what a test stand sees, which nothing in the robot may know.
@@ -145,17 +145,17 @@ class Bus:
         self._ends[topic.name].listeners.append(listener)
 
     def newest(self, topic: Topic[M]) -> M | None:
-        """Newest message of a retained topic; None before the first, and for every other topic."""
+        """Latest message of a retained topic; None before the first, and for every other topic."""
         held = self._retained.get(topic.name)
         return None if held is None else held[1]
 
     def retained(self) -> Iterator[tuple[Topic[Any], Message, bytes]]:
-        """Newest message of every retained topic with its bytes, e.g. for the head of a new log file."""
+        """Latest message of every retained topic with its bytes, e.g. for the head of a new log file."""
         for topic, message in list(self._retained.values()):
             yield topic, message, wire.encode(topic, message)
 
     def tap(self, callback: TapCallback, topics: Iterable[Topic[Any]]) -> Tap:
-        """Call back with every message of ``topics``; those of retained topics at once.
+        """Call back with every message of ``topics``; at once with retained ones.
 
         All taps of a topic share one encoding; a topic without taps is never encoded.
         """
@@ -173,7 +173,7 @@ class Bus:
     def inject(self, topic: Topic[M], message: M) -> list[object]:
         """Take in a request from outside; ``received`` becomes the daemon's own time, whatever it claimed.
 
-        Returns what the topic's listeners returned, in their order.
+        Returns the listeners' results, in their order.
 
         Raises:
             RuntimeError: ``topic`` is not one that outsiders write.
@@ -184,7 +184,7 @@ class Bus:
         return self.hand_over(topic, message.model_copy(update={"received": self._clock.now()}))
 
     def put_stand(self, topic: Topic[M], message: M) -> None:
-        """Take in what a test stand sees: for the taps alone. ``received`` becomes the daemon's own time.
+        """Deliver a test stand's message to the taps alone. ``received`` becomes the daemon's own time.
 
         Raises:
             RuntimeError: ``topic`` is not one that a stand writes.
@@ -204,7 +204,7 @@ class Bus:
         self._drops += count
 
     def hand_over(self, topic: Topic[M], message: M) -> list[object]:
-        """Deliver to listeners, readers and taps; returns what the listeners returned."""
+        """Deliver to listeners, readers and taps; return the listeners' results."""
         if topic.name in self.degraded:
             message = message.model_copy(update={"degraded": True})
         if topic.retained:

@@ -1,4 +1,4 @@
-"""What leaves the process, in batches: a message that follows another costs a fraction of one that comes alone.
+"""Outgoing messages in batches: a message that follows another costs a fraction of a single one.
 
 The code that encodes, records and puts is then in the caches, and each batch wakes Zenoh's threads once.
 """
@@ -12,7 +12,7 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.topics import Topic
 
 BEHIND: Final = MILLISECOND
-"""Nanoseconds after the multiples at which batches leave: what the gate publishes there leaves with them."""
+"""Offset of the batches from the multiples (ns): messages that the gate publishes there leave with them."""
 BATCH: Final = 10
 """Messages delivered in one iteration of the event loop: a fraction of a millisecond."""
 
@@ -48,7 +48,7 @@ class Outgoing:
             self._timer = loop.call_at(due / SECOND, self._due)
 
     def flush(self) -> None:
-        """Deliver all that waits; what is sent meanwhile comes behind it."""
+        """Deliver all waiting messages; those sent meanwhile follow."""
         if self._delivering:
             return
         try:

@@ -13,11 +13,11 @@ from monstertruck_schemas.topics import GATE, PEERS, POSE
 from monstertruckd.bus.zenoh_config import PeerConfig
 
 SILENT: Final = 5.0
-"""Time without a pose after which another robot is lost (s)."""
+"""Maximum age of a pose before the other robot is lost (s)."""
 
 
 class PeerService:
-    """Publishes the newest poses of other robots at a steady rate, with the time of receipt.
+    """Publishes the latest poses of other robots at a steady rate, with the time of receipt.
 
     Args:
         clock: time.
@@ -31,7 +31,7 @@ class PeerService:
         self._heard: dict[str, Peer] = {}
 
     def hear(self, robot: str, pose: Odometry) -> None:
-        """Take the newest pose of another robot."""
+        """Take the latest pose of another robot."""
         self._heard[robot] = Peer(
             robot=robot,
             pose=pose.pose,
@@ -72,7 +72,7 @@ class PeerSubscriber:
         """Listen until cancelled.
 
         Raises:
-            NotFoundError: nobody is there, or no robot of this name.
+            NotFoundError: no robot answers there, or none of this name.
             NoAnswerError: it has published no pose for 5 s.
         """
         endpoint = self._config.endpoint
@@ -81,5 +81,5 @@ class PeerSubscriber:
                 while (pose := await poses.next_within(SILENT)) is not None:
                     ready()
                     self._peers.hear(self._robot, pose)
-            await client.get_retained(GATE)  # says who is there instead
+            await client.get_retained(GATE)  # names the robot there
             raise NoAnswerError(f"robot {self._robot!r} at {endpoint} has published no pose for {SILENT:g} s")

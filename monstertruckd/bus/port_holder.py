@@ -72,7 +72,7 @@ def _inodes(endpoint: str, proc: Path) -> Iterator[str]:
 
 
 def _listening(endpoint: str, proc: Path) -> Iterator[list[str]]:
-    """Rows of the kernel's tables for what listens at a port."""
+    """Rows of the kernel's tables for listeners at a port."""
     port = port_of(endpoint)
     for table in ("tcp", "tcp6"):
         rows = _rows(proc / "net" / table)

@@ -1,11 +1,11 @@
-"""Answers on their way to stations, in threads of their own.
+"""Answers to stations, sent by separate threads.
 
 A reply, and the final message of a query that is dropped, waits for room towards its station: 2 s towards one that
-takes nothing. Neither the event loop nor the threads in which queries arrive may stand still so long.
+takes nothing. Neither the event loop nor the receiving threads may block for so long.
 
 Zenoh serves no station while it hangs up on one, and that takes 2 s more for each further thread that is still waiting
-for room there: with eight of them, 14 s. So one owner has one reply under way. Those whose key names nobody have one
-together: Zenoh does not say which session a query comes from, and what a client says of itself could be anything.
+for room there: with eight of them, 14 s. So one owner has one reply under way. Queries without a source share one:
+Zenoh does not report the session of a query, and a client's own claims prove nothing.
 """
 
 import logging
@@ -41,7 +41,7 @@ class Replies:
         self._change = threading.Condition()
         self._waiting = 0
         self._queues: dict[tuple[str, bool], deque[tuple[zenoh.Query, Reply | None]]] = {}
-        """By owner, orders apart; the first of each is under way."""
+        """Waiting replies by owner, orders separate; the first of each is under way."""
 
     def wait_for_room(self) -> None:
         """Wait until there is room for one more reply; not for the event loop."""
@@ -55,8 +55,8 @@ class Replies:
 
         Args:
             query: not to be used any more.
-            reply: None = end it without an answer.
-            source: who asks; None = the query names nobody.
+            reply: None to end it without an answer.
+            source: caller; None if the query names no source.
             order: whether it answers an order: these do not wait behind the others.
         """
         key = owner_of(source or ANONYMOUS), order

@@ -1,6 +1,6 @@
 """Remote calls: named coroutine handlers that take and return JSON objects.
 
-Handlers find the caller under ``source`` and the priority it may claim under ``role``, whatever the payload said.
+Handlers find the caller under ``source`` and its permitted priority under ``role``, whatever the payload claims.
 """
 
 import json
@@ -64,7 +64,7 @@ class Rpc:
         return name in self._handlers
 
     async def call(self, name: str, payload: dict[str, Any]) -> dict[str, Any]:
-        """Run one handler, whoever calls.
+        """Run one handler, for any caller.
 
         Raises:
             NotFoundError: no such name; the text lists those there are.

@@ -1,4 +1,4 @@
-"""Where and how the robot is reachable over Zenoh."""
+"""Endpoints and access of the robot over Zenoh."""
 
 import ipaddress
 import json
@@ -19,7 +19,7 @@ from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, access_rules
 
 OWNER_NAME: Final = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.@-]{0,31}")
 """Common names of certificates: one part of a key, without the colon that begins the name of one of its programs, and
-without a first dot: the name is that of a folder, too."""
+without a leading dot: the name also names a folder."""
 OwnerName = Annotated[str, Field(pattern=f"^{OWNER_NAME.pattern}$")]
 Owners = Annotated[tuple[OwnerName, ...], Field(strict=False)]
 
@@ -82,7 +82,8 @@ class ZenohConfig(Schema):
     """Routers of a fleet to connect to; retried until connected."""
     tls: TlsConfig | None = None
     insecure: bool = False
-    """Allow endpoints on a network without TLS, to listen at or to connect to: anybody there may drive the truck."""
+    """Allow endpoints on a network without TLS, to listen at or to connect to: every program there may drive the
+    truck."""
     access_control: bool = False
     """Refuse state published by others in this robot's name; always on with ``tls``. Subscribers must then subscribe to
     one group (``mt/truck/state/**``): wider expressions receive nothing."""
@@ -129,7 +130,7 @@ class PeerConfig(Schema):
     """Another robot whose poses are received."""
 
     endpoint: str
-    """Where it listens, e.g. tcp/192.168.1.8:7447"""
+    """Its endpoint, e.g. tcp/192.168.1.8:7447"""
     length: Annotated[float, Field(gt=0, le=10)] | None = None
     """Of its outline, m; null = that of this robot"""
     width: Annotated[float, Field(gt=0, le=10)] | None = None
@@ -159,7 +160,7 @@ class Listener:
 
 
 def listeners(config: ZenohConfig) -> list[Listener]:
-    """The sessions of a robot; the first one is that of all stations and of the fleet."""
+    """The sessions of a robot; the first one serves all stations and the fleet."""
     tls = config.tls
     guarded = config.access_control or tls is not None
     grants = None if tls is None else tls.grants()
@@ -169,7 +170,7 @@ def listeners(config: ZenohConfig) -> list[Listener]:
         driving = {name: grant for name, grant in grants.items() if grant.role.covers(AccessRole.PILOT)}
         found.append(Listener(config.listen_pilots, config.max_sessions, (), tls.pilots_ca, driving, guarded=guarded))
     if config.local_socket and (local := local_endpoint(config.listen)) is not None:
-        found.append(Listener((local,), 16, guarded=guarded))  # sessions of the robot's own command line
+        found.append(Listener((local,), 16, guarded=guarded))  # sessions of the command line on the robot
     return found
 
 
@@ -178,9 +179,9 @@ def session_config(robot: str, config: ZenohConfig, listener: Listener, *, probe
 
     No discovery at all, for fixed endpoints connect in milliseconds. A full transmit queue drops at once
     (``wait_before_drop`` 0) because a put happens on the event loop; each is deep enough for the largest message.
-    No shared memory: it takes 20 MB and a thread of its own, and for scans it is the slower way.
+    No shared memory: it takes 20 MB and a thread, and is slower for scans.
     """
-    # 2_000_000: microseconds after which a station is disconnected that does not take an answer, or a message that must
+    # 2_000_000: time limit before a station is disconnected that does not take an answer (us), or a message that must
     # not be dropped. Zenoh's own 5 s are too long for requests that wait behind it; a large map needs some time as
     # well.
     transport: dict[str, Any] = {

@@ -1,6 +1,6 @@
 """Bridge between the in-process bus and Zenoh: state out, requests in, remote calls, liveliness.
 
-Zenoh calls back on threads of its own; everything that touches the daemon hops onto the event loop first.
+Zenoh calls back on its own threads; everything that touches the daemon hops onto the event loop first.
 Opening and closing block, so a thread does them.
 """
 
@@ -416,7 +416,7 @@ def _reply_schemas(described: list[tuple[str, Topic[Any]]], query: zenoh.Query) 
 def _publisher(session: zenoh.Session, topic: Topic[Any], key: str) -> Put:
     """Put function of one topic; a full queue drops the message rather than stalling the loop.
 
-    Each priority has a queue of its own: others send at Zenoh's ordinary one, and neither they nor answers delay ours.
+    Each priority has its own queue: other programs use Zenoh's ordinary one, and neither they nor answers delay ours.
     """
     priority = zenoh.Priority.DATA_LOW if topic.name in BULKY else zenoh.Priority.DATA_HIGH
     if topic.retained:

@@ -1,8 +1,8 @@
 """Calibration of a truck: measured values with their uncertainty, the folder that keeps them, and how they apply.
 
-Files are numbered and dated, ``0003-2026-11-21T160102Z.json``; the newest counts. A file is written under another name,
-synced and then renamed, so that after any crash the newest one is whole. No file is ever changed or removed: undoing
-writes a newer file with the older value.
+Files are numbered and dated, ``0003-2026-11-21T160102Z.json``; the latest is used. A file is written under another
+name, synced and then renamed, so that after any crash the latest one is whole. No file is ever changed or removed:
+undoing writes a newer file with the older value.
 """
 
 import fcntl
@@ -76,26 +76,26 @@ class Estimate(Schema):
     samples: Annotated[int, Field(ge=1)]
     """Measurements it rests on"""
     meaning: str
-    """What the value is, and what its interval covers"""
+    """Meaning of the value, and coverage of its interval"""
     key: Annotated[str, AfterValidator(present_key)] | None = None
     """Place in the configuration that it sets, of whatever version; None: for information only"""
     date: str = ""
     """When it was measured, UTC by the robot's clock; set when it is saved"""
     grade: Grade | None = None
-    """By the width of its interval; None: it has none, or no goal"""
+    """Grade by the width of its interval; None without an interval or a goal"""
     valid_until: "ValidUntil | None" = None
     """Set when it is saved; None: of an older release"""
     file: Annotated[int, Field(ge=0)] = 0
-    """Number of the file in which it was first saved: clocks may be wrong; 0: not yet, or by an older release"""
+    """Number of the file that first held it, because clocks may be wrong; 0: not saved yet, or by an older release"""
 
 
 class ValidUntil(Schema):
-    """What ends an estimate, whichever comes first."""
+    """Limits of an estimate's validity; the first one reached ends it."""
 
     date: str
     """UTC"""
     odometer: float | None = None
-    """Total distance driven, m; None: distance does not count"""
+    """Total distance driven, m; None: not limited by distance"""
     part: str = ""
     """Device that was measured, and its port; another device, or one that was plugged elsewhere, is another part"""
     serial: str = ""
@@ -103,27 +103,27 @@ class ValidUntil(Schema):
 
 
 class Result(Schema):
-    """What one run of a wizard measured."""
+    """Result of one run of a wizard."""
 
     wizard: WizardName
     date: Date = ""
-    """Of the newest estimate; set when it is saved"""
+    """Date of the latest estimate; set when it is saved"""
     measured: str
-    """What was done, in a sentence"""
+    """Description of the procedure, as a sentence"""
     confidence: float = CONFIDENCE
-    """Of the intervals"""
+    """Confidence level of the intervals"""
     estimates: Annotated[tuple[Estimate, ...], Field(min_length=1)]
     unobserved: tuple[str, ...] = ()
-    """What this measurement cannot determine"""
+    """Quantities that this measurement cannot determine"""
     readings: tuple[tuple[float, ...], ...] = ()
-    """Raw readings that a later run may use again; their meaning is the wizard's"""
+    """Raw readings that a later run may use again; the wizard defines their meaning"""
     partial: bool = False
     """Only these were measured: other results of the run before stay"""
     again: str | None = None
-    """What has to be done before the calibration is complete"""
+    """Steps that remain before the calibration is complete"""
 
     def over(self, before: "Result | None", date: str, file: int = 0) -> "Result":
-        """This result as it is saved on ``date`` in the file of that number, with what it keeps of ``before``."""
+        """Return this result as saved on ``date`` in file ``number``, with estimates kept from ``before``."""
         fresh = tuple(e.model_copy(update={"date": e.date or date, "file": file}) for e in self.estimates)
         names = {estimate.name for estimate in fresh}
         old = before.estimates if self.partial and before is not None else ()
@@ -145,7 +145,7 @@ class CalibrationFile(Schema):
     written: str
     """UTC, by the robot's clock"""
     change: str
-    """What it differs in from the one before"""
+    """Differences from the previous file"""
     results: dict[WizardName, Result]
 
 
@@ -185,7 +185,7 @@ class CalibrationStore:
         return sorted(names, key=lambda path: (_number(path), path.name))
 
     def newest(self) -> Path | None:
-        """The file that counts."""
+        """The file in use."""
         return next(reversed(self.files()), None)
 
     def load(self, path: Path) -> CalibrationFile:
@@ -206,7 +206,7 @@ class CalibrationStore:
         return file
 
     def current(self) -> CalibrationFile | None:
-        """Content of the newest file; None before the first calibration.
+        """Content of the latest file; None before the first calibration.
 
         Raises:
             ConfigError: see ``load``.
@@ -215,14 +215,14 @@ class CalibrationStore:
         return None if path is None else self.load(path)
 
     def save(self, result: Result, real_ns: int) -> Path:
-        """Write a new file in which ``result`` replaces the wizard's last one; returns its path.
+        """Write a new file with ``result`` in place of the wizard's last one; return its path.
 
         Args:
-            result: what was measured.
+            result: measured estimates.
             real_ns: real time now.
 
         Raises:
-            ConfigError: the newest file is damaged, or the new one cannot be written; nothing has changed then.
+            ConfigError: the latest file is damaged, or the new one cannot be written; nothing has changed then.
         """
         with self._alone():
             current = self.current()
@@ -249,7 +249,7 @@ class CalibrationStore:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Keep other writers out, in this process and in others, from the reading of the newest file to the next one.
+        """Keep other writers out, in this process and in others, from reading the latest file to writing the next one.
 
         Raises:
             ConfigError: the folder cannot be made or opened.
@@ -320,10 +320,10 @@ def put_values(data: dict[str, Any], results: Iterable[Result], source: Path | s
 
 
 def in_order(results: Iterable[Result]) -> list[tuple[Result, int, Estimate]]:
-    """Estimates that set a value, each with its result and its index there, the newest last.
+    """Estimates that set a value, each with its result and its index there, latest last.
 
-    A result that was measured in part only keeps estimates that are older than those of another wizard: of a value that
-    both set, the newer one counts.
+    A partial measurement keeps old estimates, which may be older than another wizard's. If both set a value, the newer
+    estimate is used.
     """
     rows = [(result, k, e) for result in results for k, e in enumerate(result.estimates) if e.key is not None]
     return sorted(rows, key=lambda row: (row[2].file, "" if row[2].file else row[2].date or row[0].date))

@@ -1,4 +1,4 @@
-"""The daemon's side: it alone writes the calibration, where its user may, and says which file it runs on."""
+"""Calibration calls of the daemon: it alone writes the calibration, if its user may, and reports the file in use."""
 
 import json
 from collections.abc import Callable
@@ -41,14 +41,14 @@ def register(
     """Serve ``calibration``, ``calibration_save`` and ``calibration_undo``.
 
     Args:
-        rpc: where.
+        rpc: registry of remote calls.
         config: the running one, calibration included.
         loaded: the file it includes.
         clock: dates the files.
         events: gets an event for every new file.
         offload: where files are read and written.
-        mode: the gate's present one; nothing is written while the truck may move.
-        watch: gives a result its grades, says until when it counts, and knows what is proposed.
+        mode: the gate's current mode; nothing is written while the truck may move.
+        watch: gives a result its grades and expiry, and knows the proposal.
     """
     store = CalibrationStore(config.calibration_folder, config.robot)
 

@@ -1,4 +1,4 @@
-"""Settings of devices that decide how safe a robot is: what is beyond possible, and what is weaker than by default.
+"""Safety-relevant settings of devices: values beyond the body's limits, and values less safe than the default.
 
 As in ``monstertruckd.gate.config`` for the gate's own.
 """
@@ -89,7 +89,7 @@ UNATTENDED: Final[dict[type[Schema], tuple[str, ...]]] = {
     Pca9685Config: ("command_timeout",),
     Pca9685EscConfig: ("command_timeout",),
 }
-"""Times in which the truck drives on whatever happens."""
+"""Times during which the truck drives on, whatever happens."""
 
 BY_CELLS: Final = (
     *("low", "clear", "critical", "collapsed", "overcharged", "overcharged_clear"),
@@ -99,7 +99,7 @@ BY_CELLS: Final = (
 
 
 def unattended_times(devices: Devices) -> Iterator[tuple[str, float]]:
-    """Times of drivers in which the truck drives on whatever happens, s, with their names."""
+    """Times of drivers during which the truck drives on, whatever happens (s), by name."""
     for role, device in devices.present().items():
         driver = device.driver
         for name in UNATTENDED.get(type(driver), ()):
@@ -107,13 +107,13 @@ def unattended_times(devices: Devices) -> Iterator[tuple[str, float]]:
 
 
 def beyond_devices(devices: Devices, monitors: Monitors, standstill: float, body: BodyLimits) -> Iterator[str]:
-    """Every setting of a device that asks for more than the body can do, with what it can.
+    """Every device setting beyond the body's limits, with the limit.
 
     Args:
         devices: of the robot.
-        monitors: likewise.
+        monitors: of the robot.
         standstill: ``gate.standstill``, m/s.
-        body: what bounds its motion.
+        body: limits of its motion.
     """
     for role, device in devices.present().items():
         driver = device.driver
@@ -127,7 +127,7 @@ def beyond_devices(devices: Devices, monitors: Monitors, standstill: float, body
 
 
 def weakened_devices(devices: Devices, monitors: Monitors) -> Iterator[str]:
-    """Every setting of a device that is weaker than by default, with its value and the default.
+    """Every device setting less safe than its default, with its value and the default.
 
     Args:
         devices: of the robot.
@@ -177,7 +177,7 @@ def packs(devices: Devices, monitors: Monitors) -> Iterator[tuple[str, PackConfi
 
 
 def _beyond_cells(place: str, pack: PackConfig) -> Iterator[str]:
-    empty = 3.0  # volts of a lithium-polymer cell at which it has nothing left
+    empty = 3.0  # voltage of an empty lithium-polymer cell
     for name in ("low", "critical", "collapsed"):
         volts = getattr(pack, name)
         if volts < empty * pack.cells:

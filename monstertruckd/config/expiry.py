@@ -1,8 +1,8 @@
-"""How well a calibration was measured, and until when it counts: grades, validity, and the service that watches both.
+"""Grades and validity of calibrations, and the service that monitors both.
 
-What rests on an expired calibration says so (``degraded``): the truck drives on, as nothing has failed. A calibration
-expires by time, by the distance driven since, or when the device that was measured is another one (by its serial
-number, where USB states one) or is on another port.
+Values based on an expired calibration are marked ``degraded``; the truck drives on. A calibration
+expires by time, by the distance driven since, or when the measured device was replaced (by its serial number, if USB
+gives one) or is on another port.
 """
 
 import itertools
@@ -93,7 +93,7 @@ def stamped(
 
 
 def worst(result: Result) -> Grade:
-    """Grade of a result: that of its worst estimate; C where no estimate has one."""
+    """Grade of a result: the worst grade of its estimates; C if no estimate has one."""
     grades = [g for e in result.estimates if (g := e.grade or grade(result.wizard, e)) is not None]
     return max(grades, default="C")
 
@@ -142,10 +142,10 @@ class DistanceCounter:
     written: float = 0.0
 
     def load(self) -> str:
-        """Read it; a missing file begins at 0, and so does one that cannot be read or is damaged.
+        """Read it; the distance starts at 0 if the file is missing, unreadable or damaged.
 
         Returns:
-            What is wrong with the file; empty for a sound or a missing one.
+            Fault of the file; empty if it is intact or missing.
         """
         self.metres, wrong = 0.0, ""
         try:
@@ -178,13 +178,13 @@ class CalibrationWatch:
 
     Args:
         config: the running one.
-        results: of the calibration that it runs on.
+        results: of the calibration in use.
         bus: whose messages are marked.
         clock: time.
         events: gets an event when one ends.
         offload: where files are written.
         odometer: total distance driven.
-        proposal: what trackers propose; None: nothing is.
+        proposal: proposals of trackers, or None.
     """
 
     name = ServiceName.CALIBRATION.value
@@ -214,7 +214,7 @@ class CalibrationWatch:
         self._serials: dict[str, str] = {}
 
     async def _begin(self) -> None:
-        """Read the distance; a damaged file is kept beside the new one."""
+        """Read the distance; a damaged file is kept next to the new one."""
         wrong, file = await self._offload(self.odometer.load), self.odometer.file
         if wrong and file is not None:
             where = await self._offload(lambda: put_aside(file))
@@ -227,7 +227,7 @@ class CalibrationWatch:
             self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, text)
 
     async def consider(self, state: TrackerState) -> None:
-        """Propose what a tracker has learnt about the steering, if that is new."""
+        """Propose a tracker's estimate of the steering, if it is new."""
         proposal = self.proposal
         if proposal is None or not proposal.consider(state, utc(self._real())):
             return
@@ -252,11 +252,11 @@ class CalibrationWatch:
             self._events(disk_reason(error), Severity.WARNING, self.name, text)
 
     def stamped(self, result: Result) -> Result:
-        """As it is saved now."""
+        """Calibration as saved now."""
         return stamped(result, self._config, self._real(), self.odometer.metres, self._serials)
 
     def states(self) -> list[CalibrationState]:
-        """Of every wizard whose result counts."""
+        """Validity of every wizard's current result."""
         now, way = self._real(), self.odometer.metres
         return [state_of(r, self._config, now, way, self._serials) for r in self._results.values()]
 

@@ -32,7 +32,7 @@ def with_settings(config: T, values: Mapping[str, Any]) -> T:
     """``config`` with other values of live settings, validated as a whole.
 
     Raises:
-        InputError: a setting that is not there or not live, or a value that is refused, with what is possible.
+        InputError: a setting is unknown or not live, or a value is refused; names the possible values.
     """
     known = {setting.key for setting in live_settings(config)}
     data = config.model_dump()
@@ -47,10 +47,10 @@ def with_settings(config: T, values: Mapping[str, Any]) -> T:
 
 
 class LiveConfig:
-    """The running configuration, of which live settings may be replaced.
+    """The running configuration, with replaceable live settings.
 
     Args:
-        config: as the daemon began with.
+        config: at the daemon's start.
         apply: gives every part its settings, between two ticks of the gate.
         events: gets an event for every change, with who made it.
         offload: where configurations are validated and files written.
@@ -107,10 +107,10 @@ class LiveConfig:
 
 
 def _values(given: Any) -> dict[str, LiveValue]:
-    """Settings from outside.
+    """Parse settings from a request.
 
     Raises:
-        InputError: there are none, or too many; what the values may be is said by their models.
+        InputError: there are none, or too many; the models check the values.
     """
     most = 32  # settings changed by one call
     if not isinstance(given, dict) or not 0 < len(given) <= most:

@@ -1,6 +1,6 @@
 """Loads a robot's configuration: YAML merged along ``include:``, validated, with saved settings and calibration on top.
 
-Every value remembers its file and line; every complaint is one line with file, line, key and what was expected.
+Every value remembers its file and line; every error is one line with file, line, key and expectation.
 YAML is read as version 1.2: ``true`` and ``false`` are the only booleans, ``1e-3`` is a number, ``0o17`` is octal.
 """
 
@@ -70,11 +70,11 @@ class Tree:
     files: list[Path] = field(default_factory=list)
     """The file itself, then every file it depends on by relative names; resolved."""
     maps: list[Path] = field(default_factory=list)
-    """Folders and YAML files of maps among what it depends on by relative names."""
+    """Folders and YAML files of maps that it refers to by relative names."""
     calibration: Path | None = None
-    """Calibration file whose values replace those of the configuration, if there is one."""
+    """Calibration file whose values replace the configuration's, if any."""
     unused: list[str] = field(default_factory=list)
-    """Keys of values in it for which the configuration has no place."""
+    """Keys in it without a place in the configuration."""
 
     def origin(self, key: Key) -> Origin | None:
         """Origin of ``key``, or of its nearest parent that has one."""
@@ -115,10 +115,10 @@ def resolved(config: Schema) -> dict[str, Any]:
 
 
 def calibrated(config: T, tree: Tree, without: Collection[Path] = ()) -> tuple[T, Tree]:
-    """The configuration with the settings that were saved while the robot ran and the newest calibration, and the tree.
+    """The configuration with saved live settings and the latest calibration, and the tree.
 
-    The tree has each value's origin. Both are validated together, as they were when they were saved: what bounds a
-    setting may be a calibrated value.
+    The tree has each value's origin. Both are validated together, as when they were saved: a calibrated value may bound
+    a setting.
 
     Args:
         config: without either.
@@ -182,7 +182,7 @@ def _calibrated_origins(results: Mapping[WizardName, Result], lines: Mapping[Key
 class SavedSettings:
     """The file of live settings that outlast the run; its methods may block for a file system's time.
 
-    Keys of any version are read under their present names, which the file has once something is saved in it.
+    Keys of any version are read under their current names; the next save writes these.
 
     Args:
         folder: the robot's ``state_directory``; the file in it is made when the first setting is saved.
@@ -204,7 +204,7 @@ class SavedSettings:
         except FileNotFoundError:
             return {}
         except OSError:
-            pass  # ``YamlText`` says why
+            pass  # ``YamlText`` explains why
         try:
             root = self._text().root
             content = {} if root is None else _build(root, _Builder(self.path, origins), ())
@@ -216,7 +216,7 @@ class SavedSettings:
         """Merge saved values into a configuration's data before validation.
 
         Raises:
-            UnusableFileError: one is no live setting of the configuration; names the line.
+            UnusableFileError: one is not a live setting of the configuration; names the line.
         """
         known = {setting.key for setting in live_settings(config)}
         for key, (_, line) in values.items():
@@ -286,8 +286,8 @@ def load_tree(path: Path) -> Tree:
     """Read ``path`` and everything it includes; later values win over included ones, mappings merge.
 
     ``include`` is a file name or a list of them, relative to the including file. Keys of older versions are read under
-    their present names; the files stay as they are. In texts ``{robot}`` stands for the robot's name, so that robots
-    that share a file have ports and folders of their own.
+    their current names; the files stay as they are. In texts ``{robot}`` stands for the robot's name, so that robots
+    that share a file have separate ports and folders.
 
     Raises:
         ConfigError: a file is missing, is not YAML, repeats a key or includes itself.
@@ -390,7 +390,7 @@ class _Builder:
     scalar: Callable[[Node], Any] = field(default_factory=lambda: reader().constructor.construct_object)
     """Constructs the value of a scalar node."""
     around: list[Node] = field(default_factory=list)
-    """Nodes that contain the present one."""
+    """Nodes that contain the current one."""
     count: int = 0
     """Values built."""
 
@@ -437,7 +437,7 @@ def _build_mapping(node: Node, builder: _Builder, key: Key) -> dict[str, Any]:
 
 
 def reader() -> YAML:
-    """Reads one document of plain data; ``_build`` bounds what is behind aliases, and names it."""
+    """Reads one document of plain data; ``_build`` bounds the expansion of aliases, and names them."""
     # 5_000: keys and values in the text of one file, at most: read in a quarter of a second; a full configuration has
     # some hundreds
     return bounded_yaml(5_000, expand=False)
@@ -541,7 +541,7 @@ class YamlText:
         return True
 
     def rename(self, key: tuple[str, ...], name: str) -> bool:
-        """Rename the last part of ``key``, in which ``*`` is any one name; False if it is not there."""
+        """Rename the last part of ``key`` (``*`` matches any name); False if it is missing."""
         text = self.text
         places = {(node.start_mark.index, node.end_mark.index) for node, _ in self._pairs(key)}
         for start, end in sorted(places, reverse=True):
@@ -604,7 +604,7 @@ def run_steps(text: YamlText, version: int, steps: Mapping[int, Step], target: i
 
 
 def bring_up_to_date(text: YamlText, inherited: int | None) -> int | None:
-    """Rename the keys of a file of an older version to the present ones, in memory only.
+    """Rename the keys of an older version's file to the current ones, in memory only.
 
     Args:
         text: content of the file.
@@ -625,7 +625,7 @@ def bring_up_to_date(text: YamlText, inherited: int | None) -> int | None:
 
 
 def validated(tree: Tree, path: Path, model: type[S]) -> tuple[S, Tree]:
-    """Validate what was read and merged from ``path``; see ``load_config``."""
+    """Validate the data read and merged from ``path``; see ``load_config``."""
     version = tree.data.get("version")
     if version != FILE_VERSION:
         if version is None:
@@ -661,7 +661,7 @@ def _require_kind(data: dict[str, Any], path: Path, model: type[Schema]) -> None
     """Report a mission file in one line, instead of an error for each of its keys."""
     found = [str(key) for key in data if key != "version"]
     strange = set(found) - set(model.model_fields)
-    # 0.75: share of unknown sections from which on the file is taken to be no configuration
+    # 0.75: minimum fraction of unknown sections to reject the file as another kind of file
     if len(strange) > 1 and len(strange) >= 0.75 * len(found):
         expected = [name for name, field in model.model_fields.items() if field.is_required() and name != "version"]
         raise ConfigError(f"{path}:1: another kind of file: expected {', '.join(expected)}, found {', '.join(found)}")
@@ -721,7 +721,7 @@ def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError
     for detail in details:
         # entries that are wrong are not counted, so a list of them is "too short"
         if detail["type"] != "too_short" or detail["loc"] not in wrong:
-            mistakes.setdefault(_data_key(tree.data, detail["loc"]), detail)  # of a union the first member's
+            mistakes.setdefault(_data_key(tree.data, detail["loc"]), detail)  # for a union, the first member
     most_mistakes = 50  # named at once
     for key, detail in list(mistakes.items())[:most_mistakes]:
         origin = tree.origin(key) or f"{path}:1"
@@ -756,7 +756,7 @@ def _sentence(detail: ErrorDetails, model: type[Schema], key: Key) -> str:
 
 
 def _data_key(data: Any, loc: tuple[int | str, ...]) -> Key:
-    """Pydantic's location without the names of union members, which are no keys of the data."""
+    """Pydantic's location without the names of union members, which are not keys of the data."""
     key: list[str | int] = []
     for index, part in enumerate(loc):
         last = index == len(loc) - 1
@@ -789,7 +789,7 @@ def _field_names(model: type[BaseModel], key: Key, detail: ErrorDetails) -> list
 
 
 def _tags(model: type[BaseModel]) -> set[str]:
-    """Values of its keys that have one only: the kind, or what a step of a mission does."""
+    """Values of its keys with a single choice: the kind, or the action of a mission step."""
     fields = model.model_fields.values()
     choices = [get_args(field.annotation) for field in fields if get_origin(field.annotation) is Literal]
     return {some[0] for some in choices if len(some) == 1}

@@ -1,6 +1,6 @@
-"""Brings configuration files of older versions up to the present one, step by step, keeping their comments.
+"""Upgrades configuration files of older versions step by step, keeping their comments.
 
-A file without a ``version`` of its own has that of the file that includes it. The previous file is kept next to the new
+A file without ``version`` has the version of the including file. The previous file is kept next to the new
 one as ``NAME.vN``. A file that includes others is written last: an upgrade that is interrupted can simply be repeated,
 because a step does nothing to a key that is already as it should be.
 """
@@ -18,7 +18,7 @@ from monstertruckd.config.load import FILE_VERSION, STEPS, Step, YamlText, inclu
 
 @dataclass(frozen=True, slots=True)
 class Upgrade:
-    """What is to be done to one file."""
+    """Upgrade of one file."""
 
     path: Path
     version: int
@@ -28,12 +28,12 @@ class Upgrade:
 
     @property
     def kept(self) -> Path:
-        """Where the previous file goes."""
+        """Path of the previous file's copy."""
         return self.path.with_name(f"{self.path.name}.v{self.version}")
 
 
 def plan(path: Path, steps: Mapping[int, Step] = STEPS, target: int = FILE_VERSION) -> list[Upgrade]:
-    """Upgrades of ``path`` and of all it includes, in the order in which they are to be written.
+    """Upgrades of ``path`` and of all included files, in the order of writing.
 
     Args:
         path: configuration file.
@@ -41,7 +41,7 @@ def plan(path: Path, steps: Mapping[int, Step] = STEPS, target: int = FILE_VERSI
         target: version to reach.
 
     Raises:
-        ConfigError: a file is missing, is no YAML mapping, has no version or one this program does not know.
+        ConfigError: a file is missing, is not a YAML mapping, or has no known version.
     """
     upgrades: dict[Path, Upgrade] = {}
     _visit(path, None, steps, target, upgrades, ())

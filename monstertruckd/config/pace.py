@@ -1,7 +1,7 @@
-"""Settings outside of the gate that keep up with its speed, or else are refused by name.
+"""Settings outside of the gate that must match its speed; others are refused by name.
 
-A robot that is faster than these allow would not be wrong at once: its pose would stand still while it drives, or its
-route would end in what it should have seen. Speeds m/s, distances m.
+A faster robot would fail later: its pose would stand still while it drives, or its route would end in an unseen
+obstacle. Speeds m/s, distances m.
 """
 
 from collections.abc import Iterator
@@ -27,14 +27,14 @@ def too_slow(
     *,
     consistent: bool,
 ) -> Iterator[str]:
-    """Every setting that does not keep up with ``gate.speed``, with what it must be.
+    """Every setting too low for ``gate.speed``, with its required value.
 
     Args:
         speed: ``gate.speed``, m/s.
-        odometry: the robot's own, as all others.
-        tracker: None = there is none.
-        planner: likewise.
-        slam: likewise.
+        odometry: of the robot, as all others.
+        tracker: None if there is none.
+        planner: None if there is none.
+        slam: None if there is none.
         consistent: the sensors are compared.
     """
     believed = getattr(odometry, "max_speed", None)

@@ -1,8 +1,8 @@
 """Calibration that the trackers propose: learnt while driving, kept over restarts, used once an operator accepts it.
 
-A tracker learns gain and trim of an axle with their covariance. Where they certainly differ from the calibration, the
-pulse map is proposed at which the axle would steer as requested. Until it is accepted (``calibrate accept``) nothing
-runs on it; a proposal that was learnt on another calibration than the daemon runs on is void.
+A tracker learns gain and trim of an axle with their covariance. Where they differ significantly from the calibration,
+the tracker proposes the pulse map that would steer the axle as requested. Until it is accepted (``calibrate accept``)
+nothing runs on it; a proposal that was learnt on another calibration than the daemon runs on is void.
 """
 
 import math
@@ -31,7 +31,7 @@ HALF: Final = 1.96
 
 
 class _File(Schema):
-    """What is kept."""
+    """Content of the file."""
 
     base: str
     """Calibration file that the daemon ran on; empty: none."""
@@ -40,7 +40,7 @@ class _File(Schema):
 
 @dataclass
 class SteeringProposal:
-    """The newest proposal.
+    """Latest proposal.
 
     Args:
         config: the running one, calibration included.
@@ -54,7 +54,7 @@ class SteeringProposal:
     result: Result | None = None
     _chassis: Chassis = field(init=False)
     _closed: bool = False
-    """The steering was calibrated in this run: what trackers find until the next start is known."""
+    """The steering was calibrated in this run: ignore trackers until the next start."""
 
     def __post_init__(self) -> None:
         self._chassis = self.config.chassis()
@@ -63,7 +63,7 @@ class SteeringProposal:
         """Read it; may block.
 
         Returns:
-            What is wrong with the file; empty for a sound or a missing one.
+            Fault of the file; empty if it is intact or missing.
         """
         if self.file is None:
             return ""
@@ -97,10 +97,10 @@ class SteeringProposal:
         replace_file(self.file, _File(base=self.base, result=self.result).model_dump_json(indent=1) + "\n")
 
     def consider(self, state: TrackerState, date: str) -> bool:
-        """Propose what a tracker has learnt, if it differs from the present proposal; whether it does.
+        """Propose a tracker's estimate if it differs from the current proposal; return whether it does.
 
         Args:
-            state: the tracker's newest.
+            state: latest of the tracker.
             date: now, UTC.
         """
         if self._closed or not WIZARDS[WIZARD].fits(self.config):
@@ -124,7 +124,7 @@ class SteeringProposal:
         self.result, self._closed = None, True
 
     def _news(self, estimates: list[Estimate]) -> bool:
-        """Whether any value is another one, or is proposed for the first time."""
+        """Whether any value differs, or is proposed for the first time."""
         for new in estimates:
             old = None if self.result is None else self.result.estimate(new.name)
             if old is None or old.low is None or old.high is None or not old.low <= new.value <= old.high:
@@ -132,7 +132,7 @@ class SteeringProposal:
         return False
 
     def _estimates(self, row: AxleDeviation, date: str) -> tuple[Estimate, ...]:
-        """Centre and scale of an axle's pulse map at which it steers as requested."""
+        """Centre and scale of the pulse map that steers an axle as requested."""
         data, servo = self.config.model_dump(), f"{STEERING}.{row.axle}"
         centre, scale, direction = (
             value_at(data, f"{servo}.{key}") for key in ("centre_us", "scale_us_per_deg", "direction")
@@ -167,6 +167,6 @@ class SteeringProposal:
         )
 
     def _servo(self, axle: str, angle: float) -> float:
-        """Servo angle for an axle's angle, the other one straight, rad."""
+        """Servo angle for an axle's angle with the other axle straight (rad)."""
         front, rear = self._chassis.servos(*((angle, 0.0) if axle == "front" else (0.0, angle)))
         return math.remainder(front if axle == "front" else rear, math.tau)

@@ -14,7 +14,7 @@ from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruckd.config.truck import TruckConfig
 
 PSEUDO: Final = (Path("/dev/pts"), Path("/dev/shm"))  # noqa: S108 - nothing is put there
-"""Folders below /dev whose entries are no devices: pseudo terminals, which emulators serve, and memory."""
+"""Folders below /dev whose entries are not devices: pseudo terminals, which emulators serve, and memory."""
 
 
 def real_ports(config: TruckConfig) -> tuple[str, ...]:

@@ -20,14 +20,14 @@ RENAMED: Final[dict[int, dict[str, str]]] = {
         "usb.patience": "empty_timeout",
     },
 }
-"""By version of the configuration (release 0.1.0 has 1): dotted keys, ``*`` for any one name, and what the next version
-calls their last part. A key stays in its section.
+"""Renamed keys by version of the configuration (release 0.1.0 has 1): dotted keys (``*`` matches any name), and the
+next version's name of their last part. A key stays in its section.
 
-Saved settings and calibrations do not say the version of their keys, so no other key ever gets a name of this table."""
+Saved settings and calibrations do not record the version of their keys, so names in this table are never reused."""
 
 
 def present_key(key: str) -> str:
-    """The present name of a dotted key of any version."""
+    """Current name of a dotted key of any version."""
     names = key.split(".")
     for renamed in RENAMED.values():
         for old, name in renamed.items():
@@ -38,6 +38,6 @@ def present_key(key: str) -> str:
 
 
 def fits(names: Sequence[str], pattern: str) -> bool:
-    """Whether the parts of a key are those of a dotted pattern, in which ``*`` is any one name."""
+    """Whether a key matches a dotted pattern (``*`` matches any name)."""
     parts = pattern.split(".")
     return len(parts) == len(names) and all(part in ("*", name) for part, name in zip(parts, names, strict=True))

@@ -28,7 +28,7 @@ class LeftOut(NamedTuple):
 def started(config: T, tree: Tree) -> tuple[T, Tree, tuple[LeftOut, ...]]:
     """Return the configuration as ``calibrated`` does, without saved settings and calibrations that cannot be used.
 
-    Instead of saved settings those of the configuration count, instead of a calibration the one before it. The files
+    The configuration's settings replace saved ones, and the previous calibration replaces a damaged one. The files
     keep their names until ``set_aside``.
 
     Raises:

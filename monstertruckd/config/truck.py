@@ -102,7 +102,7 @@ class PathConfig(Schema):
 
 
 class PlacementConfig(Schema):
-    """Where planners and tracker run: in the daemon's loop, in a worker, or on another machine (`plan-server`)."""
+    """Placement of planners and tracker: in the daemon's loop, in a worker, or on another machine (`plan-server`)."""
 
     planner: Literal["loop", "worker", "remote"] = "worker"
     """`loop` is for studies only: planning blocks the control tick"""
@@ -137,12 +137,12 @@ class TruckConfig(Schema):
     monitors: Monitors = Monitors()
     usb: UsbConfig = UsbConfig()
     machine: Path = Path("/")
-    """Folder that holds proc, sys and dev of the computer; another one of a simulated computer"""
+    """Folder that holds proc, sys and dev of the computer, or of a simulated computer"""
     levelling: AnyLevelling = StabiliserConfig()
     """How the stabiliser follows the compass, where there are both"""
     gate: GateConfig = GateConfig()
     hand: HandConfig = HandConfig()
-    """What the radio control of the operator beside the robot does (`devices.hand`)"""
+    """Use of the operator's radio control (`devices.hand`)"""
     checks: dict[Name, AnyCheck] = Field(default_factory=dict)
     """Checks by name that make the safety gate stricter"""
     odometry: AnyOdometry = OdometryConfig()
@@ -155,7 +155,7 @@ class TruckConfig(Schema):
     behaviours: dict[Name, AnyBehaviour] = Field(default_factory=dict, validate_default=True)
     """Reactive behaviours (without a path) by name; started by `behave start`. `move` is always there"""
     lidar_sonars: LidarSonarsConfig | None = None
-    """Sonars computed from the lidar, for behaviours of a robot that has none; null = none"""
+    """Sonars computed from the lidar, for behaviours of a robot without sonars; null for none"""
     peers: dict[Name, PeerConfig] = Field(default_factory=dict)
     """Other robots whose poses are received, by name, for behaviours such as `follow`"""
     placement: PlacementConfig = PlacementConfig()
@@ -164,22 +164,22 @@ class TruckConfig(Schema):
     slam: SlamConfig | None = None
     """Mapping, or localisation in a saved map, by the lidar; null = the pose in map is odometry"""
     consistency: ConsistencyConfig | None = ConsistencyConfig()
-    """Comparison of the sensors' measures of motion, by which sensors that lie are found; null = none"""
+    """Comparison of the sensors' measures of motion, which reveals false sensors; null for none"""
     ground: GroundConfig | None = GroundConfig()
-    """Tilt and roughness of the ground, for the routes of a robot with a compass; null = not estimated"""
+    """Tilt and roughness of the ground, for the routes of a robot with a compass; null for none"""
     points: PointsConfig | None = None
-    """Points of interest in the map: tags that the camera sees (extra vision), and marked places; null = none"""
+    """Points of interest in the map: tags that the camera sees (extra vision), and marked places; null for none"""
     zones: ZonesConfig | None = None
-    """Keepout and speed zones of the map; null = none, and operators cannot add any"""
+    """Keepout and speed zones of the map; null for none, and operators cannot add any"""
     recorder: RecorderConfig | None = None
     blackbox: BlackBoxConfig | None = BlackBoxConfig()
     """Saves the minute before every stop by the gate; null = off"""
     zenoh: ZenohConfig = ZenohConfig()
     state_directory: Path = Path("runs/state")
-    """Where the e-stop latch is kept"""
+    """Folder of the e-stop latch and other state"""
     runtime_directory: Path | None = None
-    """Folder on a tmpfs for the mark of an emergency stop that is not yet on the disk; null = that of the service, of
-    the user, or /run"""
+    """Folder on a tmpfs for the mark of an emergency stop that is not yet on the disk; null for the service's, the
+    user's, or /run"""
     calibration: Path | None = None
     """Folder of the calibration files; null = `calibration` in the state directory"""
     stand: Literal["none", "simulator", "overhead"] = "none"
@@ -223,12 +223,12 @@ class TruckConfig(Schema):
 
     @property
     def calibration_folder(self) -> Path:
-        """Where calibration files are kept."""
+        """Folder of calibration files."""
         return self.calibration or self.state_directory / "calibration"
 
     @property
     def black_box_folder(self) -> Path | None:
-        """Where black boxes go; None = nowhere."""
+        """Folder of black boxes, or None."""
         if self.blackbox is not None and self.blackbox.directory is not None:
             return Path(self.blackbox.directory)
         return None if self.blackbox is None or self.recorder is None else Path(self.recorder.directory) / "blackbox"
@@ -249,7 +249,7 @@ class TruckConfig(Schema):
         )
 
     def weakened(self) -> tuple[str, ...]:
-        """Settings by which the robot is less safe than by the defaults, each with its value and the default."""
+        """Settings less safe than their defaults, each with its value and the default."""
         opened = (f"zenoh.insecure: anybody who reaches {end} may drive" for end in self.zenoh.open_endpoints)
         sees = self.devices.lidar is not None or self.devices.sonar is not None
         blind = () if sees or self.gate.scan.critical else (BLIND,)
@@ -264,7 +264,7 @@ class TruckConfig(Schema):
             yield from weaker("consistency", self.consistency, usual, above, ())
 
     def missing_actuators(self) -> str | None:
-        """What the body needs to drive and steer, if some of it is not there."""
+        """Devices missing for the body to drive and steer."""
         chassis = self.chassis()
         needed = (*SHAFTS[: len(chassis.shafts)], *((DeviceRole.STEERING,) if chassis.steered else ()))
         steering = self.devices.steers()

@@ -1,6 +1,6 @@
-"""The calibration wizards, each declared once: keys, lifetime, what it needs, its options and its place in the order.
+"""The calibration wizards, each declared once: keys, lifetime, prerequisites, options and place in the order.
 
-Everything else follows from these rows: what a calibration may change (`calibration.py`), grades and expiry
+Everything else follows from these rows: permitted changes (`calibration.py`), grades and expiry
 (`expiry.py`), the commands `calibrate NAME` and `calibrate all`. The procedure itself is a class in
 `monstertruckd/tools/calibrate/`, which is loaded when the wizard runs. Nothing is imported here, for every command line
 loads this table.
@@ -56,12 +56,12 @@ class WizardOption(NamedTuple):
 
     name: str
     default: float | bool | str
-    """Its type is the option's: int, float, bool (a flag) or str (one of ``choices``)."""
+    """Type of the option: int, float, bool (a flag) or str (one of ``choices``)."""
     help: str
     low: float | None = None
     high: float | None = None
     scale: float = 1.0
-    """Factor from the option's unit to that of the field."""
+    """Factor from the option's unit to the field's."""
     choices: tuple[str, ...] = ()
 
 
@@ -74,7 +74,7 @@ class SequenceStep:
     needs: tuple[str, ...] = ()
     """Steps that come before it where the robot has them, ``wizard.complete``."""
     rough: bool = False
-    """A first measurement, on which the others rest: skipped once there is any result of this wizard."""
+    """A first measurement as the base of the others: skipped once this wizard has a result."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Other than the defaults."""
     fits: Callable[["TruckConfig"], bool] = lambda _: True
@@ -87,16 +87,16 @@ class WizardKind:
 
     name: str
     doc: str
-    """Help of its command: what it finds and does, and the names of its questions."""
+    """Help of its command: result, procedure, and names of its questions."""
     procedure: str
-    """Place ``module:Class`` of what measures; built from the options by its ``of``, if it has one."""
+    """Place ``module:Class`` of the procedure; built from the options by its ``of``, if any."""
     keys: tuple[str, ...]
     """Values of the configuration that it may set, ``*`` for any one name; a calibration never touches any other. Where
     two wizards measure the same value, the newer measurement counts."""
     lifetime: Lifetime
-    """By experience of such parts, none of it measured: tyres wear, linkages and mounts are knocked, iron changes."""
+    """Experience with such parts, not measured: tyres wear, linkages and mounts are knocked, iron changes."""
     goals: Mapping[str, Goal]
-    """By the estimate's name, ``*_x`` for each that ends so."""
+    """Goals by the estimate's name; ``*_x`` matches every name with that ending."""
     steps: tuple[SequenceStep, ...]
     fits: Callable[["TruckConfig"], bool]
     """Whether the wizard applies to the robot."""
@@ -408,7 +408,7 @@ _ROWS: Final = (
 )
 
 WIZARDS: Final[Mapping[str, WizardKind]] = {row.name: row for row in _ROWS}
-"""By name, in the order of the commands."""
+"""Wizards by name, in the order of the commands."""
 
 
 class WizardRun(NamedTuple):

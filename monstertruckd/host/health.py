@@ -278,5 +278,5 @@ class MeterService:
 
 
 def _again(said: int | None, now: int) -> bool:
-    """Whether a message logged at ``said`` (ns) is due again."""
+    """Whether a message last logged at ``said`` (ns) is due again."""
     return said is None or now - said > 60.0 * SECOND  # seconds until it is repeated

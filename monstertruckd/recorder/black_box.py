@@ -31,9 +31,9 @@ from monstertruckd.recorder.repair import in_use
 from monstertruckd.recorder.ring import Retention, Ring, RingSnapshot
 
 BATCH: Final = 8
-"""Messages written without a pause: a fraction of a millisecond in which the control loop would have to wait."""
+"""Messages written without a pause: they delay the control loop by a fraction of a millisecond."""
 LAST_SECONDS: Final = 5.0
-"""Longest time after the end for which writing goes on (s)."""
+"""Maximum time for writing after the end (s)."""
 log = logging.getLogger(__name__)
 
 PART: Final = ".part"
@@ -50,7 +50,7 @@ class BlackBoxFile:
     number: int
     """Counts the folder's boxes over all runs."""
     reason: str
-    """What tripped the gate."""
+    """Reason of the trip."""
     size: int
     """Bytes."""
 
@@ -80,7 +80,7 @@ class BlackBoxFolder:
 
     Args:
         directory: made when missing.
-        quota: bytes; the newest box of each reason stays even beyond them.
+        quota: bytes; the latest box of each reason stays even beyond them.
     """
 
     def __init__(self, directory: Path, quota: int) -> None:
@@ -89,7 +89,7 @@ class BlackBoxFolder:
         self._number = 0
 
     def scan(self) -> None:
-        """Go on with the numbers of earlier runs, and remove what they left unfinished."""
+        """Continue the numbering of earlier runs, and remove their unfinished boxes."""
         make_folder(self.directory)
         self._number = max(self._number, *(box.number for box in black_boxes(self.directory)), 0)
         for path in self.directory.glob(f"*{PART}"):
@@ -117,7 +117,7 @@ class BlackBoxFolder:
         return name
 
     def part(self, name: str) -> Path:
-        """Where the box ``name`` is written until it is complete."""
+        """Path of the box ``name`` until it is complete."""
         return self.directory / (name + PART)
 
     def finish(self, name: str) -> None:
@@ -157,19 +157,19 @@ class _Pending:
 
     @property
     def what(self) -> str:
-        """What it holds."""
+        """Content."""
         if len(self.trips) == 1:
             return f"the minute before stop {self.trips[0].number} is"
         return f"stops {', '.join(str(trip.number) for trip in self.trips)} are"
 
 
 class BlackBox:
-    """Keeps the newest messages in memory and writes them when the gate trips; runs while its ``async with`` body does.
+    """Keeps the latest messages in memory and writes them when the gate trips; runs while its ``async with`` body does.
 
-    Every trip is in some box: in one of its own, in that of a trip shortly before, or, if there was one of its reason
-    less than ``interval`` ago, in one that is written later. A box that waits when the body ends is written before the
-    context is left, unless that takes longer than ``LAST_SECONDS``. A disk that is full, refuses or is too slow loses
-    the box, which is reported, and has no other effect.
+    Every trip is in a box: a new one, the box of a trip shortly before, or, within ``interval`` of a box for the same
+    reason, a later one. A box that waits when the body ends is written before the context is left, unless that takes
+    longer than ``LAST_SECONDS``. A disk that is full, refuses or is too slow loses the box, which is reported, and has
+    no other effect.
 
     Args:
         config: spans and limits.
@@ -211,7 +211,7 @@ class BlackBox:
         )
         self._sequences = {topic.name: 0 for topic in TOPICS}
         self._last: dict[Reason, int] = {}
-        """When the newest box with a trip of this reason is due."""
+        """Time when the latest box with a trip of this reason is due."""
         self._pending: list[_Pending] = []
         self._frozen: list[tuple[_Pending, RingSnapshot]] = []
         self._taken: asyncio.Queue[tuple[_Pending, RingSnapshot] | None] = asyncio.Queue()
@@ -250,7 +250,7 @@ class BlackBox:
             await asyncio.wait((self._taking, self._saving))
 
     def freeze(self) -> None:
-        """Take what the waiting boxes will hold now, before the end; they are written when the context is left."""
+        """Take the content of the waiting boxes now, before the end; they are written when the context is left."""
         self._frozen += [(pending, self.ring.snapshot()) for pending in self._pending]
         self._pending.clear()
         self._wake.set()
@@ -288,7 +288,7 @@ class BlackBox:
         return pending.name
 
     def _allowed(self, trip: Stop) -> int:
-        """From when on there may be another box of this trip's reason; never so late that it would miss the trip."""
+        """Earliest time of another box of this trip's reason; never so late that it would miss the trip."""
         last = self._last.get(trip.reason)
         if last is None:
             return trip.stamp
@@ -362,7 +362,7 @@ class BlackBox:
         self._events(disk_reason(error), Severity.WARNING, self.name, f"{what}: {error.strerror or error}")
 
     def _write(self, name: str, entries: RingSnapshot, metadata: Mapping[str, str], offset: int) -> str:
-        """In a thread with pauses for the control loop, unless the daemon waits for it to end; the box's name."""
+        """Write a box in a thread, pausing for the control loop unless the daemon ends; return the box's name."""
         offloaded = threading.get_ident() != self._loop_thread
         name = self._folder.begin(name)
         part = self._folder.part(name)

@@ -1,4 +1,4 @@
-"""The body's tilt by its compass, without what the body's own acceleration adds to it.
+"""The body's tilt by its compass, corrected for the body's acceleration.
 
 A compass finds the vertical by an accelerometer, which feels the reaction to gravity and to the body's acceleration:
 0.9 m/s^2 look like 5 degrees, and a truck that slows down on seeing a slope would see one because it slows down. The
@@ -19,7 +19,7 @@ KEPT_ODOMETRY: Final = 64
 
 
 class Tilt(NamedTuple):
-    """Of the body, rad, REP 103."""
+    """Roll and pitch of the body, rad, REP 103."""
 
     roll: float
     pitch: float
@@ -38,7 +38,7 @@ class BodyAcceleration:
         self._speeds: deque[tuple[int, float, float]] = deque(maxlen=KEPT_ODOMETRY)
 
     def observe(self, odometry: Odometry) -> None:
-        """Take a reading; older ones than the newest are passed over."""
+        """Take a reading; readings older than the latest are ignored."""
         if not self._speeds or odometry.stamp > self._speeds[-1][0]:
             self._speeds.append((odometry.stamp, odometry.twist.vx, odometry.twist.wz))
 
@@ -54,7 +54,7 @@ class BodyAcceleration:
         return _believed(forward), _believed(left)
 
     def tilt(self, attitude: Attitude) -> Tilt:
-        """Of the body by a valid reading of its compass."""
+        """Tilt of the body by a valid reading of its compass."""
         return without(self.at(attitude.stamp), Tilt(attitude.roll, attitude.pitch))
 
 

@@ -12,9 +12,9 @@ class SmoothedCorrection:
 
     Args:
         slew: greatest speed of the change, m/s and rad/s.
-        jump: corrections of the robot's place beyond this, m, count at once.
-        settle: time constant of the approach within that, s; 0 = none. Scans are deskewed by these poses: a correction
-            must not look like motion.
+        jump: corrections of the robot's place beyond this, m, apply at once.
+        settle: time constant of the approach within that, s; 0 for none. Scans are deskewed by these poses: a
+            correction must not look like motion.
     """
 
     def __init__(self, slew: tuple[float, float], jump: float, settle: float = 0.0) -> None:

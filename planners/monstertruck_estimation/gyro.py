@@ -10,16 +10,16 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Positive, Schema
 
 RESTING_DISTANCE: Final = 1e-4
-"""Distance of the fastest shaft between two readings, m, up to which the robot stands."""
+"""Maximum distance of the fastest shaft between two readings of a standing robot, m."""
 
 
 class GyroConfig(Schema):
-    """What the yaw rate of an IMU is worth."""
+    """Trust in the yaw rate of an IMU."""
 
     rest: Positive = 0.5
-    """Seconds at rest after which the bias is known"""
+    """Minimum time at rest to measure the bias (s)"""
     max_bias: Positive = 0.1
-    """A mean rate at rest above this is no bias, rad/s: the robot is turned by hand"""
+    """Maximum bias (rad/s): at a higher mean rate the robot is turned by hand"""
     window: Positive = 1.5
     """Seconds over which turns by the gyroscope and by the wheels are compared"""
     tolerance: Positive = 0.12
@@ -27,7 +27,7 @@ class GyroConfig(Schema):
     share: Annotated[float, Field(ge=0, lt=1)] = 0.35
     """Tolerated difference as a share of the greater turn: wheels slip"""
     proof: Positive = 0.3
-    """Turn of the wheels in the window with which an IMU that was left out has to agree to count again, rad"""
+    """Minimum turn of the wheels in the window before an excluded IMU that agrees returns, rad"""
     drift: Annotated[float, Field(ge=0)] = 5e-5
     """How fast the bias may change after a rest, rad/s^2: as it warms up by two degrees a minute"""
 
@@ -66,12 +66,12 @@ class Gyro:
         self._rates.append((stamp, rate))
 
     def turned(self, since: int, stamp: int, wheels: float | None, distance: float) -> float | None:
-        """Mean yaw rate between two readings of the wheels, rad/s; None = leave it to the wheels.
+        """Mean yaw rate between two readings of the wheels, rad/s; None to use the wheels.
 
         Args:
             since: ns.
             stamp: ns.
-            wheels: mean yaw rate by the wheels, rad/s; None = they slip, and are not compared.
+            wheels: mean yaw rate by the wheels, rad/s; None if they slip, and are not compared.
             distance: of the fastest shaft, m.
         """
         found = [rate for at, rate in self._rates if since < at <= stamp]
@@ -97,7 +97,7 @@ class Gyro:
         return rate if self.trusted else None
 
     def variance(self, stamp: int, dt: float, distance: float) -> float:
-        """What the drift of the bias adds in ``dt`` seconds to the variance of the turn since the last rest, rad^2.
+        """Growth of the variance of the turn since the last rest by the drift of the bias in ``dt`` seconds, rad^2.
 
         A bias that has changed at a rate d for the time T has turned the heading by d T^2 / 2.
         """
@@ -107,7 +107,7 @@ class Gyro:
         return self._config.drift**2 * rested**3 * dt
 
     def _forget(self) -> None:
-        """What comes next is not to be compared with what was."""
+        """Start a new comparison."""
         self._turns.clear()
         self._long.clear()
         self._sums = (0.0, 0.0)
@@ -148,10 +148,10 @@ class Gyro:
             rows.clear()
             self._sums = (0.0, 0.0)
             return
-        # 0.05: curvature by which the wheels may be off all the time, rad/m
+        # 0.05: permanent curvature error of the wheels, rad/m
         rows.append((stamp, wheels, gyro, config.share * abs(wheels) + 0.05 * distance))
         off, allowed = self._sums[0] + gyro - wheels, self._sums[1] + rows[-1][3]
-        long = 20 * SECOND  # turns are compared over so long as well, ns: what a bias that has crept away adds up to
+        long = 20 * SECOND  # second, longer window of the comparison, ns: it reveals a drifting bias
         while stamp - rows[0][0] > long:
             _, by_wheels, by_gyro, may = rows.popleft()
             off, allowed = off - (by_gyro - by_wheels), allowed - may

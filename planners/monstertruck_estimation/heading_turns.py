@@ -1,8 +1,8 @@
 """Whether the headings of a compass turn with the robot or against it.
 
-A heading of the wrong sign is no outlier: it is right near the heading at which north was found, and while the robot
-turns slowly it pulls the yaw with it, within any outlier gate. Only its turns show the fault: they are opposite to
-those of the wheels or of an inertial measurement unit.
+A heading of the wrong sign is not an outlier: it is right near the heading where north was found, and while the robot
+turns slowly it pulls the yaw with it, within any outlier gate. Only its turns show the fault: they oppose the turns of
+the wheels or of an inertial measurement unit.
 """
 
 from collections import deque
@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 from monstertruck_estimation.transforms import wrap_angle
 
 LONGEST_TURN: Final = 3.0
-"""Distance within which it has to turn that much, m: a drift of the wheels over a long distance is no turn."""
+"""Distance within which it has to turn that much, m: a drift of the wheels over a long distance does not count."""
 
 
 class _Row(NamedTuple):
@@ -42,7 +42,7 @@ class ContraryTurn:
 
 
 class HeadingTurns:
-    """Compares the turns of headings with those of the robot."""
+    """Compares the turns of headings with the robot's turns."""
 
     def __init__(self) -> None:
         self._rows: deque[_Row] = deque()

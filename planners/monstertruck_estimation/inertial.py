@@ -1,4 +1,4 @@
-"""What an inertial measurement unit gives the odometry: its yaw rate over level ground, and the body's tilt.
+"""Inertial measurement unit for the odometry: its yaw rate over level ground, and the body's tilt.
 
 The tilt is a complementary filter: the gyroscopes turn the vertical, the specific force draws it back (Mahony et al.
 2008, the direct form with one vector). The body's own acceleration averages out over 2 s.
@@ -18,9 +18,9 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Imu, Vector3
 
 LONGEST_SILENCE: Final = 0.5
-"""Seconds without a measurement after which it starts again."""
+"""Maximum gap between measurements before it restarts, s."""
 STEEPEST: Final = 0.7
-"""Share of the vertical along the body's z axis below which it is no tilt of a robot that drives."""
+"""Minimum vertical component of the body's z axis for a driving robot."""
 
 
 class InertialTilt:
@@ -37,22 +37,22 @@ class InertialTilt:
         if self._up is not None and dt <= 0.0:
             return
         strength = math.hypot(*force)
-        # 1.0: a force that differs more from gravity, m/s^2, says nothing of the vertical
+        # 1.0: maximum difference between force and gravity for an update of the vertical, m/s^2
         felt = _scaled(force, 1.0 / strength) if abs(strength - GRAVITY) < 1.0 else None
         self._felt = self._felt if felt is None else stamp
-        # 5.0: seconds without a plausible force after which the tilt is not known
+        # 5.0: maximum time without a plausible force before the tilt is unknown, s
         if self._up is None or dt > LONGEST_SILENCE or stamp - self._felt > 5.0 * SECOND:
             up = felt
         else:
             up = added(self._up, _scaled(_cross(self._up, rate), dt))
             if felt is not None:
-                vertical_time = 2.0  # time constant with which the vertical follows the specific force, s
+                vertical_time = 2.0  # time constant of the vertical towards the specific force, s
                 up = added(_scaled(up, 1.0 - dt / vertical_time), _scaled(felt, dt / vertical_time))
         self._up = None if up is None else _scaled(up, 1.0 / math.hypot(*up))
         self._stamp = stamp
 
     def tilt(self, now: int) -> Tilt | None:
-        """Of the body at ``now``, ns; None where it is not known."""
+        """Tilt of the body at ``now``, ns; None if unknown."""
         if self._up is None or self._up[2] < STEEPEST or now - self._stamp > LONGEST_SILENCE * SECOND:
             return None
         x, y, z = self._up
@@ -70,8 +70,8 @@ class Inertial:
     """An inertial measurement unit in base.
 
     Args:
-        config: what its yaw rate is worth.
-        mount: from its axes to those of base.
+        config: trust in its yaw rate.
+        mount: from its axes to base.
     """
 
     def __init__(self, config: GyroConfig, mount: Quaternion) -> None:
@@ -95,7 +95,7 @@ class Inertial:
 
 
 class InertialInput:
-    """Measurements of the bus for an ``Inertial``; says when its yaw rate and the wheels disagree.
+    """Feeds measurements of the bus to an ``Inertial``; reports when its yaw rate and the wheels disagree.
 
     Args:
         inertial: the unit.
@@ -117,7 +117,7 @@ class InertialInput:
             self.inertial.observe(imu)
 
     def report(self) -> None:
-        """Report a change of what its yaw rate is worth."""
+        """Report a change of trust in its yaw rate."""
         gyro = self.inertial.gyro
         if gyro.trusted is self._trusted:
             return

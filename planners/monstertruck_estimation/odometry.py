@@ -33,7 +33,7 @@ from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedbac
 from monstertruck_schemas.state import Odometry
 
 SOURCE_TIMEOUT: Final = SECOND
-"""Time after a reading for which a sensor is listed as a source, ns."""
+"""Time that a sensor is listed as a source after a reading, ns."""
 
 
 _NINE: Final = Struct("9d")
@@ -110,11 +110,11 @@ class OdometryConfig(OdometrySettings):
     turn_noise: NotNegative = 0.1
     """Standard deviation of the yaw rate while it is predicted, rad/s."""
     max_prediction: Positive = 0.3
-    """Seconds of prediction without a drive reading; then the pose stays, and its covariance goes on growing."""
+    """Time of prediction without a drive reading, s; then the pose stays, and its covariance keeps growing."""
     max_speed: Positive = 0.6
     """A drive position that would need more than this, m/s, is a new origin (the drive restarted), not a motion."""
     compass: CompassConfig | None = CompassConfig()
-    """Null: the heading is that of the wheels."""
+    """Null: heading by the wheels alone."""
     gyro: GyroConfig | None = GyroConfig()
     """Yaw rate of an inertial measurement unit, where there is one; null leaves it out"""
 
@@ -132,7 +132,7 @@ class OdometryEstimate:
     twist_covariance: Array
     """Shape (9,), row-major."""
     age: float
-    """Seconds since the newest drive reading."""
+    """Age of the latest drive reading, s."""
     sources: tuple[str, ...]
 
 
@@ -140,7 +140,7 @@ class SensorInput(Protocol):
     """Messages of an additional sensor, passed to the estimator by its own adapter."""
 
     def take(self) -> None:
-        """Pass new messages to the estimator, before those of the wheels."""
+        """Pass new messages to the estimator, before the wheels' messages."""
 
     def report(self) -> None:
         """Emit events about changes."""
@@ -168,7 +168,7 @@ class DeadReckoning:
     Args:
         config: start and noise.
         chassis: from motors and servos to the body's motion.
-        inertial: an inertial measurement unit whose yaw rate replaces that of the wheels.
+        inertial: an inertial measurement unit whose yaw rate replaces the wheels' rate.
     """
 
     def __init__(self, config: OdometryConfig, chassis: Chassis, inertial: Inertial | None = None) -> None:
@@ -211,7 +211,7 @@ class DeadReckoning:
 
     @property
     def _twist(self) -> Twist2:
-        """With which the pose is predicted."""
+        """Velocity that predicts the pose."""
         return self._wheels.twist
 
     @property
@@ -286,7 +286,7 @@ class DeadReckoning:
         twist = self._twist
         ahead = min(age, self._config.max_prediction)
         x, y, yaw = integrate(self._pose, *twist, ahead)
-        # The predicted motion turns with the uncertain yaw; the uncertain speed, alike in all directions, is added.
+        # The predicted motion turns with the uncertain yaw; the uncertain speed, equal in all directions, is added.
         moved = self._covariance.moved(x - self._pose[0], y - self._pose[1])
         covariance = moved.plus(term * age**2 for term in self._drift)
         twist_covariance = self._twist_covariance
@@ -347,7 +347,7 @@ class DeadReckoning:
 
     def _align(self, off: float, config: CompassConfig) -> None:
         self._aligning.append(off)
-        # 0.02: distance from the start up to which the truck counts as standing there, m
+        # 0.02: maximum distance from the start of a truck that still stands there, m
         if len(self._aligning) >= config.alignment or self._driven > 0.02:
             self._north = math.atan2(
                 sum(math.sin(value) for value in self._aligning), sum(math.cos(value) for value in self._aligning)
@@ -445,7 +445,7 @@ class OdometryService:
             self.report_compass(self._reckoning.doubt)
 
     def report_compass(self, doubt: str | None, returned: str = "") -> None:
-        """Report that the headings are left out, and why, or that they count again."""
+        """Report that the headings are excluded, and why, or used again."""
         if self._doubted is (doubt is not None):
             return
         self._doubted = doubt is not None
@@ -489,7 +489,7 @@ class OdometryContext:
     slam: bool
     """SLAM publishes the pose in map and the motion between scans."""
     imu: Quaternion | None = None
-    """Rotation from the axes of its IMU to those of base; None = it has none."""
+    """Rotation from the axes of its IMU to base; None without an IMU."""
     encoders: bool = False
     """Whether its rear wheels have encoders."""
 

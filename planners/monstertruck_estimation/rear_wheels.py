@@ -35,11 +35,11 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveFeedback, WheelEncoders
 
 Pair = tuple[float, float]
-"""Of the left and of the right wheel."""
+"""Values of the left and of the right wheel."""
 
 SIDES: Final = ("left", "right")
 LATE: Final = SECOND // 5
-"""Interval between two readings from which on one is missing, ns."""
+"""Minimum interval between two readings with one missing, ns."""
 KEPT_READINGS: Final = 256
 """Readings, and poses, that are kept."""
 STANDS: Final = 0.2
@@ -50,7 +50,7 @@ class EncoderConfig(Schema):
     """When encoders are used."""
 
     stretch: Positive = 0.1
-    """Newest distance over which rear wheels and driven wheel are compared, m"""
+    """Latest distance to compare rear wheels and driven wheel over, m"""
     proof: Positive = 0.3
     """Distance over which a difference must last, m; until then the driven wheel moves the pose"""
     tolerance: Positive = 0.02
@@ -68,7 +68,7 @@ class RearWheelConfig(OdometryConfig):
 
 
 class EncoderVerdict(NamedTuple):
-    """What a window says of the encoders."""
+    """Verdict of a window about the encoders."""
 
     trusted: tuple[bool, bool] = (True, True)
     slips: bool = False
@@ -82,10 +82,10 @@ class EncoderVerdict(NamedTuple):
 
 
 def judged(expected: Pair, counted: Pair, turned: float, least: float, config: EncoderConfig) -> EncoderVerdict | None:
-    """Which of two encoders can be right; None = the distance is too short.
+    """Plausible ones of two encoders; None if the distance is too short.
 
     Two that agree with each other and with the steering are right, and the driven wheel slips; two that roll as far as
-    it on average are right too, and the steering is not where it is said to be.
+    it on average are right too, and the steering angle is wrong.
 
     Args:
         expected: distances of the wheels by rate and angle of the front wheel, m.
@@ -147,9 +147,9 @@ class Compared(NamedTuple):
     since: int
     """ns."""
     distance: float
-    """Of the wheel that rolled furthest, m, positive."""
+    """Distance of the wheel that rolled furthest, m, positive."""
     expected: Pair
-    """By the driven wheel, m."""
+    """Distance by the driven wheel, m."""
     counted: Pair
     """m."""
     turned: float
@@ -157,7 +157,7 @@ class Compared(NamedTuple):
 
 
 class Encoders:
-    """Newest readings of both encoders, and what they are worth.
+    """Latest readings of both encoders, and trust in them.
 
     Args:
         config: limits.
@@ -172,7 +172,7 @@ class Encoders:
         """(ns, positions in m)."""
         self._compared: deque[Compared] = deque()
         self._since: int | None = None
-        """When the stretch of the first difference began, ns; None = there is none."""
+        """Start of the stretch with the first difference, ns, or None."""
         self._doubted = False
         """The first difference speaks against an encoder."""
 
@@ -183,11 +183,11 @@ class Encoders:
 
     @property
     def stamp(self) -> int | None:
-        """Of the newest reading, ns."""
+        """Stamp of the latest reading, ns."""
         return self._rolled[-1][0] if self._rolled else None
 
     def observe(self, reading: WheelEncoders, front: float) -> EncoderIncrement | None:
-        """What was rolled since the last reading; None = not known, or the reading is not later."""
+        """Distances since the last reading; None if unknown, or the reading is not later."""
         radius = self._chassis.drivetrain.wheel_radius
         now = (reading.left * radius, reading.right * radius)
         before = self._rolled[-1] if self._rolled else None
@@ -207,7 +207,7 @@ class Encoders:
         """Compare with the driven wheel.
 
         Returns:
-            Since when an encoder is no longer trusted, ns; None = there is none.
+            Start of the distrust of an encoder, ns, or None.
         """
         start, end = self._at(roll.since), self._at(roll.stamp)
         if roll.lost or start is None or end is None:
@@ -224,7 +224,7 @@ class Encoders:
         return self._judge()
 
     def _judge(self) -> int | None:
-        """Of the newest stretch; a verdict that is another one has to be confirmed by a longer one after it."""
+        """Verdict of the latest stretch; a different verdict must be confirmed by a longer stretch after it."""
         compared, doubted, since = self._compared, self._doubted, self._since
         stretch = self.config.stretch if since is None else self.config.proof
         total = math.fsum(one.distance for one in compared)
@@ -285,7 +285,7 @@ class RearWheelReckoning(DeadReckoning):
         self._at: int | None = None
         """Instant of the pose, ns."""
         self._carrying: WheelIncrement | None = None
-        """Newest motion by the encoders, if they carry the pose."""
+        """Latest motion by the encoders, if they carry the pose."""
 
     def observe_encoders(self, reading: WheelEncoders) -> None:
         """Take the angles of both rear wheels and move the pose along the arc they rolled."""
@@ -331,7 +331,7 @@ class RearWheelReckoning(DeadReckoning):
             self._carrying = roll if by_encoders else None
 
     def _next(self, at: int) -> tuple[WheelIncrement, bool] | None:
-        """The next motion from ``at`` on, and whether it is the encoders'; None = nothing more is known."""
+        """Next motion from ``at`` on, and whether it comes from the encoders; None if none is known."""
         until: int | None = None
         if self._heard() and any(self.encoders.believed):
             increment = next((increment for increment in self._increments if increment.stamp > at), None)
@@ -353,7 +353,7 @@ class RearWheelReckoning(DeadReckoning):
         return newest is not None and self._wheels.stamp - newest <= LATE
 
     def _by_encoders(self, increment: EncoderIncrement) -> WheelIncrement | None:
-        """Motion by the wheels that are trusted; None = the one that is says nothing here."""
+        """Motion by the trusted wheels; None if they did not measure it."""
         dt, lean = (increment.stamp - increment.since) / SECOND, self._tricycle.lean(increment.front)
         left, right = increment.distances[0] / dt, increment.distances[1] / dt
         trusted = self.encoders.believed
@@ -387,7 +387,7 @@ def _part(roll: WheelIncrement, since: int, stamp: int) -> WheelIncrement:
 
 
 class EncoderInput:
-    """Readings of the bus for a ``RearWheelReckoning``; says when encoders and driven wheel disagree.
+    """Feeds readings of the bus to a ``RearWheelReckoning``; reports when encoders and driven wheel disagree.
 
     Args:
         reckoning: the estimator.

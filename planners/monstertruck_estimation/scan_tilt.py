@@ -57,8 +57,8 @@ class AngleHistory:
         self._points.extend(points)
 
     def at(self, time_ns: int) -> Angles | None:
-        """On the straight line through the two readings around ``time_ns``, or the newest two; None = unknown."""
-        stale = SECOND // 4  # nanoseconds over which angles are extended beyond the newest reading
+        """Interpolate between the two readings around ``time_ns``, or extrapolate the latest two; None if unknown."""
+        stale = SECOND // 4  # nanoseconds that angles are extended beyond the latest reading
         if not self._points or time_ns - self._points[-1][0] > stale:
             return None
         if len(self._points) == 1:
@@ -76,8 +76,8 @@ class ScanAngles:
 
     Args:
         compass: the body's tilt.
-        joints: of the mount; None = the lidar is fixed to the body.
-        odometry: by which the body's acceleration is taken out of its tilt; None = it is left in.
+        joints: of the mount; None if the lidar is fixed to the body.
+        odometry: gives the body's acceleration to correct its tilt; None for no correction.
     """
 
     def __init__(

@@ -167,7 +167,7 @@ class FrameTree:
         return compose(invert(self._chain(parent, shared)), self._chain(child, shared))
 
     def all(self, now: int) -> tuple[Transform, ...]:
-        """Every transform put in, newest of each frame; fixed ones are true ``now``."""
+        """All transforms, the latest of each frame; fixed ones are valid ``now``."""
         return tuple(
             transform.model_copy(update={"stamp": now}) if transform.stamp == FIXED else transform
             for transform in self._by_child.values()
@@ -198,8 +198,8 @@ class TransformService:
         odometry: pose of base in odom.
         out: where the tree goes.
         rate: messages per second.
-        joints: of a stabiliser: the pose of the point its two joints turn about, and their angles. Whatever it carries
-            has it for parent; until the angles are known it counts as level.
+        joints: of a stabiliser: the pose of the point its two joints turn about, and their angles. Frames that it
+            carries have it as parent; until the angles are known it is assumed level.
         localised: transforms above base by localisation, which replace odometry and the fixed map to odom.
     """
 

@@ -1,7 +1,7 @@
 """Motion of base by the wheels between two readings, of any drive family, with its covariance.
 
 The covariance comes from the family's own kinematics: the noise of every driven shaft and of both axle angles goes
-through the derivatives of the body's twist, and what wheels do not measure (sideways slip, scrubbing) is added to it.
+through the derivatives of the body's twist, and unmeasured motion (sideways slip, scrubbing) is added to it.
 """
 
 import math
@@ -57,9 +57,9 @@ class WheelMotion:
         self._angles_then = chassis.straight
         self._pace: Speeds = (0.0,) * len(chassis.shafts)
         self.stamp = 0
-        """Of the newest reading that was used, ns."""
+        """Stamp of the latest reading used, ns."""
         self.steered: int | None = None
-        """Stamp of the newest servo angles, ns."""
+        """Stamp of the latest servo angles, ns."""
 
     @property
     def known(self) -> bool:
@@ -68,12 +68,12 @@ class WheelMotion:
 
     @property
     def front(self) -> float:
-        """Newest angle of the front axle, rad."""
+        """Latest angle of the front axle, rad."""
         return self._angles[0]
 
     @property
     def twist(self) -> Twist2:
-        """Velocity (vx, vy, wz) at the newest pace and the newest steering angles; m/s, rad/s."""
+        """Velocity (vx, vy, wz) at the latest speed and steering angles; m/s, rad/s."""
         return self._chassis.twist(self._pace, *self._angles)
 
     def observe_steering(self, feedback: SteeringFeedback) -> None:
@@ -86,8 +86,8 @@ class WheelMotion:
     def observe_drive(self, *shafts: DriveFeedback) -> WheelIncrement | None:
         """Motion since the last reading; None for the first, one that is not later, or one that is not a number.
 
-        Positions that were not read at one instant are brought to the newest by their own speeds; what that misses is
-        made up by the next ones.
+        Positions that were not read simultaneously are extrapolated to the latest by their speeds; the next readings
+        correct the error.
         """
         stamp = max(shaft.stamp for shaft in shafts)
         turns = tuple(shaft.position + shaft.velocity * ((stamp - shaft.stamp) / SECOND) for shaft in shafts)

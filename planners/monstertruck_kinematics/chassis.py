@@ -1,6 +1,6 @@
-"""A robot body with its actuators: what gate, odometry and simulation need of any drive family.
+"""A robot body with its actuators, for gate, odometry and simulation of any drive family.
 
-A motion is requested in one of three forms, and ``forms`` says which of them a body takes:
+A motion is requested in one of three forms, and ``forms`` lists the accepted ones:
 
 - ``axles``: the motion of an equivalent bicycle about the base point, by its speed along the direction of travel and
   the angles of its two axles, whatever angles the wheels of a real linkage have (``truck.LinkedAxles``). ``freedom`` is
@@ -10,9 +10,8 @@ A motion is requested in one of three forms, and ``forms`` says which of them a 
   that follows from it.
 
 The first two lead to the angles that the body's wheels are steered to and to a twist of its base. At given steering
-angles a chassis says which part of a twist is possible (``along``) and which shaft speeds make it; from measured
-shaft speeds and servo angles it finds the twist again. Bodies that steer nothing can pass from any motion to any
-other.
+angles a chassis computes which part of a twist is possible (``along``) and which shaft speeds make it; from measured
+shaft speeds and servo angles it finds the twist again. Bodies that steer nothing can pass from any motion to any other.
 
 The bicycle of a body without axles is virtual, its wheelbase being the body's reference length. ``freedom``:
 
@@ -21,7 +20,7 @@ The bicycle of a body without axles is virtual, its wheelbase being the body's r
   bicycle whose rear axle lies on the line of its ICRs, curvature tan(front) / length.
 - ``parallel``: both angles are equal, the body never turns (synchro).
 
-Shaft speeds are those of the wheels' treads over ground, m/s, forward positive.
+Shaft speeds are speeds of the wheels' treads over ground, m/s, forward positive.
 """
 
 import math
@@ -60,7 +59,7 @@ STILL: Final = (0.0, 0.0, 0.0)
 """Twist of a body at rest."""
 
 MAX_ANGLE: Final = 1.4
-"""Axle angles beyond this are no turn any more but turning on the spot, or sideways motion, rad."""
+"""Maximum axle angle of a turn, rad: beyond it the body turns on the spot or moves sideways."""
 
 AXLES: Final = ("front", "rear")
 """Names of the two axles."""
@@ -70,7 +69,7 @@ STANDING: Final = 0.1
 
 
 WHEEL_REACH: Final = math.radians(100.0)
-"""Angle that wheels with servos of their own reach to both sides: more than a quarter turn, so that a wheel need not
+"""Angle that wheels with their own servos reach to both sides: more than a quarter turn, so that a wheel need not
 turn about when its motion passes through sideways, rad."""
 
 
@@ -99,7 +98,7 @@ class Chassis(ABC):
     forms: ClassVar[frozenset[Form]] = frozenset({"axles", "twist", "shafts"})
     """Forms of request that it takes."""
     straight: ClassVar[Angles] = (0.0, 0.0)
-    """Steering angles for driving straight ahead; those of a body that steers nothing never change."""
+    """Steering angles for driving straight ahead; constant for a body that steers nothing."""
 
     @abstractmethod
     def shaft_speeds(self, speed: float, front: float, rear: float) -> Speeds:
@@ -141,7 +140,7 @@ class Chassis(ABC):
         A ``vy`` of 0 is understood as none requested: a car whose base is not on its rear axle has one as it turns.
 
         Raises:
-            KinematicsError: the body cannot move like that, nor nearly; the reason is named.
+            KinematicsError: the body cannot move like that, nor nearly; the text gives the reason.
         """
         vx, vy, wz = twist
         if self.freedom == "parallel":
@@ -164,11 +163,11 @@ class Chassis(ABC):
         return self.bicycle.steer_for_twist(*twist)[1:]
 
     def steering_for_axles(self, front: float, rear: float, near: Angles) -> Angles:
-        """Steering angles for those of the bicycle; where there is a choice, those nearest to ``near``."""
+        """Steering angles for the bicycle's angles; where there is a choice, the nearest to ``near``."""
         return (front, rear) if self.steered else near
 
     def along(self, twist: Twist2, *angles: float) -> Twist2:
-        """What the body does of a twist while its wheels stand at steering angles."""
+        """Part of a twist that the body executes at its current steering angles."""
         if not self.steered:
             return twist
         return self.bicycle.body_twist(signed_hypot(twist[0], twist[1]), *angles)
@@ -181,8 +180,8 @@ class Chassis(ABC):
         """Twist of the base that shaft speeds make at steering angles.
 
         Raises:
-            KinematicsError: another number of shafts; or the shafts push against each other, so that nobody knows how
-                the body moves.
+            KinematicsError: another number of shafts; or the shafts push against each other, so that the body's motion
+                is undetermined.
         """
         if len(shaft_speeds) != len(self.shafts):
             raise KinematicsError(
@@ -246,7 +245,7 @@ class Chassis(ABC):
 
     @property
     def reached_angle(self) -> float:
-        """Largest axle angle that the servos reach to both sides, in every way in which the body steers, rad."""
+        """Largest axle angle that the servos reach to both sides in every steering mode, rad."""
         ways = {"both": ((1.0, -1.0), (1.0, 1.0)), "front": ((1.0, 0.0),), "parallel": ((1.0, 1.0),)}[self.freedom]
         low, high = 0.0, MAX_AXLE_ANGLE
         for _ in range(30):
@@ -379,7 +378,7 @@ class TricycleChassis(FamilyChassis):
         return twist[0] - half, twist[0] + half
 
     def lean(self, front: float) -> float:
-        """Share by which the right rear wheel is faster than its axle, at an angle of the front wheel."""
+        """Relative excess speed of the right rear wheel over its axle, at an angle of the front wheel."""
         return self.family.track / 2.0 * math.tan(front) / self.family.wheelbase
 
 
@@ -414,18 +413,18 @@ class SkidWheelsChassis(FamilyChassis):
     """
 
     def shafts_along(self, twist: Twist2, *angles: float) -> Speeds:
-        """Both wheels of a side alike."""
+        """Equal speeds of both wheels of a side."""
         return super().shafts_along(twist, *angles) * 2
 
     def twist(self, inputs: Speeds, *angles: float) -> Twist2:
-        """Of the means of the sides."""
+        """Twist by the means of the sides."""
         front_left, front_right, rear_left, rear_right = inputs
         return super().twist(((front_left + rear_left) / 2, (front_right + rear_right) / 2), *angles)
 
 
 @dataclass(frozen=True)
 class IndependentChassis(Chassis):
-    """Two steered axles with ideal linkages, every wheel with a motor of its own.
+    """Two steered axles with ideal linkages, every wheel with its own motor.
 
     Two axle angles always leave a forward speed: turning on the spot takes ``WheelSteerChassis``.
 
@@ -451,7 +450,7 @@ class IndependentChassis(Chassis):
 
 @dataclass(frozen=True)
 class WheelSteerChassis(Chassis):
-    """Every wheel steered by a servo and driven by a motor of its own: any twist.
+    """Every wheel steered by a servo and driven by its own motor: any twist.
 
     Args:
         family: the drive.

@@ -29,7 +29,7 @@ class Drive(Protocol):
         """Command that produces a twist.
 
         Raises:
-            KinematicsError: the family cannot produce this twist (the component is named), or NaN.
+            KinematicsError: the family cannot produce this twist (the text names the component), or NaN.
         """
 
     def wheels(self, command: Sequence[float]) -> tuple[Wheel, ...]:

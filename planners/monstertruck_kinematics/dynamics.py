@@ -23,8 +23,8 @@ class SingleTrack:
         yaw_inertia: I_z, kg m^2 (a box of the footprint).
         front_stiffness: C of the front axle, N/rad (assumed).
         rear_stiffness: C of the rear axle, N/rad (assumed).
-        blend_from: forward speed, m/s, up to which the motion is kinematic.
-        blend_to: forward speed from which it is dynamic; between them it is mixed smoothly.
+        blend_from: maximum forward speed of kinematic motion, m/s.
+        blend_to: minimum forward speed of dynamic motion, m/s; between them it is mixed smoothly.
 
     Raises:
         KinematicsError: a field is not above 0, or blend_to is not above blend_from.
@@ -62,13 +62,13 @@ class SingleTrack:
 
         Args:
             twist: (vx, vy, wz) at the start.
-            speed: the drivetrain's, m/s, along the direction of travel; the forward speed follows it without lag.
+            speed: of the drivetrain, m/s, along the direction of travel; the forward speed follows it without lag.
             front: axle angle, rad.
             rear: axle angle, rad.
             dt: s, above 0.
 
         Raises:
-            KinematicsError: NaN, a steering angle beyond the geometry's, or dt not above 0.
+            KinematicsError: NaN, a steering angle beyond the geometry's limit, or dt not above 0.
         """
         require_positive("dt", dt)
         for name, value in zip(("vx", "vy", "wz"), twist, strict=True):

@@ -1,4 +1,4 @@
-"""Elementary functions and rigid motion in the plane, for a float or an array alike.
+"""Elementary functions and rigid motion in the plane, for a float or an array.
 
 Floats go through ``math`` (fast enough for a control tick), arrays through numpy.
 """
@@ -18,7 +18,7 @@ Real = TypeVar("Real", float, Array)
 
 
 class KinematicsError(ValueError):
-    """An argument, wheel or parameter that no robot can have; the text names it, its value and what was expected."""
+    """An argument, wheel or parameter that no robot can have; the text names it, its value and the expectation."""
 
 
 def sin(x: Real) -> Real:
@@ -226,7 +226,7 @@ def any_zero(x: Real) -> bool:
 
 
 def rotation(yaw: float, pitch: float, roll: float) -> Array:
-    """From a device's axes to those of its body, (3, 3): yaw, then pitch, then roll (REP 103), rad."""
+    """Rotation from a device's axes to its body's, (3, 3): yaw, then pitch, then roll (REP 103), rad."""
     cy, sy, cp, sp, cr, sr = (f(v) for v in (yaw, pitch, roll) for f in (math.cos, math.sin))
     return np.array(
         (

@@ -50,7 +50,7 @@ def least_squares(
         start: (n,) first guess within the bounds.
         lower: (n,) least values, -inf for none; equal bounds hold a parameter fixed.
         upper: (n,) largest values, inf for none.
-        huber: residual above which a sample counts linearly; None weighs all alike.
+        huber: residual above which a sample counts linearly; None weighs all equally.
         iterations: at most.
 
     Raises:

@@ -134,7 +134,7 @@ def common_motion(
 
     Returns:
         tan(sideslip) v_y/v_x of the reference point, its turning w_z/v_x (1/m; the curvature over cos(sideslip)), and
-        each wheel's steering error: its angle minus the direction in which it is dragged.
+        each wheel's steering error: its angle minus the direction of its drag.
 
     Raises:
         KinematicsError: NaN, or wheels that leave the motion undetermined.
@@ -169,7 +169,7 @@ def dragged_speeds(
 
 
 def reachable_servo(linkage: SteeringLinkage, step: float = math.radians(0.1)) -> tuple[float, float]:
-    """Servo angles (right end, left end), on a grid of ``step``, up to which linkage and tie rod move without locking.
+    """Limits of the servo angle (right, left), on a grid of ``step``, for linkage and tie rod to move without locking.
 
     Raises:
         KinematicsError: ``step`` is not above 0.

@@ -1,4 +1,4 @@
-"""Descriptions of robots whose wheels are not steered: a platform on driven wheels, each on a spring of its own.
+"""Descriptions of robots whose wheels are not steered: a platform on driven wheels, each on its own spring.
 
 A wheel with rollers (Swedish, mecanum) is made from its ideal: a ball that rolls freely about the axis of its rollers
 and is driven about the level axis across it. Along the rollers' axis it has the tyre's friction, across it rolls. The
@@ -47,7 +47,7 @@ class BallCaster:
 
 
 def frame_name(wheel: Wheel) -> str:
-    """What a wheel's links and joints are named by."""
+    """Names of a wheel's links and joints."""
     return wheel.name.replace(" ", "_")
 
 
@@ -68,11 +68,11 @@ def platform_description(
 
     Args:
         size: its dimensions.
-        parts: masses and springs; an axle's mass is the platform's.
+        parts: masses and springs; an axle's mass belongs to the platform.
         wheels: driven ones; each wheel carries as much as any other.
-        casters: what else carries it.
+        casters: further supports.
         sensors: frames on the platform.
-        head: the lidar on its joints; None = it is fixed.
+        head: the lidar on its joints; None if it is fixed.
 
     Raises:
         KinematicsError: springs that do not hold it upright, or more wheels than mass.

@@ -67,7 +67,7 @@ class CubicRamp:
 
     @property
     def peaks(self) -> tuple[float, float]:
-        """Greatest amounts of acceleration and jerk within it."""
+        """Maximum acceleration and jerk within it."""
         a1, a2 = self.coefficients
         time, peak = self.duration, abs(self.a0)
         if a2 and 0.0 < -a1 / (3.0 * a2) < time:
@@ -108,7 +108,7 @@ _FINE: Final = np.linspace(0.0, 1.0, 65)
 
 
 def shortest_ramp(v0: float, a0: float, v1: float, max_acceleration: float, max_jerk: float) -> CubicRamp:
-    """The shortest cubic ramp from the present speed and acceleration within limits.
+    """Shortest cubic ramp from the current speed and acceleration within limits.
 
     With acceleration a(t) = a0 + 2 a1 t + 3 a2 t^2 its jerk is greatest at one of the ends, |2 a1| or |2 a1 + 6 a2 T|,
     and its acceleration at the start or where the jerk is 0.
@@ -130,7 +130,7 @@ def shortest_ramp(v0: float, a0: float, v1: float, max_acceleration: float, max_
     limit = max(max_acceleration, abs(a0)) * (1.0 + 1e-9)
     change, jerk = v1 - v0, max_jerk * (1.0 + 1e-9)
     long = 2.0 * abs(change) / max_acceleration + 8.0 * (limit / max_jerk) + (6.0 * abs(change) / max_jerk) ** 0.5
-    shortest = 1e-3  # duration from which on ramps are tried, s
+    shortest = 1e-3  # minimum duration of a ramp, s
     times = shortest * np.exp(_COARSE * math.log(max(long, 1e-2) / shortest))
     found = _kept(times, change, a0, limit, jerk)
     first = int(np.argmax(found))
@@ -141,7 +141,7 @@ def shortest_ramp(v0: float, a0: float, v1: float, max_acceleration: float, max_
 
 
 def _kept(time: Array, change: float, a0: float, limit: float, jerk: float) -> NDArray[np.bool_]:
-    """Of which durations a ramp keeps the limits of acceleration and jerk."""
+    """Whether ramps of these durations keep the limits of acceleration and jerk."""
     a1, a2 = (3.0 * change - 2.0 * a0 * time) / time**2, (a0 * time - 2.0 * change) / time**3
     ends = np.maximum(np.abs(2.0 * a1), np.abs(2.0 * a1 + 6.0 * a2 * time))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -325,7 +325,7 @@ class BasicMove:
 
     @property
     def profile_distance(self) -> float:
-        """What a motion profile covers: the length, m, or the angle, rad, of a turn on the spot."""
+        """Extent of a motion profile: the length, m, or the angle, rad, of a turn on the spot."""
         return self.angle if self.radius == 0.0 else self.length
 
     @property

@@ -2,7 +2,7 @@
 
 A pose is x, y (m) and yaw (rad), a twist vx, vy (m/s) and wz (rad/s), either as a tuple or along the last axis of an
 array. Functions of arrays are vectorised over the leading axes; ``compose``, ``inverse`` and ``between`` wrap the yaw,
-the others let it count turns.
+the others keep full turns.
 """
 
 import math
@@ -25,7 +25,7 @@ def wrap(angle: Array | float) -> Array:
 
 
 def compose(outer: Array, inner: Array) -> Array:
-    """Pose ``inner``, given in the frame of ``outer``, in the frame in which ``outer`` is given."""
+    """Pose ``inner``, given in the frame of ``outer``, transformed to the parent frame of ``outer``."""
     c, s = np.cos(outer[..., 2]), np.sin(outer[..., 2])
     return np.stack(
         (
@@ -137,7 +137,7 @@ def integrate(pose: tuple[Real, Real, Real], vx: Real, vy: Real, wz: Real, dt: f
     """Pose after holding the body twist (vx, vy, wz) for dt: an exact arc, a straight line for wz = 0.
 
     The chord of the arc has the length sinc(wz dt / 2) |v| dt and points along the heading at half time, so no case
-    distinction by curvature is needed. The heading is not wrapped (it counts turns).
+    distinction by curvature is needed. The heading is not wrapped.
 
     Args:
         pose: x, y (m) and heading (rad) in the world frame; three floats, three (N,) arrays or one (3, N) array.

@@ -156,14 +156,14 @@ class Ackermann:
         return speed, steer
 
     def front_angles(self, steer: Real) -> tuple[Real, Real]:
-        """Front wheel angles (left, right): tan = L/(R -+ w/2) (2.10, 2.11); the sign of R says which is inner."""
+        """Front wheel angles (left, right): tan = L/(R -+ w/2) (2.10, 2.11); the sign of R selects the inner wheel."""
         left, right, _, _ = self.geometry.wheel_angles(steer, 0.0 * steer)
         return left, right
 
     def defect(self, left: Real, right: Real) -> Real:
         """Violation of Ackermann's condition by two front wheels, cot d_r - cot d_l = w/L (2.12): 0 if ideal.
 
-        Multiplied out, tan d_l - tan d_r - (w/L) tan d_l tan d_r, so that straight ahead is no special case.
+        Multiplied out, tan d_l - tan d_r - (w/L) tan d_l tan d_r, so that straight ahead needs no special case.
         """
         tan_l, tan_r = tan(left), tan(right)
         return tan_l - tan_r - (self.track / self.wheelbase) * tan_l * tan_r

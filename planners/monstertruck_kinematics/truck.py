@@ -2,12 +2,12 @@
 
 Frames: x forward, y left, angles positive to the left, rad. Wheels are ordered front left, front right, rear left,
 rear right. Speed is signed along the direction of travel of the reference point C. Everything is in curvature form:
-straight ahead and crab are no special cases. Every function takes floats or arrays.
+straight ahead and crab need no special cases. Every function takes floats or arrays.
 
-An axle angle is everywhere that of an equivalent bicycle: its two wheels at these angles give the body's curvature and
+An axle angle always belongs to an equivalent bicycle: its two wheels at these angles give the body's curvature and
 sideslip exactly (``FourWheelSteering``). ``IdealAxles`` have wheels that share one ICR, so each axle's angle is its
 own. The wheels of ``LinkedAxles`` share none: the body makes their least-squares motion (``least_squares_motion``),
-which turns less than the mean of the wheels' tangents says (4WS at full lock by a tenth), and each axle's angle depends
+which turns less than the mean of the wheels' tangents (4WS at full lock by a tenth), and each axle's angle depends
 on the other a little. ``TurnDeficit`` refines that.
 """
 
@@ -53,7 +53,7 @@ MAX_AXLE_ANGLE = math.radians(89.0)
 """Largest axle angle that the bicycle form accepts (tangents stay meaningful)."""
 
 Range = tuple[float, float]
-"""Least and greatest servo angle, rad: to the right (negative) and to the left."""
+"""Minimum and maximum servo angle, rad: to the right (negative) and to the left."""
 
 FULL: Final[Range] = (-SERVO_LIMIT, SERVO_LIMIT)
 
@@ -242,7 +242,7 @@ class FourWheelSteering:
         return secant(self.tan_sideslip(tan_f, tan_r)), 0.5 * (secant(tan_f) + secant(tan_r))
 
     def _sides(self, tan_f: Real, tan_r: Real) -> tuple[Real, Real]:
-        """Forward speed of the left and of the right wheels over that of C: 1 -+ (w/2)/R with the signed R of 2.37."""
+        """Forward speed of the left and of the right wheels, relative to C: 1 -+ (w/2)/R with the signed R of 2.37."""
         lean = (tan_f - tan_r) * (0.5 * self.track / self.wheelbase)
         return 1.0 - lean, 1.0 + lean
 
@@ -268,7 +268,7 @@ class FourWheelSteering:
         require_within("rear_limit", far, 0.0, MAX_AXLE_ANGLE)
         tightest = self.curvature(limit, -far)
         curvature = clip(self.curvature(front, rear), -tightest, tightest)
-        # tan(beta) + l_f kappa/cos(beta) = +-tan(limit) solved for beta, likewise at the rear.
+        # tan(beta) + l_f kappa/cos(beta) = +-tan(limit) solved for beta, and the same at the rear.
         ahead = asin(clip(self.l_f * math.cos(limit) * curvature, -1.0, 1.0))
         behind = asin(clip(self.l_r * math.cos(far) * curvature, -1.0, 1.0))
         low = larger(-limit - ahead, -far + behind)
@@ -277,7 +277,7 @@ class FourWheelSteering:
         return clip(wanted_f, -limit, limit), clip(wanted_r, -far, far)
 
     def minimum_radius(self, mode: SteeringModeName, limit: float, *, every_wheel: bool = False) -> float:
-        """Least turning radius R (m): lateral distance of the ICR from the body's middle line (eq. 2.37).
+        """Minimum turning radius R (m): lateral distance of the ICR from the body's middle line (eq. 2.37).
 
         Front and rear steering have their ICR on the straight axle's line, counter steering on the line of the centre.
 
@@ -327,10 +327,10 @@ def least_squares_motion(geometry: FourWheelSteering, angles: tuple[Real, Real, 
 
 @dataclass(frozen=True, slots=True)
 class TurnDeficit:
-    """What the axles turn less than the linkage says: dimensionless, 0 = as it says.
+    """Turn that the axles lack compared with the linkage: dimensionless, 0 for none.
 
     The tangent t of an axle angle becomes t (1 - c t^2), with a coefficient c for each axle and side; where the axles
-    oppose each other, the turn becomes turn (1 + c t_f t_r), with a coefficient for each side to which the body turns.
+    oppose each other, the turn becomes turn (1 + c t_f t_r), with a coefficient for each direction of turn.
     """
 
     front_left: float = 0.0
@@ -395,20 +395,20 @@ class IdealAxles(Axles):
         )
 
     def servos(self, front: float, rear: float) -> tuple[float, float]:
-        """Of each axle by itself."""
+        """Angles of each axle by itself."""
         return self.polynomials.servo_from_axles(front, rear)
 
 
 @dataclass(frozen=True)
 class LinkedAxles(Axles):
-    """Axles whose wheels stand as the fitted polynomials say.
+    """Axles with wheel angles by the fitted polynomials.
 
     Args:
         geometry: of the body; its reference point is the middle between the axles.
         front: servo to wheels.
-        rear: servo to wheels; None = its wheels are fixed straight ahead, and the rear axle angle is 0: the front one
+        rear: servo to wheels; None if its wheels are fixed straight ahead, and the rear axle angle is 0: the front one
             gives the turn, the sideslip of the rear axle's middle (0.5 deg at full lock) is neglected.
-        deficit: what the axles turn less.
+        deficit: turn that the axles lack.
     """
 
     geometry: FourWheelSteering
@@ -427,7 +427,7 @@ class LinkedAxles(Axles):
         return left, right, rear_left, rear_right
 
     def angles(self, front_servo: Real, rear_servo: Real) -> tuple[Real, Real]:
-        """Of the bicycle that makes the wheels' least-squares motion."""
+        """Angles of the bicycle with the wheels' least-squares motion."""
         front, rear = self._tangents(front_servo, rear_servo)
         return atan(front), atan(rear)
 
@@ -440,7 +440,7 @@ class LinkedAxles(Axles):
         return (front, rear) if self.deficit is None else self.deficit.tangents(front, rear)
 
     def servos(self, front: float, rear: float) -> tuple[float, float]:
-        """By Broyden's method from the slopes of the mean tangents."""
+        """Solve by Broyden's method from the slopes of the mean tangents."""
         require_within("front", front, -MAX_AXLE_ANGLE, MAX_AXLE_ANGLE)
         require_within("rear", rear, -MAX_AXLE_ANGLE, MAX_AXLE_ANGLE)
         target_f, target_r = tan(front), tan(rear)
@@ -473,7 +473,7 @@ class LinkedAxles(Axles):
             row_f, row_r = step_f * ff + step_r * rf, step_f * fr + step_r * rr
             ff, fr = ff + left_f * row_f, fr + left_f * row_r
             rf, rr = rf + left_r * row_f, rr + left_r * row_r
-        # 1e-3: tangent by which a clamped servo may miss an axle angle on the edge of its reach
+        # 1e-3: tolerance (tangent) of a clamped servo for an axle angle on the edge of its reach
         if not abs(target_f - got_f) + abs(target_r - got_r) < 1e-3:
             raise KinematicsError(f"front is {front:.6g}, rear is {rear:.6g}: out of the steering linkage's reach")
         return servo_f, servo_r

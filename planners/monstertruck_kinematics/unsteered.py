@@ -65,8 +65,8 @@ class SkidSteer:
     """Skid-steer drive (skid-steer paper, eqs. 1-11, and their extension by ICR parameters).
 
     One model covers four cases. Each side's tread moves as if it turned about its own ICR on the lateral axis: at the
-    wheels for an ideal robot, farther out for one that skids (it turns more slowly). An effective radius or a slip
-    factor scales a side's speed, and a reference point off the middle shifts both ICRs alike.
+    wheels for an ideal robot, further out for one that skids (it turns more slowly). An effective radius or a slip
+    factor scales a side's speed, and a reference point off the middle shifts both ICRs equally.
 
     omega = (s_R - s_L)/(y_L - y_R), v_x = (s_R y_L - s_L y_R)/(y_L - y_R), v_y = -x_ICR omega (eq. 6), with the side
     speeds s = gain r times the wheel rate.

@@ -98,7 +98,7 @@ class CasterWheel(Wheel):
         return None
 
     def steering_rate(self, twist: Sequence[float]) -> float:
-        """Rate at which the caster swivels, rad/s, relative to the body, when the body moves with (vx, vy, wz).
+        """Swivel rate of the caster, rad/s, relative to the body, when the body moves with (vx, vy, wz).
 
         From its no-slip row: side speed of the axis - offset (wz + rate) = 0, the contact point trailing. (The
         textbook writes + d: it looks from the axis towards the contact point.)
@@ -126,7 +126,7 @@ class SwedishWheel(Wheel):
 
     @property
     def rolling_row(self) -> Array:
-        """Row along the direction in which the rollers do not roll."""
+        """Row along the direction without rolling of the rollers."""
         return self.row(self.heading + self.roller)
 
     @property
@@ -211,7 +211,7 @@ def analyse(wheels: Sequence[Wheel], tolerance: float = 1e-9) -> Mobility:
 
     Args:
         wheels: any wheels; steered ones may contradict each other (then nothing moves: mobility 0).
-        tolerance: singular value, relative to the largest, up to which rows count as dependent; larger for headings
+        tolerance: singular value, relative to the largest, threshold of dependent rows; larger for headings
             that were rounded.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The robot's bodies by ``kind``, for the daemon and for the simulated world alike."""
+"""The robot's bodies by ``kind``, for daemon and simulated world."""
 
 from typing import Annotated, Any, Final
 

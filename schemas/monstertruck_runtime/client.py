@@ -97,7 +97,7 @@ def _arguments_for(robot: str, endpoint: str) -> str:
 
 
 class Watched(Generic[M]):
-    """The newest message of a topic; a context manager that ends the subscription.
+    """Latest message of a topic; a context manager that ends the subscription.
 
     Args:
         topic: row of the topic table.
@@ -115,7 +115,7 @@ class Watched(Generic[M]):
 
     @property
     def latest(self) -> M | None:
-        """The newest message; None before the first, and for one that cannot be decoded."""
+        """Latest message; None before the first, and if it cannot be decoded."""
         data = self._bytes
         if data is not self._decoded[0] and data is not None:
             try:
@@ -147,7 +147,7 @@ class TruckClient(Operator):
         role: of its requests; decides their priority.
         clock: time of stamps and deadlines; robots do not trust it.
         timeout: seconds to wait for the link and for answers.
-        tls: certificate files for ``tls/...`` endpoints; None = those of ``station_tls``.
+        tls: certificate files for ``tls/...`` endpoints; None for the files of ``station_tls``.
 
     Raises:
         InputError: the source cannot be part of a key.
@@ -189,10 +189,10 @@ class TruckClient(Operator):
         """Connect to the endpoint.
 
         Raises:
-            InputError: no endpoint is named, and several robots of this computer could be meant; lists them.
+            InputError: no endpoint is given, and several robots run on this computer; lists them.
             NotFoundError: nothing answers there, or a file of the certificate is missing.
-            NotPermittedError: others may read the certificate's key, the source is not the certificate's, or a
-                certificate is refused.
+            NotPermittedError: others may read the certificate's key, the source differs from the certificate's name, or
+                a certificate is refused.
         """
         try:
             await in_thread(self._open)
@@ -210,7 +210,7 @@ class TruckClient(Operator):
     # Subscriptions
 
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """Subscribe to ``topic``; of a retained topic the newest message comes at once.
+        """Subscribe to ``topic``; a retained topic delivers its latest message at once.
 
         Args:
             topic: row of the topic table.
@@ -234,7 +234,7 @@ class TruckClient(Operator):
     def tap(self, topic: Topic[Any], take: Callable[[bytes], object]) -> Any:
         """Hand the bytes of every message of ``topic`` to ``take``, in a thread that reads the network.
 
-        Of a retained topic the newest message comes at once. It ends by ``undeclare()`` of what is returned.
+        A retained topic delivers its latest message at once. ``undeclare()`` of the returned object ends it.
         """
         return self._declare(topic, lambda sample: take(sample.payload.to_bytes()))
 
@@ -246,14 +246,14 @@ class TruckClient(Operator):
         return ext.declare_advanced_subscriber(self._open_session(), key, receive, history=history)
 
     def watch(self, topic: Topic[M]) -> "Watched[M]":
-        """Follow the newest message of ``topic``, which is decoded only when it is requested.
+        """Follow the latest message of ``topic``, which is decoded only when it is requested.
 
         For looking at a topic less often than it is published: messages in between cost next to nothing.
         """
         return Watched(topic, partial(self._open_session().declare_subscriber, topic.key(self.robot)))
 
     async def get_retained(self, topic: Topic[M]) -> M | None:
-        """Newest message of a retained topic; None if the robot has published none yet.
+        """Latest message of a retained topic; None if the robot has published none yet.
 
         Raises:
             NoAnswerError: no answer in time.
@@ -286,7 +286,7 @@ class TruckClient(Operator):
         Args:
             rpc: name.
             payload: JSON object.
-            timeout: seconds to wait; None = those of the client.
+            timeout: seconds to wait; None for the client's timeout.
 
         Raises:
             NotFoundError: no such robot or rpc.
@@ -324,8 +324,8 @@ class TruckClient(Operator):
     ) -> None:
         """Request a velocity of the base, forward, to the left (m/s) and turning (rad/s), for ``lease`` seconds.
 
-        What the body cannot do is refused by the robot with an event ``impossible_motion``. ``unseen`` as in ``drive``,
-        which raises the same.
+        The robot refuses a motion that its body cannot execute, with an event ``impossible_motion``. ``unseen`` as in
+        ``drive``, which raises the same.
         """
         header = await self.header(lease)
         twist = RequestedTwist(vx=vx, vy=vy, wz=wz)
@@ -422,10 +422,10 @@ class TruckClient(Operator):
 
         Args:
             order: which of both.
-            home: drive back to the start at the end; None = as configured.
-            budget: seconds after which it ends; None = as configured.
+            home: drive back to the start at the end; None for the configured value.
+            budget: time limit, s; None for the configured value.
             find: look for tags on walls, too, and end when so many are known.
-            own: of a stop: only one that this client started.
+            own: with a stop: only one that this client started.
 
         Raises:
             RequestRefusedError: why it does not start, or none runs.
@@ -449,7 +449,7 @@ class TruckClient(Operator):
             order: which of both.
             name: of the point.
             place: of a mark, in map, m; None = where the robot is.
-            yaw: rad; None = the robot's.
+            yaw: rad; None for the robot's yaw.
 
         Returns:
             Of a mark its place: ``x``, ``y`` (m) and ``yaw`` (rad) in map.
@@ -558,7 +558,7 @@ class TruckClient(Operator):
         )
 
     async def ready(self) -> None:
-        """Wait until the robot's nonce is known: until then requests wait, and what they ask for grows old.
+        """Wait until the robot's nonce is known: until then requests wait and age.
 
         Raises:
             NoAnswerError: it did not come in time.
@@ -673,7 +673,7 @@ class TruckClient(Operator):
 
     async def _absent(self) -> NotFoundError | NoAnswerError:
         """That the robot is not there, and which ones are; or that it is, and does not answer."""
-        look = 0.5  # seconds in which the robots that are there answer
+        look = 0.5  # seconds that running robots take to answer
         # One that requires certificates shows itself only to who asks for it by name.
         seen = await asyncio.gather(self._seen("*", look), self._seen(self.robot, look))
         names = sorted({name for some in seen for name in some})
@@ -708,7 +708,7 @@ def _payload(reply: zenoh.Reply) -> bytes:
 
 
 def _refusal(data: bytes) -> TruckError:
-    """What an error reply means; Zenoh's own come as plain text."""
+    """Error from an error reply; Zenoh's own replies are plain text."""
     try:
         fields = json.loads(data)
         reason, text = Reason(fields["reason"]), str(fields["text"])  # type: ignore[call-arg]  # look-up by value

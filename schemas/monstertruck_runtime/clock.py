@@ -1,10 +1,9 @@
 """Time, injected everywhere: wall, virtual and replay clocks, and the event loops that carry them.
 
-Every coroutine sleeps on its event loop as usual (``asyncio.sleep``, ``asyncio.timeout``); what differs is
-the loop. ``VirtualLoop`` jumps to the next timer as soon as nothing is ready to run, so an hour of driving
-takes as long as its computations, and two runs of one seed are identical. A replay clock is a virtual loop
-that starts at the log's first stamp and can be held to a multiple of real time. ``Schedule`` is periodic work without
-drift, on either.
+Every coroutine sleeps on its event loop as usual (``asyncio.sleep``, ``asyncio.timeout``); only the loop differs.
+``VirtualLoop`` jumps to the next timer as soon as nothing is ready to run, so an hour of driving takes as long as its
+computations, and two runs of one seed are identical. A replay clock is a virtual loop that starts at the log's first
+stamp and can be held to a multiple of real time. ``Schedule`` is periodic work without drift, on either.
 
 This is the only module that may import ``time``.
 """
@@ -35,11 +34,11 @@ MILLISECOND: Final = SECOND // 1000
 
 
 MANY_TIMERS: Final = 100
-"""Number of timers from which on cancelled ones are removed."""
+"""Minimum number of timers before cancelled ones are removed."""
 
 GUARD: Final = 300.0
-"""Seconds of processor time, or of waiting for another thread, that one virtual second may take: kernels that are
-compiled take a minute or two."""
+"""Seconds of processor time, or of waiting for another thread, allowed for a virtual second: compiling kernels takes a
+minute or two."""
 ENDING: Final = 600.0
 """Virtual seconds that all tasks may take to end once a run is over."""
 
@@ -51,7 +50,7 @@ def is_date(real: int) -> bool:
 
 
 def processor_time() -> float:
-    """Processor time of the calling thread, s: what a computation has used, whatever the computer's other load."""
+    """Processor time of the calling thread (s), independent of the computer's other load."""
     return time.thread_time()
 
 
@@ -94,7 +93,7 @@ class WallClock(Clock):
         await self.sleep_until(until)
 
     async def sleep_until(self, instant: int) -> None:
-        """Wait for the whole millisecond at or after ``instant``; the kernel may take most of another one."""
+        """Wait for the whole millisecond at or after ``instant``; the kernel may add most of a millisecond."""
         while (now := self.now()) < instant:
             await asyncio.sleep((-(-instant // MILLISECOND) - now // MILLISECOND) / 1000)
 
@@ -114,12 +113,12 @@ class HungError(RuntimeError):
 
 
 ON_COMPUTER: Final[contextvars.ContextVar[bool]] = contextvars.ContextVar("on_computer", default=False)
-"""True in what runs on the robot's computer, whose loop can stall while world and devices go on: see
+"""True for tasks on the robot's computer, whose loop can stall while world and devices continue: see
 ``VirtualLoop.stall``."""
 
 
 def on_computer() -> contextvars.Context:
-    """Return a context for tasks and callbacks of the robot's computer; what they start belongs to it, too."""
+    """Return a context for tasks and callbacks of the robot's computer; tasks that they start inherit it."""
     context = contextvars.copy_context()
     context.run(ON_COMPUTER.set, True)
     return context
@@ -128,7 +127,7 @@ def on_computer() -> contextvars.Context:
 class VirtualLoop(asyncio.SelectorEventLoop):
     """Event loop whose time jumps to the next timer when nothing is ready.
 
-    Timers of one instant fire in the order in which they were set, so that nothing but the seed decides a run. An
+    Timers of one instant fire in the order of their creation, so that only the seed decides a run. An
     exception outside ``Exception`` in a callback, such as a test's time-out, ends the run.
 
     Args:
@@ -150,12 +149,12 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self._timers_set = 0
         self._most_timers = MANY_TIMERS
         self._held: list[asyncio.Handle] | None = None
-        """What waits for the end of a stall; None while there is none."""
+        """Callbacks waiting for the end of a stall; None without a stall."""
         self._guard = guard
         self._turns = 0
         self._guarded_second = -1
         self._used = 0.0
-        """Processor time at which the guarded second began, s."""
+        """Processor time at the start of the guarded second (s)."""
         self._end_by: int | None = None
         super().__init__(_VirtualSelector(self))
 
@@ -166,7 +165,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def call_at(
         self, when: float, callback: Callable[[*Ts], object], *args: *Ts, context: contextvars.Context | None = None
     ) -> asyncio.TimerHandle:
-        """As in asyncio, but first set, first fired."""
+        """Schedule as in asyncio; timers of one instant fire in order of creation."""
         if len(self._timers) > self._most_timers:
             self._timers = [timer for timer in self._timers if not timer.handle.cancelled()]
             heapq.heapify(self._timers)
@@ -180,13 +179,13 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def call_soon_threadsafe(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: contextvars.Context | None = None
     ) -> asyncio.Handle:
-        """As in asyncio; also notes that the kernel has to be asked."""
+        """Schedule as in asyncio; also note that the kernel must be polled."""
         handle = super().call_soon_threadsafe(callback, *args, context=context)
         self.woken = True
         return handle
 
     def call_exception_handler(self, context: dict[str, Any]) -> None:
-        """As in asyncio, but an exception outside ``Exception`` is raised by what runs the loop."""
+        """Handle as in asyncio, but raise an exception outside ``Exception`` from the running loop."""
         error = context.get("exception")
         if error is not None and not isinstance(error, Exception | asyncio.CancelledError):
             raise error
@@ -230,9 +229,9 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         return HungError(f"{what}; {len(tasks)} tasks, see their stacks")
 
     def stall(self, seconds: float) -> None:
-        """Run nothing of the robot's computer for so long, as behind a computation; all else goes on.
+        """Run nothing of the robot's computer for some time, as during a computation; everything else continues.
 
-        What comes due meanwhile runs afterwards, in its order. A stall during a stall changes nothing.
+        Callbacks that come due meanwhile run afterwards, in order. A stall during a stall changes nothing.
 
         Args:
             seconds: from now on.
@@ -252,7 +251,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def _call_soon_stalled(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: contextvars.Context | None = None
     ) -> asyncio.Handle:
-        """As in asyncio, but what belongs to the robot's computer waits."""
+        """Run as in asyncio, but callbacks of the robot's computer wait during a stall."""
         context = contextvars.copy_context() if context is None else context
         if self._held is None or not context.get(ON_COMPUTER, False):
             return super().call_soon(callback, *args, context=context)
@@ -310,7 +309,7 @@ class _Timer(NamedTuple):
 
 
 class _VirtualSelector(selectors.DefaultSelector):
-    """Where asyncio waits, once each iteration of the loop: it has no timers, so without limit if nothing is ready.
+    """Wait for the kernel, once per iteration of the loop; without limit if nothing is ready and there are no timers.
 
     The kernel is asked only when another thread has woken the loop, when files other than its wake-up pipe are watched,
     or when there is no timer to jump to.
@@ -371,7 +370,7 @@ class VirtualClock(Clock):
         return self._real_offset
 
     def spend(self, seconds: float) -> None:
-        """Let time pass at once: what is due meanwhile comes late, as behind a computation."""
+        """Advance time at once: timers due meanwhile fire late, as after a computation."""
         self._loop.instant += round(seconds * SECOND)
 
     def stall(self, seconds: float) -> None:
@@ -394,7 +393,7 @@ def run_virtual(
     rate: float | None = None,
     guard: float = GUARD,
 ) -> T:
-    """Run ``main(clock)`` to its end on a virtual loop of its own.
+    """Run ``main(clock)`` to its end on a new virtual loop.
 
     Args:
         main: coroutine function that gets the clock.
@@ -426,8 +425,8 @@ def _run(loop: VirtualLoop, main: Callable[[VirtualLoop], Coroutine[Any, Any, T]
 def run_wall(main: Callable[[WallClock], Coroutine[Any, Any, T]]) -> T:
     """Run ``main(clock)`` on uvloop. Ctrl-C cancels it, a second one does not disturb its end, a third one does.
 
-    Whoever presses twice, or timeout(1), which signals a program and its group, would leave a robot driving that the
-    end of ``main`` stops.
+    A second Ctrl-C, or timeout(1), which signals a program and its group, must not interrupt the end of ``main``, which
+    stops the robot.
     """
 
     async def work() -> T:
@@ -456,7 +455,7 @@ def _ignore_second_interrupt() -> None:
 
 
 BEFORE_GATE: Final = 4 * MILLISECOND
-"""So long before the gate's ticks the instants of the others lie: its newest input is fresh then, and the loop free."""
+"""Lead of other schedules over the gate's ticks: the gate's input is fresh then, and the loop free."""
 
 ESTIMATES: Final = BEFORE_GATE + MILLISECOND
 """Lead of services whose estimates the others use, ns."""
@@ -470,10 +469,10 @@ IN_THREADS: Final = -2 * MILLISECOND
 
 
 class Schedule:
-    """Instants on one fixed grid. Of those that were missed by a millisecond none is made up for.
+    """Instants on a fixed grid. Instants missed by a millisecond are skipped.
 
     Schedules of one rate have the same instants, so that services wake together: a loop that sleeps in between runs
-    code from cold caches, and what comes first pays for what follows.
+    code from cold caches, and the first service to run pays for the others.
 
     Args:
         clock: time.
@@ -495,7 +494,7 @@ class Schedule:
         return due
 
     def step(self) -> int:
-        """The next instant, ns, for those who wait by themselves; if it was missed, now: slow work goes on at once."""
+        """Next instant (ns), for callers that wait themselves; now if it was missed."""
         due = self._step(0)
         if (newest := self._clock.now() - MILLISECOND) > due:
             self._behind = due = newest

@@ -1,7 +1,7 @@
-"""A task or a drive along a path, as a client of the robot: from the request to how it ended.
+"""A task or a drive along a path, as a client of the robot: from the request to the outcome.
 
 `run_task` is the one session of all clients with a goal, an exploration, a mission or a behaviour: it starts the task,
-arms the robot if it may, follows the reports and stops what it started when it is cancelled or the robot falls silent.
+arms the robot if it may, follows the reports, and stops the task when it is cancelled or the robot falls silent.
 """
 
 import asyncio
@@ -39,11 +39,11 @@ E = TypeVar("E")
 STAND_LOOK_PERIOD: Final = 0.5
 """Half the period of reports why the truck stands, s."""
 ACCEPT_TIMEOUT: Final = 3.0
-"""Seconds in which a path is accepted or refused."""
+"""Time limit for the acceptance of a path (s)."""
 
 
 class DriveReport:
-    """What is said of a drive while it lasts; this one says nothing."""
+    """Progress reports of a drive; this base reports nothing."""
 
     def waiting(self, text: str, share: float) -> None:
         """The planner is starting; ``share`` of the time allowed has passed."""
@@ -52,7 +52,7 @@ class DriveReport:
         """Driven so far, 0..1."""
 
     def stands(self, gate: GateState, why: str) -> None:
-        """The truck stands, for a reason that was not said since it does; ``why`` words all of them."""
+        """The truck stands, for a reason not yet reported; ``why`` holds all reasons in words."""
 
 
 SILENT: Final = DriveReport()
@@ -83,7 +83,7 @@ class TaskEnd(Generic[S]):
     reason: Reason
     text: str
     state: S | None
-    """Newest report on it."""
+    """Latest report on it."""
 
 
 async def run_task(
@@ -217,7 +217,7 @@ async def follow(
 ) -> Arrival:
     """Send a path and wait for its end; cancelled or without an answer, it stops the truck, but not on another path.
 
-    Then the path is withdrawn: whoever arms the truck later does not have it driven.
+    Then the path is withdrawn, so that arming the truck later does not drive it.
 
     Args:
         driver: who sends it.
@@ -307,8 +307,8 @@ async def begun(
 ) -> dict[str, Any]:
     """Start a task; returns the robot's answer.
 
-    The robot is armed only when nothing else is in the way, and held until the task has begun: a path that it has would
-    be driven meanwhile. It is disarmed again if nothing comes of it.
+    The robot is armed only when nothing else is in the way, and held until the task has started: a path that it has
+    would be driven meanwhile. It is disarmed again if nothing comes of it.
 
     Args:
         driver: who starts it.
@@ -341,7 +341,7 @@ async def begun(
 
 
 def named(path: Path, clock: Clock) -> Path:
-    """The path under a name that no other one has."""
+    """The path under a unique name."""
     return path.model_copy(update={"name": f"{path.name[:96]}-{clock.now():x}"})
 
 
@@ -351,8 +351,8 @@ async def send_path(driver: TruckClient, clock: Clock, path: Path, present: Mail
     Args:
         driver: who sends it.
         clock: time.
-        path: what is to be driven, with a name of its own.
-        present: the newest path of the robot.
+        path: path to drive, with a unique name.
+        present: the robot's latest path.
 
     Raises:
         RequestRefusedError: the path was refused.
@@ -409,7 +409,7 @@ async def _first(*ends: Coroutine[Any, Any, Arrival]) -> Arrival:
 
 
 def _followed(present: Mailbox[Path], name: str) -> bool:
-    """Whether the path of this name is the newest one."""
+    """Whether the latest path has this name."""
     return present.latest is not None and present.latest.name == name
 
 
@@ -440,11 +440,11 @@ async def _watched(
     undo: Callable[[], Awaitable[object]],
     to_its_end: bool = False,
 ) -> E:
-    """Wait for the end; ``undo`` if cancelled or refused, but not of a robot that restarted: it may go on with it."""
+    """Wait for the end; ``undo`` if cancelled or refused, unless the robot restarted."""
     ending = asyncio.ensure_future(while_it_runs(driver, end(), needs))
     try:
         if arm and not ((state := stand.gate.latest) is not None and state.mode.active):
-            # A truck that is armed already may have set off.
+            # A truck that is armed already may have started to drive.
             try:
                 async with taken_back(driver.disarm):
                     await driver.arm()
@@ -453,7 +453,7 @@ async def _watched(
         return await asyncio.shield(ending)  # one reader of the reports to the end: a second one would miss some
     except TruckError as error:
         if not isinstance(error, RequestRefusedError) or error.refusal is not Reason.SHUTDOWN:
-            with suppress(TruckError):  # that it failed says more than that it cannot be taken back either
+            with suppress(TruckError):  # report the failure rather than the failed undo
                 await undo()
         raise
     except BaseException as error:
@@ -484,7 +484,7 @@ async def reported(stand: StandstillMonitor, clock: Clock | None, report: DriveR
 
 
 async def _say_why_it_stands(stand: StandstillMonitor, clock: Clock, report: DriveReport) -> None:
-    said: set[str] = set()  # what is stale comes and goes while it stands
+    said: set[str] = set()  # stale inputs come and go while it stands
     while True:
         await clock.sleep(2 * STAND_LOOK_PERIOD)
         why, state = stand.why(), stand.gate.latest

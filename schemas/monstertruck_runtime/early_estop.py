@@ -19,7 +19,7 @@ ENCODING: Final = "application/json;monstertruck.ControlRequest;v=1"
 
 
 def estop_key(robot: str, source: str) -> str:
-    """Key of a source's emergency stops; as that of the topic table, which takes long to load."""
+    """Key of a source's emergency stops, as in the topic table, which takes long to load."""
     return f"mt/{robot}/req/{source}/estop"
 
 
@@ -59,7 +59,7 @@ def send_estop(robot: str, endpoint: str, timeout: float) -> zenoh.Session:
 def early_estop(arguments: Sequence[str]) -> Iterator[None]:
     """Send an emergency stop by the arguments of ``estop``; the session is open while the context lasts.
 
-    What goes wrong is left to the ordinary command, which orders again and says so.
+    Failures are left to the ordinary command, which repeats the order and reports them.
     """
     session = None
     with suppress(GetoptError, TruckError, zenoh.ZError):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 SERVICE_FOLDER: Final = Path("/run/monstertruckd")
-"""Where the service keeps its sockets."""
+"""Folder of the service's sockets."""
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 LOCAL_HOSTS: Final = ("127.0.0.1", "localhost", "::1")
 UNIX: Final = "unixsock-stream/"
@@ -18,7 +18,7 @@ _OTHERS: Final = ("unixsock-stream", "unixpipe", "vsock", "serial")
 ANNOUNCED: Final = "monstertruckd/"
 """Prefix of the abstract Unix socket that shows a daemon to all users; its ports, protocol and robot follow."""
 EVERYWHERE: Final = ("0.0.0.0", "::")  # noqa: S104
-"""Addresses at which a program listens on all interfaces."""
+"""Addresses that stand for all interfaces."""
 ANSWERS_WITHIN: Final = 0.2
 """Timeout of a connection to a program on this machine (s)."""
 
@@ -32,7 +32,7 @@ def is_endpoint(text: str) -> bool:
 
 
 def endpoint_of(protocol: str, host: str, port: int) -> str:
-    """Of a host's name or address; those of IPv6 stand in brackets."""
+    """Endpoint of a host name or address; IPv6 addresses stand in brackets."""
     return f"{protocol}/[{host}]:{port}" if ":" in host else f"{protocol}/{host}:{port}"
 
 
@@ -53,7 +53,7 @@ def port_of(endpoint: str) -> int | None:
 
 
 def runtime_folder(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where sockets and emulated ports are kept: the folder that systemd made for it, or one of its user's own."""
+    """Folder of sockets and emulated ports: made by systemd for the service, or one of the user."""
     if given := environment.get("RUNTIME_DIRECTORY"):
         return Path(given.partition(":")[0])
     runtime = environment.get("XDG_RUNTIME_DIR")
@@ -72,9 +72,9 @@ def local_endpoint(listen: Iterable[str], environment: Mapping[str, str] = os.en
 
 
 def nearest(endpoint: str, environment: Mapping[str, str] = os.environ) -> str:
-    """The Unix socket of the daemon behind a TCP endpoint of this machine, where there is one that answers.
+    """Unix socket of the daemon behind a TCP endpoint of this machine, if one answers.
 
-    Its places are not those of stations, so it answers when all of them are taken.
+    Its connections are separate from the stations', so it answers when all stations' places are taken.
     """
     port = port_of(endpoint)
     if protocol_of(endpoint) != "tcp" or host_of(endpoint) not in LOCAL_HOSTS or port is None:
@@ -98,15 +98,15 @@ class Announced(NamedTuple):
 
     @property
     def endpoint(self) -> str:
-        """Where it is reached from this computer."""
+        """Address for connections from this computer."""
         return endpoint_of(self.protocol, LOCAL_HOSTS[0], self.port)
 
 
 def local_endpoints(environment: Mapping[str, str] = os.environ, *, near: str = DEFAULT_ENDPOINT) -> list[str]:
     """Return an endpoint of each daemon that answers on this machine, by port, the port of ``near`` first.
 
-    Unix sockets are those of this user and of the service; a daemon of another user is reached by its port. Of several
-    endpoints of a daemon ``near`` is preferred, then its Unix socket.
+    Only Unix sockets of this user and of the service are tried; a daemon of another user is reached by its port. Of
+    several endpoints of a daemon ``near`` is preferred, then its Unix socket.
     """
     folders = runtime_folder(environment), SERVICE_FOLDER
     daemons = announced()
@@ -135,7 +135,7 @@ def announce(robot: str, listen: Iterable[str]) -> socket.socket | None:
         listen: endpoints of the daemon; the first that is reached from this computer is shown.
 
     Returns:
-        Socket that holds the name; the kernel drops that of a process that ends. None if the endpoints are for other
+        Socket that holds the name; the kernel drops it when the process ends. None if the endpoints are for other
         computers, or another program holds the name.
     """
     hosts, listen = (*LOCAL_HOSTS, *EVERYWHERE), tuple(listen)
@@ -185,7 +185,7 @@ def robot_on_host(robot: str, endpoint: str) -> str:
 
 
 def make_private(folder: Path) -> None:
-    """Make the folder of sockets and ports; one that is there must be this user's own and nobody else's to write.
+    """Make the folder of sockets and ports; an existing one must belong to this user and be writable by no other.
 
     Raises:
         OSError: it cannot be made, or others may put sockets into it.

@@ -14,7 +14,7 @@ class TruckError(Exception):
 
 
 class ConfigError(TruckError):
-    """A configuration was refused; the text names file, line, key and what was expected."""
+    """A configuration was refused; the text names file, line, key and expectation."""
 
     reason = Reason.BAD_CONFIG
 
@@ -24,7 +24,7 @@ class UnusableFileError(ConfigError):
 
     Args:
         file: its path.
-        why: text that names file, place and what was expected.
+        why: text that names file, place and expectation.
     """
 
     def __init__(self, file: Path, why: str) -> None:
@@ -33,7 +33,7 @@ class UnusableFileError(ConfigError):
 
 
 class InputError(TruckError):
-    """Other input (map, log, path, argument) was refused; the text names what was expected."""
+    """Other input (map, log, path, argument) was refused; the text names the expectation."""
 
     reason = Reason.BAD_INPUT
 
@@ -61,13 +61,13 @@ class NotInstalledError(TruckError):
 
 
 class NotPermittedError(TruckError):
-    """The user lacks a right; the text says how to get it."""
+    """The user lacks a right; the text explains how to get it."""
 
     reason = Reason.NOT_PERMITTED
 
 
 class CommandFailedError(TruckError):
-    """A program of the computer failed; the text is what it said."""
+    """A program of the computer failed; the text is its output."""
 
     reason = Reason.COMMAND_FAILED
 
@@ -135,7 +135,7 @@ class WrongDeviceError(DeviceError):
 
 
 class DeviceFaultError(DeviceError):
-    """The device reports a fault of its own that did not clear."""
+    """The device reports an internal fault that did not clear."""
 
     reason = Reason.DEVICE_FAULT
 
@@ -165,5 +165,5 @@ class WorkerTimeoutError(WorkerError):
 
 
 def disk_reason(error: OSError) -> Reason:
-    """Reason of a failed write: whether space is what is missing."""
+    """Reason of a failed write: disk full or another failure."""
     return Reason.DISK_FULL if error.errno in {errno.ENOSPC, errno.EDQUOT} else Reason.RECORDING_FAILED

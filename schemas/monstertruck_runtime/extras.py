@@ -1,6 +1,6 @@
-"""Extras of the distribution: what they bring, and the command that installs what is missing.
+"""Extras of the distribution: their packages, and the command that installs missing ones.
 
-The distribution itself is in no package index, so a command names the packages that an extra brings.
+The distribution itself is in no package index, so a command names the packages of an extra.
 """
 
 import json
@@ -45,7 +45,7 @@ class Requirement(NamedTuple):
 
 
 def required(extra: str, lines: Sequence[str]) -> Iterator[Requirement]:
-    """Requirements of an extra in a distribution's metadata, including those of the extras that it names itself."""
+    """Requirements of an extra in a distribution's metadata, nested extras included."""
     for line in lines:
         requirement = Requirement.parse(line)
         if requirement.extra != extra:
@@ -58,7 +58,7 @@ def required(extra: str, lines: Sequence[str]) -> Iterator[Requirement]:
 
 
 def lacking(extra: str) -> list[Requirement]:
-    """Requirements of an extra of which no version is installed."""
+    """Requirements of an extra without an installed version."""
     return [row for row in required(extra, metadata.requires(DISTRIBUTION) or ()) if not _installed(row.name)]
 
 
@@ -76,7 +76,7 @@ def pip_command(python: str, requirements: Sequence[Requirement]) -> str:
 
 
 def checkout() -> str | None:
-    """Folder of the checkout from which the program runs; None if it runs from an installed wheel."""
+    """Folder of the running checkout; None if the program runs from an installed wheel."""
     try:
         origin = metadata.distribution(DISTRIBUTION).read_text("direct_url.json")
     except metadata.PackageNotFoundError:
@@ -86,7 +86,7 @@ def checkout() -> str | None:
 
 
 def not_installed(what: str, extra: str) -> NotInstalledError:
-    """The error of a missing library: what it is, the extra that brings it, and the command that installs that."""
+    """Error of a missing library: its name, its extra, and the command that installs it."""
     folder = checkout()
     if folder is not None:
         command = f"cd {shlex.quote(folder)} && python3 -m monstertruckd.bootstrap sync"

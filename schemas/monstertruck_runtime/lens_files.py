@@ -135,7 +135,7 @@ def _kalibr(row: Mapping[str, Any], file: Path) -> LensConfig:
 def _matrices(
     data: Mapping[str, Any], matrix: str, coefficients: str, file: Path, size: tuple[int, int] | None
 ) -> LensConfig:
-    """Of ROS or OpenCV: a matrix of nine numbers, and coefficients."""
+    """Intrinsics of ROS or OpenCV: a matrix of nine numbers, and coefficients."""
     numbers = _floats(_numbers(data[matrix]), 9, matrix, file)
     fx, skew, cx, a, fy, cy, b, c, one = numbers
     if (skew, a, b, c, one) != (0.0, 0.0, 0.0, 0.0, 1.0):

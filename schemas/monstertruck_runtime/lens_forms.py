@@ -1,10 +1,10 @@
-"""Names of the forms in which camera intrinsics are written; light, for the command line."""
+"""Names of the file formats of camera intrinsics; light, for the command line."""
 
 from enum import StrEnum
 
 
 class LensForm(StrEnum):
-    """Forms in which camera intrinsics are written."""
+    """File formats of camera intrinsics."""
 
     CONFIG = "config"
     ROS = "ros"

@@ -20,7 +20,7 @@ class Delivery:
 
 
 def latest() -> Delivery:
-    """Only the newest message waits; older ones are superseded, which is no loss."""
+    """Only the latest message waits; older ones are superseded and do not count as lost."""
     return Delivery(1, counted=False)
 
 
@@ -35,7 +35,7 @@ class Mailbox(Generic[M]):
     """Subscription of one reader; iterate it, or await ``next()``.
 
     Args:
-        delivery: what waits while the reader is busy.
+        delivery: queueing of messages while the reader is busy.
         on_close: called once when the mailbox is closed.
     """
 
@@ -51,7 +51,7 @@ class Mailbox(Generic[M]):
 
     @property
     def latest(self) -> M | None:
-        """Newest message, or None before the first; reading it consumes nothing."""
+        """Latest message, or None before the first; reading it consumes nothing."""
         return self._latest
 
     @property
@@ -92,14 +92,14 @@ class Mailbox(Generic[M]):
         return self._unread.popleft()
 
     async def next_within(self, seconds: float, take: Callable[[M], bool] | None = None) -> M | None:
-        """As ``next``, or None if nothing comes within ``seconds``.
+        """Return as ``next``, or None if nothing comes within ``seconds``.
 
         A timer costs much less than a deadline, which has to cancel its task, and ``take`` much less than a wake-up.
 
         Args:
             seconds: limit.
-            take: gets a message that comes during the wait at once, in its writer's own callback; if it says True the
-                wait goes on, and the message counts as read.
+            take: gets a message that comes during the wait at once, in its writer's own callback; if it returns True
+                the wait continues, and the message counts as read.
 
         Raises:
             RuntimeError: as ``next``.
@@ -145,7 +145,7 @@ class Mailbox(Generic[M]):
     def _offer(self, message: M, reader: "asyncio.Future[bool]", take: Callable[[M], bool]) -> None:
         try:
             taken = take(message)
-        except Exception as bug:  # noqa: BLE001  # the reader's, not the writer's
+        except Exception as bug:  # noqa: BLE001  # the reader fails, not the writer
             reader.set_exception(bug)
         else:
             if taken:

@@ -1,6 +1,6 @@
 """Occupancy maps in the map_server format: one YAML file that names one image.
 
-The array's convention differs from the image's: row 0 is the lowest y, so cell (row, column) covers
+Unlike in the image, row 0 of the array is the lowest y, so cell (row, column) covers
 ``origin + resolution * ([column, column + 1], [row, row + 1])``.
 """
 
@@ -75,7 +75,7 @@ class WorldMap:
 
 
 def load_map(path: Path) -> WorldMap:
-    """Read a map_server YAML file and the image it names, or the newest whole save in the folder of a map.
+    """Read a map_server YAML file and its image, or the latest whole save in the folder of a map.
 
     Cells have the values that nav2's map_server publishes. With p = darkness in 0..1 (lightness if ``negate``),
     p > occupied_thresh is occupied, p < free_thresh free, the rest unknown. ``mode: scale`` spreads the rest over
@@ -97,7 +97,7 @@ def load_map(path: Path) -> WorldMap:
 
 
 def load_saved(save: MapSave) -> WorldMap:
-    """Read the grid of an open save; its remarks are among those of the map.
+    """Read the grid of an open save; its remarks join the map's.
 
     Raises:
         InputError: see ``load_map``.
@@ -128,7 +128,7 @@ def _load(path: Path) -> WorldMap:
 
 
 def files_of(place: Path) -> list[Path]:
-    """Return the files that ``load_map`` needs of a map: those of the newest whole save, or YAML and image.
+    """Return the files of a map that ``load_map`` needs: the latest whole save, or YAML and image.
 
     An image that the YAML names by an absolute path stays where it is, and is left out.
 

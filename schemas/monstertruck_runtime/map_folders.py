@@ -1,9 +1,9 @@
-"""Folders of saved maps: every save is a folder of its own, whole or not there at all.
+"""Folders of saved maps: every save is a separate folder, whole or absent.
 
 ``saves/NNNNNN`` below a map's folder holds one save: grid, pose graph, ground and points of interest, and a manifest
-with their checksums. It is written under another name, synced and renamed. What a writer does not replace is taken
-over from the save before, if both are of one run; another run makes another map, with another origin. Readers take
-the newest whole save.
+with their checksums. It is written under another name, synced and renamed. Files that a writer does not replace are
+taken over from the previous save of the same run; another run makes another map, with another origin. Readers take the
+latest whole save.
 
 Folders of earlier versions, and of other programs, hold their files without a manifest.
 """
@@ -32,7 +32,7 @@ from monstertruck_schemas.base import Schema
 YAML: Final = "map.yaml"
 """File of the grid, in map_server's format."""
 SAVES: Final = "saves"
-"""Folder of the saves in that of a map."""
+"""Folder of the saves in a map's folder."""
 MANIFEST: Final = "manifest.json"
 _NUMBER: Final = re.compile(r"\d{6,}")
 _LOOSE: Final = (YAML, "map.png", "graph.npz", "ground.npz", "points.json", "point-*.jpg")
@@ -47,7 +47,7 @@ class _SavedFile(Schema):
 
 
 class _Manifest(Schema):
-    """What a save holds."""
+    """Content of a save."""
 
     version: Literal[1] = 1
     run: str
@@ -65,7 +65,7 @@ class MapSave:
     remarks: tuple[str, ...] = ()
     """Newer saves that are damaged."""
     beside: Path | None = None
-    """Newest save of what was added to a map without a manifest."""
+    """Latest save of additions to a map without a manifest."""
 
     def file(self, name: str) -> Path:
         """Path of a file of the save, which need not be there."""
@@ -83,7 +83,7 @@ def folder_of(place: Path) -> Path | None:
 
 @contextmanager
 def opened(folder: Path) -> Iterator[MapSave]:
-    """Yield the newest whole save of a map's folder; it stays until the body ends.
+    """Yield the latest whole save of a map's folder; it stays until the body ends.
 
     Raises:
         InputError: all saves are damaged; names file and damage of each.
@@ -96,7 +96,7 @@ def opened(folder: Path) -> Iterator[MapSave]:
 
 
 def holds_map(folder: Path, run: str) -> bool:
-    """Whether the newest whole save of a grid is of this run."""
+    """Whether the latest whole save of a grid is of this run."""
     try:
         with opened(folder) as save:
             return save.run == run and save.file(YAML).exists()
@@ -107,7 +107,7 @@ def holds_map(folder: Path, run: str) -> bool:
 def write_save(
     folder: Path, parts: Mapping[str, bytes], owned: Sequence[str] = (), run: str | None = None, *, new: bool = True
 ) -> Path | None:
-    """Write a save with ``parts``, and with what the save before it holds and is not ``owned``.
+    """Write a save with ``parts``, and with the previous save's files that are not ``owned``.
 
     Once this returns, the save outlasts a power cut. The save before is kept, and one with the grid before.
 
@@ -122,7 +122,7 @@ def write_save(
         The folder of the save; None if there was nothing to write.
 
     Raises:
-        OSError: a file could not be written; the newest save is the one before.
+        OSError: a file could not be written; the previous save remains the latest.
     """
     saves = folder / SAVES
     make_folder(saves)
@@ -158,7 +158,7 @@ def write_save(
 
 
 def tidy(folder: Path) -> list[Path]:
-    """Remove and return what killed writers left in a map's folder.
+    """Remove and return leftovers of killed writers in a map's folder.
 
     Raises:
         OSError: it cannot be removed.
@@ -180,13 +180,13 @@ def _locked(saves: Path, how: int) -> Iterator[None]:
 
 
 def numbered_saves(saves: Path) -> list[Path]:
-    """Saves of a map in its folder of them, newest first; other entries of the folder are left out."""
+    """Saves in a map's folder of saves, latest first; other entries of the folder are left out."""
     found = (path for path in saves.iterdir() if _NUMBER.fullmatch(path.name))
     return sorted(found, key=lambda path: int(path.name), reverse=True)
 
 
 def _newest(folder: Path) -> MapSave:
-    """The newest whole save with a grid; without one, the newest whole save.
+    """Latest whole save with a grid; without one, the latest whole save.
 
     Raises:
         InputError: all are damaged.
@@ -211,7 +211,7 @@ def _newest(folder: Path) -> MapSave:
 
 
 def _run(folder: Path, run: str | None) -> str:
-    """``run``, or that of the map that is there."""
+    """``run``, or the run of the existing map."""
     if run is not None:
         return run
     try:
@@ -221,7 +221,7 @@ def _run(folder: Path, run: str | None) -> str:
 
 
 def _base(saves: Path, run: str) -> tuple[Path | None, Mapping[str, _SavedFile]]:
-    """Newest whole save of a run, and what it holds."""
+    """Latest whole save of a run, and its content."""
     for path in numbered_saves(saves):
         try:
             manifest = _check(path)
@@ -250,10 +250,10 @@ def _check(save: Path) -> _Manifest:
 
 
 def _manifest(save: Path) -> _Manifest:
-    """What a save should hold.
+    """Expected content of a save.
 
     Raises:
-        InputError: that is not known.
+        InputError: it is unknown.
     """
     path, expected = save / MANIFEST, "the manifest of a saved map"
     with reading(path, expected):
@@ -282,7 +282,7 @@ def _take_over(old: Path, new: Path) -> None:
 
 
 def _prune(saves: Path) -> None:
-    """Remove old saves: not the newest two, and not the newest of two grids that share no file."""
+    """Remove old saves, except the latest two and the latest of two grids that share no file."""
     grids = set[int]()
     for age, path in enumerate(numbered_saves(saves)):
         grid = {(path / YAML).stat().st_ino} if (path / YAML).exists() else set[int]()

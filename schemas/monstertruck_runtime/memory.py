@@ -11,7 +11,7 @@ _LIBRARY: Final = ctypes.CDLL(None)
 
 
 def settle() -> None:
-    """Declare that what is loaded now stays: the collector looks at it no more, and it moves into huge pages.
+    """Declare the loaded objects permanent: the collector skips them, and they move into huge pages.
 
     A full collection over it takes tens of milliseconds, again and again. And a loop that sleeps between short
     callbacks finds caches and address translation cold: fewer pages save it a few hundredths of its processor time.
@@ -28,7 +28,7 @@ def settle() -> None:
 
 
 def give_back() -> None:
-    """Return free pages to the system, also those between what is in use; the heap keeps them otherwise.
+    """Return free pages to the system, also between used ones; the heap keeps them otherwise.
 
     About a millisecond for 200 MB; nothing where the C library cannot (it is glibc's ``malloc_trim``).
     """

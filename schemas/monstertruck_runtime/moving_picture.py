@@ -11,18 +11,18 @@ from PIL import GifImagePlugin, Image, ImageChops
 from monstertruck_runtime.small_files import whole_file
 
 LONGEST_FRAME: Final = 65_535
-"""Hundredths of a second for which a picture can stand (GIF89a, 23: 16 bits)."""
+"""Maximum display time of a picture, hundredths of a second (GIF89a, 23: 16 bits)."""
 
 
 class MovingPicture:
     """Writes a GIF, as a whole or not at all; a context manager.
 
-    Only the newest picture is kept, and of each what differs from the one before.
+    Only the latest picture is kept, and the differences between pictures.
 
     Args:
         file: takes the place of an older one at the end; without a picture there is none.
-        seconds: for which a picture stands.
-        rest: for which the last one stands; None = as the others.
+        seconds: display time of a picture.
+        rest: display time of the last one; None for that of the others.
     """
 
     def __init__(self, file: Path, seconds: float, rest: float | None = None) -> None:

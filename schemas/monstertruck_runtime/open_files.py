@@ -26,7 +26,7 @@ def holders(targets: Collection[str], proc: Path = PROC) -> Iterator[str]:
 
 
 def _open_files(folder: Path) -> Iterator[str]:
-    """What a process has open; nothing of one that belongs to another user, or has ended."""
+    """Open files of a process; none if it belongs to another user, or has ended."""
     with suppress(OSError):
         for link in (folder / "fd").iterdir():
             with suppress(OSError):  # closed meanwhile

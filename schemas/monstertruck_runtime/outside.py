@@ -1,8 +1,8 @@
 """The door for files from outside: maps, pictures, arrays, tables, logs, certificates, files of earlier runs.
 
-A reader opens its file with one of the functions here, or does its work in ``reading``. Whatever fails then, in any
-library, becomes one of our refusals, which names the file, what was expected and what was found instead. Sizes are
-bounded before anything is decompressed or held.
+A reader opens its file with one of the functions here, or does its work in ``reading``. Any failure then, in any
+library, becomes one of our refusals, which names the file, the expectation and the finding. Sizes are bounded before
+anything is decompressed or held.
 """
 
 import gzip
@@ -37,11 +37,11 @@ QUOTED: Final = 200
 
 @contextmanager
 def reading(file: Path | str, expected: str, refusal: type[TruckError] = InputError) -> Iterator[None]:
-    """Turn whatever the body raises into a refusal of ``file``; our own errors pass.
+    """Turn any exception of the body into a refusal of ``file``; our own errors pass.
 
     Args:
         file: path, or path and place in it, as the user is to see it.
-        expected: what the file should be, e.g. "a pose graph".
+        expected: expected content, e.g. "a pose graph".
         refusal: class of the refusal.
     """
     try:
@@ -49,7 +49,7 @@ def reading(file: Path | str, expected: str, refusal: type[TruckError] = InputEr
     except TruckError:
         raise
     except OSError as error:
-        if error.errno is None:  # a library's, about the content
+        if error.errno is None:  # a library's error about the content
             raise refusal(f"{file}: expected {expected}: {cause_of(error)}") from error
         raise refusal(f"{file}: cannot be read: {error.strerror or error}") from error
     except Exception as error:
@@ -74,7 +74,7 @@ def contents(file: Path, expected: str, most: int, refusal: type[TruckError] = I
     """Read a whole file of at most ``most`` bytes.
 
     Raises:
-        TruckError: ``refusal``: it cannot be read, is no regular file, or is longer.
+        TruckError: ``refusal``: it cannot be read, is not a regular file, or is longer.
     """
     with reading(file, expected, refusal):
         require_file(file, most)
@@ -92,7 +92,7 @@ def text_of(file: Path, expected: str, most: int, refusal: type[TruckError] = In
 
 
 def text_from(data: bytes, file: Path, expected: str, refusal: type[TruckError] = InputError) -> str:
-    """Decode what was read from ``file``: UTF-8, with or without a byte order mark.
+    """Decode the content of ``file``: UTF-8, with or without a byte order mark.
 
     Raises:
         TruckError: ``refusal``: it is not UTF-8; names the line.
@@ -155,7 +155,7 @@ def _require_array(stream: Any, size: int) -> None:
     """Refuse the head of an array that does not fit into ``size`` bytes: NumPy would make room for it.
 
     Raises:
-        ValueError: it is no array, of objects, or too large.
+        ValueError: it is not an array, holds objects, or is too large.
     """
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

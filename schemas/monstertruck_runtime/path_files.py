@@ -25,7 +25,7 @@ from monstertruck_schemas.plan import MAX_POSES, Path
 Array = NDArray[np.float64]
 
 HEADER: Final = ("x", "y", "yaw", "direction")
-"""Columns of our own table; ``speed`` may follow."""
+"""Columns of our table format; ``speed`` may follow."""
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "x": ("x", "x_m"),
     "y": ("y", "y_m"),
@@ -51,13 +51,13 @@ def path_from(text: str, file: FilePath, *, closed: bool, frame: str = "odom", c
 
     Args:
         text: of the file.
-        file: its name; the suffix says whether it is a table or YAML.
+        file: its name; the suffix tells table from YAML.
         closed: the path is a lap.
         frame: of its poses.
         columns: names of a table's columns, which replace those in the file.
 
     Raises:
-        InputError: naming file and line, and what was expected.
+        InputError: naming file, line and expectation.
     """
     if _is_yaml(file):
         rows, curved = _waypoints(text, file)

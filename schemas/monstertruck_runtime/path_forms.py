@@ -1,10 +1,10 @@
-"""Names of the forms in which paths are written; light, for the command line."""
+"""Names of the file formats of paths; light, for the command line."""
 
 from enum import StrEnum
 
 
 class PathForm(StrEnum):
-    """Forms in which paths are written."""
+    """File formats of paths."""
 
     CSV = "csv"
     F1TENTH = "f1tenth"

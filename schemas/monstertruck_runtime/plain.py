@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 
 def plain(value: Any) -> Any:
-    """Return what JSON can carry: models and enums become plain, what is not finite becomes None.
+    """Return a JSON-compatible copy: models and enums become plain, non-finite numbers become None.
 
     Args:
         value: built of mappings, sequences, models, scalars.

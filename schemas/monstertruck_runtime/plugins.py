@@ -1,8 +1,8 @@
-"""Plug-ins: what a ``kind`` in the configuration stands for, from this repository or from another distribution.
+"""Plug-ins: implementations of each ``kind`` in the configuration, from this repository or another distribution.
 
 A catalog has one ``Plugin`` per kind. The settings model is light: it is loaded to check a configuration. The
 implementation is loaded on use, so that listing kinds, ``--help`` and a check of a configuration stay cheap. Other
-distributions add rows through entry points, each of which names a ``Plugin``::
+distributions add rows through entry points that name a ``Plugin``::
 
     [project.entry-points."monstertruck.trackers"]
     mine = "my_package.plugin:MINE"
@@ -43,7 +43,7 @@ class Plugin:
     settings: str
     """Place ``module:Class`` of its settings, a ``Schema`` with ``kind: Literal[name]``."""
     implementation: str
-    """Place ``module:Class`` of what does the work; the catalog's user says what it is called with."""
+    """Place ``module:Class`` of the implementation; the catalog's user defines its arguments."""
     doc: str
     """One line for lists."""
     extra: str | None = None
@@ -54,7 +54,7 @@ class Plugin:
         return cast("type[Schema]", load(self.settings))
 
     def implementation_class(self) -> Any:
-        """What does the work; loads its module.
+        """Implementation; loads its module.
 
         Raises:
             InputError: it does not load.
@@ -70,7 +70,7 @@ P = TypeVar("P", bound=Plugin)
 
 
 class Catalog(ExtensibleTable[P], Generic[P]):
-    """All plug-ins of one group by kind: ours in the order given, then those of other distributions.
+    """All plug-ins of one group by kind: ours in the order given, then plug-ins of other distributions.
 
     Settings models of other distributions are loaded with their entry points, ours on first use.
 
@@ -85,7 +85,7 @@ class Catalog(ExtensibleTable[P], Generic[P]):
         self._base, self._row_class = base, type(rows[0])
 
     def fault(self, row: Any) -> str | None:
-        """What is wrong with a row of another distribution."""
+        """Fault of a row of another distribution."""
         if not isinstance(row, self._row_class):
             return f"expected a {self._row_class.__name__}, found {type(row).__name__}"
         model: Any = row.settings_class()
@@ -124,7 +124,7 @@ class Catalog(ExtensibleTable[P], Generic[P]):
         For instance ``tracker: Annotated[TrackerConfig, TRACKERS.section()]``.
 
         Args:
-            default: kind of a section that names none; None = it has to.
+            default: kind of a section that names none; None if it is required.
         """
         return KindSection(self, default)
 

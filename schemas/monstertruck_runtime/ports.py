@@ -32,7 +32,7 @@ class Subscription(Protocol[M_co]):
 
     @property
     def latest(self) -> M_co | None:
-        """Newest message, or None before the first; reading it consumes nothing."""
+        """Latest message, or None before the first; reading it consumes nothing."""
 
     async def next(self) -> M_co:
         """Wait for a message not returned by ``next`` yet."""
@@ -42,13 +42,13 @@ class Subscription(Protocol[M_co]):
 
         Args:
             seconds: limit.
-            take: gets a message that comes during the wait at once, in its writer's own callback; if it says True the
-                wait goes on, and the message counts as read.
+            take: gets a message that comes during the wait at once, in its writer's own callback; if it returns True
+                the wait continues, and the message counts as read.
         """
 
 
 class EventSink(Protocol):
-    """Where a service reports what happened."""
+    """Sink of a service's events."""
 
     def __call__(self, reason: Reason, severity: Severity, source: str, text: str = "", **values: Value) -> None:
         """Publish one event."""
@@ -65,10 +65,10 @@ class BusPort(Protocol):
         """
 
     def subscribe(self, topic: Topic[M], delivery: Delivery) -> Mailbox[M]:
-        """A read end of ``topic``; of a retained topic it holds the newest message at once."""
+        """A read end of ``topic``; for a retained topic it holds the latest message at once."""
 
     def event_sink(self) -> EventSink:
-        """Where events go."""
+        """Sink of events."""
 
 
 Ready = Callable[[], None]
@@ -79,7 +79,7 @@ Handler = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 
 
 class RpcRegistry(Protocol):
-    """Where handlers of remote calls are registered."""
+    """Registry of remote calls."""
 
     def register(
         self, name: str, handler: Handler, role: AccessRole = AccessRole.PILOT, *, recorded: bool = True

@@ -1,4 +1,4 @@
-"""A client that waits for what a robot says later: meanwhile it may restart or fall silent, or a service of it fail."""
+"""Waiting for a robot's later message, while the robot may restart or fall silent, or a service may fail."""
 
 import asyncio
 from collections.abc import Awaitable
@@ -15,7 +15,7 @@ from monstertruck_schemas.topics import GATE, HEALTH
 T = TypeVar("T")
 
 GONE: Final = 2.0
-"""Seconds without the state of the gate, which comes ten times a second, after which a client that drives gives up."""
+"""Maximum gap in the state of the gate, sent ten times a second, before a driving client gives up (s)."""
 
 
 class Subscriber(Protocol):
@@ -26,7 +26,7 @@ class Subscriber(Protocol):
 
 
 async def while_it_runs(robot: Subscriber, work: Awaitable[T], needs: ServiceName) -> T:
-    """The result of ``work``, which waits for what the service ``needs`` of the robot's present run says.
+    """The result of ``work``, which waits for a message of the service ``needs`` of the robot's current run.
 
     Raises:
         RequestRefusedError: the service failed, or the robot restarted: its new run knows nothing of it.
@@ -47,7 +47,7 @@ async def while_it_runs(robot: Subscriber, work: Awaitable[T], needs: ServiceNam
 
 async def _until_gone(gate: Mailbox[GateState], health: Mailbox[HealthTable], needs: ServiceName) -> NoReturn:
     run: str | None = None
-    # Seconds without it after which a client that waits gives up: links that are lost for shorter come back, and the
+    # Maximum gap in it before a waiting client gives up: links that are lost for shorter come back, and the
     # robot drives on by itself meanwhile.
     lost = 60.0
     while (state := await gate.next_within(lost)) is not None:

@@ -1,4 +1,4 @@
-"""Recordings of a robot as files of whoever asks for them."""
+"""Downloads of a robot's recordings to local files."""
 
 import base64
 from collections.abc import Callable
@@ -13,23 +13,23 @@ from monstertruck_runtime.threads import in_thread
 async def fetch_recording(
     truck: TruckClient, name: str, to: Path, progress: Callable[[float], object], most: int | None = None
 ) -> int:
-    """Fetch a recording into a file, going on with what is there of it already; returns its size, bytes.
+    """Fetch a recording into a file, resuming an earlier part; return its size in bytes.
 
-    The robot says how fast.
+    The robot sets the rate.
 
     Args:
         truck: the robot.
         name: of the recording.
         to: file, made with the first bytes.
         progress: gets the share that is there, 0..1.
-        most: bytes of which it may be; None = any number.
+        most: maximum size, bytes; None for no limit.
 
     Raises:
         InputError: it is larger than that, or the file holds more than it, or something else.
         TruckError: the robot refuses, is not there, or has no such recording.
     """
     held = await in_thread(lambda: to.stat().st_size if to.exists() else 0)
-    at = max(held - 4096, 0)  # bytes of what is there that are compared with the robot's before more is added to them
+    at = max(held - 4096, 0)  # bytes of the earlier part that are compared with the robot's before resuming
     end = await in_thread(partial(_read, to, at)) if held else b""
     while True:
         answer = await truck.call("recording_read", {"name": name, "offset": at})

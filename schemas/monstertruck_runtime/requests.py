@@ -145,7 +145,7 @@ def register_numbered(
         name: of the call.
         model: of its payload.
         take: carries out the request.
-        kept: returns once the request outlasts a power cut; the call is answered then. None = nothing is kept.
+        kept: returns once the request outlasts a power cut; the call is answered then. None if nothing is kept.
     """
 
     async def call(payload: dict[str, Any]) -> dict[str, Any]:
@@ -158,17 +158,17 @@ def register_numbered(
 
 
 class Sequences:
-    """Newest sequence number of each source of one kind of requests.
+    """Latest sequence number of each source of one kind of requests.
 
-    A number counts only while a request may be on its way, for an older one is refused for its gate stamp: so one of
-    2^62 under somebody's name does not lock the owner of the name out.
+    A number counts only while a request may be on its way, for an older one is refused for its gate stamp: so a number
+    of 2^62 under another source's name does not lock that source out.
 
     Args:
         max_age: greatest age of a request's gate stamp, s.
     """
 
     def __init__(self, max_age: float = math.inf) -> None:
-        self._memory = max(max_age, 2.0) * SECOND  # seconds for which a sequence number counts at least
+        self._memory = max(max_age, 2.0) * SECOND  # minimum seconds that a sequence number is remembered
         self._newest: dict[str, tuple[int, int]] = {}
         """Number, and when it was accepted, ns."""
 
@@ -177,9 +177,9 @@ class Sequences:
 
         Args:
             request: what was asked.
-            nonce: what it must carry.
+            nonce: required nonce.
             now: ns.
-            keep: sources whose lease runs. They are not dropped (if all places are theirs, a new one is refused), and
+            keep: sources whose lease runs. They are not dropped (if they take all places, a new one is refused), and
                 their numbers make no leaps.
         """
         source = request.source
@@ -202,7 +202,7 @@ class Sequences:
 
 
 def crowded(known: Collection[str], source: str) -> Collection[str]:
-    """Sources of which one has to go for a new one, in the order of ``known``; empty if there is room.
+    """Sources that may be dropped for a new one, in the order of ``known``; empty if there is room.
 
     Args:
         known: names of sources.
@@ -226,7 +226,7 @@ def late_text(limit: float) -> str:
 
 
 def planner_request(seq: int, gate: GateState, now: int, source: str, lease: float, **motion: Any) -> DriveRequest:
-    """A planner's drive request to the gate that ``gate`` is the newest state of.
+    """A planner's drive request to the gate with the latest state ``gate``.
 
     Args:
         seq: of the publisher.
@@ -250,7 +250,7 @@ def planner_request(seq: int, gate: GateState, now: int, source: str, lease: flo
 
 
 def inner_request(seq: int, gate: GateState | None, now: int, source: str) -> dict[str, Any]:
-    """Header of a request that a service of the robot itself makes to another one, in place of an operator.
+    """Header of a request from one service of the robot to another, in place of an operator.
 
     Args:
         seq: grows from request to request.
@@ -295,7 +295,7 @@ def examine(request: Request, gate: GateState | None, sequences: Sequences, now:
 
 
 def does_not_drive(gate: GateState | None) -> RequestRefusedError:
-    """What to answer who asks a robot for motion that is not armed: what holds it most, and why in words."""
+    """Answer to a request for motion while the robot is not armed: main reason, and why in words."""
     if gate is None:
         return RequestRefusedError(Reason.DISARMED, f"the robot does not drive: {Reason.DISARMED.text}")
     return RequestRefusedError(gate.worst, f"the robot does not drive: {gate.why}")

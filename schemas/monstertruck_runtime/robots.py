@@ -1,4 +1,4 @@
-"""Robots that answer on this computer: which one is meant where no endpoint is named."""
+"""Robots that answer on this computer, to choose one if no endpoint is given."""
 
 import json
 from collections.abc import Callable
@@ -24,9 +24,9 @@ def robots_at(endpoint: str, timeout: float = 0.5) -> list[str]:  # timeout of a
 
 
 def robots_here(near: str = DEFAULT_ENDPOINT) -> list[tuple[str, str]]:
-    """Robots of this computer's daemons with their endpoints, that of ``near`` first; asking takes up to a second.
+    """Robots of this computer's daemons with their endpoints, ``near`` first; takes up to a second.
 
-    All are asked at once; those that require a certificate are named by what they announce.
+    All are queried at once; robots that require a certificate are listed by their announced names.
     """
     from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415 - most commands need no thread
 
@@ -38,11 +38,11 @@ def robots_here(near: str = DEFAULT_ENDPOINT) -> list[tuple[str, str]]:
 
 
 def only_robot(name: str | None, choice: Callable[[str, str], str]) -> str:
-    """Endpoint where none is named: the default port, unless several robots, or one of another port, could be meant.
+    """Endpoint if none is given: the default port, unless several robots, or one at another port, answer.
 
     Args:
-        name: of the robot; None if it is not named either.
-        choice: says in words how a robot is chosen, by its name and endpoint.
+        name: of the robot; None if it is not given either.
+        choice: describes the choice of a robot, by its name and endpoint.
 
     Raises:
         InputError: several robots could be meant, or none answers at the default port; lists those that answer.

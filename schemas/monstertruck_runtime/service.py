@@ -1,4 +1,4 @@
-"""Services, their supervision, and the nested scopes in which they live.
+"""Services, their supervision, and their nested scopes.
 
 A service's ``run`` owns ONE session: it opens its resource, calls ``ready()`` when it works, serves until
 cancelled, and raises when the session is lost. It never reconnects: ``supervise`` runs it again by a
@@ -6,7 +6,7 @@ cancelled, and raises when the session is lost. It never reconnects: ``supervise
 
 Scopes start outside-in and stop inside-out. ``asyncio.TaskGroup`` cancels its members at once and in arbitrary order,
 so the recorder could end before the last neutral command was written. Here a failing service only interrupts the owner
-of the scopes; then every scope ends its services, the newest first and each completely, before the scope around it
+of the scopes; then every scope ends its services, latest first and each completely, before the scope around it
 ends any.
 """
 
@@ -46,10 +46,10 @@ class Service(Protocol):
 
 
 class OnBug(StrEnum):
-    """What an unexpected exception in a service does."""
+    """Effect of an unexpected exception in a service."""
 
     EXIT = "exit"
-    """Gate, actuators, bridge to Zenoh: the process must not go on."""
+    """Gate, actuators, bridge to Zenoh: the process must end."""
     FAIL = "fail"
     """Any other: stop the truck through the gate, fail this service alone."""
 
@@ -61,13 +61,13 @@ class RestartPolicy(Schema):
     """Seconds before the first retry."""
     factor: Annotated[float, Field(ge=1)] = 1.6
     max_delay: Annotated[float, Field(gt=0)] = 1.0
-    """Greatest seconds between two tries: a replugged device is back within this time."""
+    """Maximum time between two attempts (s): a replugged device is back within this time."""
     jitter: Annotated[float, Field(ge=0, le=0.5)] = 0.1
     """Share of the delay that is drawn at random, so that devices of one hub do not start together."""
     settled_after: Annotated[float, Field(ge=0)] = 5.0
-    """Seconds of work after which the delay starts from the first one again."""
+    """Working time that resets the delay (s)."""
     budget: Annotated[int, Field(ge=1)] | None = None
-    """Restarts allowed within ``window`` seconds before the service is given up; None = never give up."""
+    """Restarts allowed within ``window`` seconds before the service is given up; None for no limit."""
     window: Annotated[float, Field(gt=0)] = 60.0
 
 
@@ -174,7 +174,7 @@ class _Session:
         self.starts = 0
         self.ready_at: int | None = None
         self._warned: set[Reason] = set()
-        """Causes of the present outage that were logged as warnings."""
+        """Causes of the current outage that were logged as warnings."""
 
     def start(self) -> None:
         self.starts += 1
@@ -226,7 +226,7 @@ class Scope:
         self._tasks.append(task)
 
     async def end(self) -> bool:
-        """End all services, newest first and each completely, whatever cancels the owner meanwhile.
+        """End all services, latest first and each completely, even if the owner is cancelled meanwhile.
 
         Returns:
             True if the owner was cancelled meanwhile by another task, which must still be informed.
@@ -256,10 +256,10 @@ class Scope:
 
 @asynccontextmanager
 async def scope(name: str) -> AsyncIterator[Scope]:
-    """Open a scope; on exit its services are cancelled one by one, newest first, each awaited.
+    """Open a scope; on exit its services are cancelled one by one, latest first, each awaited.
 
     Raises:
-        BaseExceptionGroup: what its services raised, with the body's own exception if it had one.
+        BaseExceptionGroup: exceptions of its services and of the body.
     """
     opened = Scope(name)
     raised: list[BaseException] = []

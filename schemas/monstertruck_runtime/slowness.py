@@ -1,10 +1,10 @@
-"""How slow may a computer be: on the virtual clock, a run takes the processor time that a slower one would.
+"""Slower computers on the virtual clock: a run takes the processor time of a slower computer.
 
-What the tasks of a service compute is measured turn by turn and moves the virtual time on by its processor time times a
-factor: timers that are due meanwhile fire late, as on that computer. A worker's result is delivered after its declared
-latency times the factor, or after its measured processor time times the factor, whichever is longer; workers have
-processors of their own. Such runs depend on this computer's speed, so no two are alike. Without a factor nothing is
-measured, and runs are reproducible.
+The processor time of each turn of a service's tasks is measured, and the virtual time advances by it times a factor:
+timers that are due meanwhile fire late, as on that computer. A worker's result is delivered after its declared latency
+times the factor, or after its measured processor time times the factor, whichever is longer; each worker has its own
+processor. Such runs depend on this computer's speed and are not reproducible. Without a factor nothing is measured, and
+runs are reproducible.
 
 Callbacks that belong to no task of a service (the links' bytes, the world) take no such time.
 """
@@ -26,7 +26,7 @@ BOARDS: Final[dict[Board, float]] = {"xu4": 5.0, "pi2": 20.0}
 0.9 GHz) against some 35 000 DMIPS of the reference computer's core."""
 
 _module: ContextVar[str | None] = ContextVar("module", default=None)
-"""The service that the present task works for; tasks inherit it from those that create them."""
+"""Service of the current task; tasks inherit it from their creators."""
 
 
 def factor_of(slowness: float | Board) -> float:
@@ -35,7 +35,7 @@ def factor_of(slowness: float | Board) -> float:
 
 
 class SlowComputer:
-    """A computer whose every core is ``factor`` times slower than this one's.
+    """A computer with cores ``factor`` times slower than this one.
 
     Args:
         clock: whose time is moved on; at most one slow computer per clock.

@@ -1,4 +1,4 @@
-"""Small files: those of /proc and /sys, which may be missing, and files that are replaced as a whole."""
+"""Small files: in /proc and /sys, where they may be missing, and files that are replaced as a whole."""
 
 import errno
 import fcntl
@@ -147,14 +147,14 @@ def sync_folder(folder: Path) -> None:
     try:
         os.fsync(handle)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # file systems without folders of their own, as those of some networks
+        if error.errno != errno.EINVAL:  # file systems without folders, such as some network file systems
             raise
     finally:
         os.close(handle)
 
 
 def remove_leftovers(folder: Path) -> list[Path]:
-    """Remove what killed writers left in a folder; files that are being written stay.
+    """Remove leftovers of killed writers from a folder; files that are being written stay.
 
     Returns:
         The files that were removed.
@@ -184,7 +184,7 @@ def remove_leftovers(folder: Path) -> list[Path]:
 
 @contextmanager
 def _scratch(place: Path) -> Iterator[tuple[int, Path]]:
-    """Yield a new, locked file beside ``place`` and its path; if it is not renamed, it is removed at the end."""
+    """Yield a new, locked file next to ``place`` and its path; if it is not renamed, it is removed at the end."""
     while True:
         handle, name = tempfile.mkstemp(dir=place.parent, prefix=f"{place.name}.", suffix=SCRATCH)
         scratch = Path(name)
@@ -205,8 +205,8 @@ def _scratch(place: Path) -> Iterator[tuple[int, Path]]:
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield where to write a file of any length: ``.part`` behind its name, which it takes once the body ends.
 
-    If the body fails, what it wrote is removed, and a file of that name stays as it was. File and folder are synced.
-    A failure of the system that names no file, as that of a full disk, is given the name of this one.
+    If the body fails, its output is removed, and an existing file of that name stays. File and folder are synced.
+    A system error without a file name, as for a full disk, is given this name.
 
     Raises:
         OSError: ``path`` is a folder, a device or the like, or cannot be replaced.

@@ -1,4 +1,4 @@
-"""Why a robot does not drive, as a client learns it: the gate's state says what holds it, events and stops what did."""
+"""Why a robot does not drive: the gate's state gives the current reason, events and stops its cause."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,19 +14,19 @@ from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import EVENT, GATE, STOP
 
 BEGINS: Final = frozenset({Reason.ARMED, Reason.DRIVING})
-"""Events after which what held the robot before is over."""
+"""Events that end an earlier reason to stand."""
 HELD: Final = frozenset({Reason.DISARMED, Reason.ESTOPPED})
-"""Reasons that do not say what led to them."""
+"""Reasons without a cause."""
 ENDS: Final = frozenset({Reason.DISARMED, Reason.FAULTS_REPEAT})
-"""Events of the gate whose text says who or what disarmed the robot."""
+"""Events of the gate whose text names the source or cause of a disarm."""
 
 
 class StandstillMonitor:
     """Follows one robot; see ``monitor_standstill``.
 
     Args:
-        gate: newest state of the gate.
-        stops: newest stop.
+        gate: latest state of the gate.
+        stops: latest stop.
         events: all events.
     """
 
@@ -35,13 +35,14 @@ class StandstillMonitor:
         self._stops = stops
         self._events = events
         self._since: int | None = None
-        """When it was armed or began to drive last, or was first seen to be armed, ns of its clock; None = never."""
+        """Time of the last arming or start of driving, or when it was first seen armed, ns of its clock; None if
+        never."""
         self._said: list[str] = []
 
     def why(self) -> str:
-        """Why the gate lets the robot not drive, with who or what disarmed it if that is known; nothing where it does.
+        """Why the gate does not let the robot drive, with the cause of a disarm if known; empty if it does.
 
-        To be called now and then while the robot drives, too.
+        Call it now and then while the robot drives, too.
         """
         held = self.gate.latest
         self._take()
@@ -55,7 +56,7 @@ class StandstillMonitor:
         return ", ".join(texts) or held.why
 
     def _cause(self, held: GateState) -> str:
-        """Who or what disarmed the robot or stopped it in an emergency; empty where that is not known."""
+        """Source or cause of the disarm or emergency stop; empty if unknown."""
         stop, estopped = self._stops.latest, held.mode is GateMode.ESTOPPED
         said = [] if estopped else self._said
         if stop is not None and (stop.mode is GateMode.ESTOPPED if estopped else self._after_it_began(stop)):
@@ -63,7 +64,7 @@ class StandstillMonitor:
         return "; ".join(dict.fromkeys(said))
 
     def _after_it_began(self, stop: Stop) -> bool:
-        """Whether it ended the newest driving: where something is in the way the robot stands, and its driver stays."""
+        """Whether it ended the latest driving: before an obstacle the robot stands, but its driver stays."""
         return self._since is not None and stop.stamp >= self._since and not stop.mode.accepts_motion
 
     def _take(self) -> None:
@@ -77,7 +78,7 @@ class StandstillMonitor:
 
 
 def _causes(stop: Stop) -> str:
-    """What tripped the gate, and what was behind it, without measurements."""
+    """Tripped check and its causes, without measurements."""
     return "; ".join(", because ".join(cause.text for cause in chain(stop.causes, head)) for head in heads(stop.causes))
 
 

@@ -26,7 +26,7 @@ class ClientTls:
     """Files of a station with its own certificate."""
 
     ca: Path
-    """Certificate of the authority that signed the robot's."""
+    """Certificate of the authority that signed the robot's certificate"""
     certificate: Path
     key: Path
 
@@ -50,7 +50,7 @@ class ClientTls:
 def station_tls(environment: Mapping[str, str] = os.environ) -> ClientTls:
     """The certificate of this user's station: ``ca.pem``, ``station.pem`` and ``station.key`` of one folder.
 
-    The folder is that of ``MONSTERTRUCKD_TLS``, else ``monstertruckd/tls`` in the user's configuration.
+    The folder is ``MONSTERTRUCKD_TLS``, else ``monstertruckd/tls`` in the user's configuration.
 
     Raises:
         NotFoundError: a file is missing.
@@ -68,7 +68,7 @@ def station_tls(environment: Mapping[str, str] = os.environ) -> ClientTls:
 
 
 def session_config(endpoint: str, timeout: float, tls: ClientTls | None) -> dict[str, Any]:
-    """Of a Zenoh session that dials one endpoint, and neither listens nor discovers.
+    """Configuration of a Zenoh session that dials one endpoint, and neither listens nor discovers.
 
     Args:
         endpoint: of the robot.
@@ -94,16 +94,16 @@ def session_config(endpoint: str, timeout: float, tls: ClientTls | None) -> dict
 
 
 def link_refusal(endpoint: str, ca: Path, tls: ClientTls | None, timeout: float) -> str:
-    """Why a ``tls/...`` link is refused, by this side or the other, which Zenoh does not say; empty if it is not.
+    """Why this or the other side refuses a ``tls/...`` link, which Zenoh does not report; empty if it is accepted.
 
     Args:
         endpoint: of the robot.
-        ca: certificate of the authority that signed the robot's.
-        tls: this station's; None = without.
+        ca: certificate of the robot's authority.
+        tls: certificate of this station, or None.
         timeout: seconds for each step.
 
     Raises:
-        OSError: nobody listens there, or the files cannot be used.
+        OSError: no process listens there, or the files cannot be used.
     """
     import ssl  # noqa: PLC0415 - only for certificates
 

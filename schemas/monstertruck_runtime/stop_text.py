@@ -1,4 +1,4 @@
-"""Why the truck was stopped, in words: for the gate, the command line and stations alike."""
+"""Why the truck was stopped, in words: for gate, command line and stations."""
 
 from collections.abc import Iterator, Sequence
 
@@ -7,7 +7,7 @@ from monstertruck_schemas.event import Cause, Measurement, Stop
 
 
 def causes_text(causes: Sequence[Cause], now: int) -> str:
-    """All causes in one line, each followed by what was behind it.
+    """All causes in one line, each followed by its own causes.
 
     Args:
         causes: as in ``Stop``.
@@ -19,11 +19,11 @@ def causes_text(causes: Sequence[Cause], now: int) -> str:
 
 
 def stop_lines(stop: Stop, now: int) -> list[str]:
-    """The stop in a few lines: what and when, then the causes, each indented below what it led to.
+    """The stop in a few lines: what and when, then the causes, each indented below its effect.
 
     Args:
-        stop: the newest message of its number.
-        now: the robot's time, ns, e.g. the stamp of its newest gate state.
+        stop: the latest message of its number.
+        now: the robot's time, ns, e.g. the stamp of its latest gate state.
     """
     how = "quick stop" if stop.quick else "stop"
     speed = "" if stop.speed is None else f" at {abs(stop.speed):.2f} m/s"
@@ -38,13 +38,13 @@ def stop_lines(stop: Stop, now: int) -> list[str]:
 
 
 def heads(causes: Sequence[Cause]) -> list[Cause]:
-    """The causes that tripped the gate themselves: those that are behind no other one."""
+    """Causes that tripped the gate directly: causes of no other cause."""
     deeper = {cause.because for cause in causes}
     return [cause for index, cause in enumerate(causes) if index not in deeper]
 
 
 def chain(causes: Sequence[Cause], head: Cause) -> Iterator[Cause]:
-    """``head`` and what was behind it, link by link; indices that lead nowhere or back end it."""
+    """``head`` and its causes, link by link; indices that lead nowhere or back end it."""
     left = len(causes)
     cause = head
     while True:

@@ -17,7 +17,7 @@ def read_table(file: Path, expected: str, most: int) -> list[tuple[int, list[str
     semicolon and tab that the first row has most of.
 
     Raises:
-        InputError: it cannot be read, is too long, is not UTF-8, or is no table; names the line where there is one.
+        InputError: it cannot be read, is too long, is not UTF-8, or not a table; names the line if there is one.
     """
     return rows_of(text_of(file, expected, most), file, expected)
 
@@ -26,7 +26,7 @@ def rows_of(text: str, file: Path, expected: str) -> list[tuple[int, list[str]]]
     """Return the rows of a table's text; see ``read_table``.
 
     Raises:
-        InputError: it is no table; names the line.
+        InputError: it is not a table; names the line.
     """
     rows = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if _counts(line)]
     delimiter = max(DELIMITERS, key=rows[0][1].count) if rows else DELIMITERS[0]

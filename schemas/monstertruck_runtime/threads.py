@@ -67,7 +67,7 @@ class ThreadHop(Generic[T]):
         return len(self._items)
 
     def close(self) -> None:
-        """Discard what waits and everything to come; to be called while the loop lives."""
+        """Discard waiting and later items; call it while the loop lives."""
         self._closed = True
 
     def _make_room(self) -> None:
@@ -123,7 +123,7 @@ async def in_thread(function: Callable[[], T]) -> T:
     try:
         return await asyncio.shield(work)
     except asyncio.CancelledError:
-        await asyncio.gather(work, return_exceptions=True)  # nobody is left to report an error to
+        await asyncio.gather(work, return_exceptions=True)  # no reader is left to report an error to
         raise
 
 
@@ -151,7 +151,7 @@ async def inline(function: Callable[[], T]) -> T:
 
 
 class Offload(Protocol):
-    """Where blocking work is done: ``in_thread``, or ``inline`` on the virtual clock."""
+    """Runner of blocking work: ``in_thread``, or ``inline`` on the virtual clock."""
 
     def __call__(self, function: Callable[[], T], /) -> Awaitable[T]:
         """Run ``function`` and wait for its result."""

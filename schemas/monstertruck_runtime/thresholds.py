@@ -24,7 +24,7 @@ class Dwell:
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """Where an alarm begins and ends; ``clear < set`` watches for too much, ``clear > set`` for too little."""
+    """Limits that set and clear an alarm; ``clear < set`` watches for too much, ``clear > set`` for too little."""
 
     set: float
     clear: float
@@ -33,10 +33,10 @@ class Threshold:
 
 
 class ThresholdAlarm:
-    """On and off with hysteresis and dwell.
+    """Switch with hysteresis and dwell.
 
     Args:
-        threshold: when.
+        threshold: limits and dwell times.
     """
 
     def __init__(self, threshold: Threshold) -> None:

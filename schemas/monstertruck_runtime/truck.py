@@ -35,11 +35,11 @@ WAIT: Final = 5.0
 
 
 class Truck:
-    """Session with one robot, over a ``TruckClient`` on an event loop in a thread of its own.
+    """Session with one robot, over a ``TruckClient`` on an event loop in a separate thread.
 
     A context manager; without ``with`` it opens at the first call, and closes with ``close()``, when nothing refers to
-    it any longer, or at the program's end. Calls may come from any thread; those of others that still wait when it is
-    closed raise ``RuntimeError``, and so does a call in a process that was forked from this one: open another there.
+    it any longer, or at the program's end. Calls may come from any thread; calls of other threads that still wait at
+    its close raise ``RuntimeError``, and so does a call in a process that was forked from this one: open another there.
     Ctrl-C during ``goto`` cancels the goal.
 
     Args:
@@ -73,16 +73,16 @@ class Truck:
         self.close()
 
     def close(self) -> None:
-        """End the session; the next call opens another one."""
+        """End the session; the next call opens a new one."""
         with self._lock:
             finalizer, self._finalizer, self._loop = self._finalizer, None, None
         if finalizer is not None:
             finalizer()
 
-    # What the robot says
+    # Messages of the robot
 
     def get(self, topic: Topic[M], timeout: float = WAIT) -> M:
-        """The newest message of ``topic``: of a retained one what there is, of others the next.
+        """Latest message of ``topic`` if it is retained, else the next one.
 
         Raises:
             NoAnswerError: none within ``timeout`` s.
@@ -91,7 +91,7 @@ class Truck:
             return next(messages)
 
     def stream(self, topic: Topic[M], timeout: float = WAIT, depth: int = 256) -> "MessageStream[M]":
-        """Messages of ``topic`` one after the other, to iterate; up to ``depth`` wait, then the oldest is lost.
+        """Iterator over messages of ``topic``; up to ``depth`` wait, then the oldest is lost.
 
         Iterating raises ``NoAnswerError`` if none comes within ``timeout`` s.
         """
@@ -139,7 +139,7 @@ class Truck:
             y: m.
             yaw: rad.
             via: places to pass, x, y and optionally yaw.
-            arm: arm the truck as well; it drives off at once. Otherwise somebody else has to.
+            arm: arm the truck as well; it drives off at once. Otherwise another client has to arm it.
 
         Raises:
             RequestRefusedError: the goal or the arming was refused, or the goal was given up; carries the reason.

@@ -26,7 +26,7 @@ class _BoundedComposer(Composer):
     Args:
         loader: of the document.
         most: nodes.
-        expand: count what is behind an alias each time; otherwise the reader bounds it.
+        expand: count the target of an alias each time; otherwise the reader bounds it.
     """
 
     def __init__(self, loader: Any = None, *, most: int, expand: bool) -> None:

@@ -58,7 +58,7 @@ class Schema(BaseModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        """With the fields' docstrings as their descriptions."""
+        """Schema with the fields' docstrings as descriptions."""
         found = handler(schema)
         properties = handler.resolve_ref_schema(found).get("properties", {})
         for name, text in field_docs(cls).items():
@@ -76,7 +76,7 @@ class Schema(BaseModel):
 
 
 def first_mistake(error: ValidationError, *before: str) -> str:
-    """Key and text of the first mistake in what was validated; ``before`` are the keys that lead there."""
+    """Key and text of the first validation error; ``before`` are the keys that lead there."""
     detail = error.errors(include_url=False)[0]
     where = ".".join(map(str, (*before, *detail["loc"])))
     text = detail["msg"].removeprefix("Value error, ")
@@ -84,9 +84,9 @@ def first_mistake(error: ValidationError, *before: str) -> str:
 
 
 def field_docs(model: type[BaseModel]) -> dict[str, str]:
-    """What each field means: its description, or the docstring behind it.
+    """Description of each field, or the docstring behind it.
 
-    Read from the source when somebody asks: pydantic's ``use_attribute_docstrings`` does so whenever a model is
+    Read from the source on demand: pydantic's ``use_attribute_docstrings`` does so whenever a model is
     defined, which takes a third of the start of every process.
     """
     found: dict[str, str | None] = {}
@@ -209,7 +209,7 @@ def _array_type(dtype: type[np.generic], json_item: str, size: int | None = None
 Float64Array = Annotated[NDArray[np.float64], *_array_type(np.float64, "number")]
 """Read-only float64 array; JSON: list of numbers. May hold +inf for "no return" only where stated."""
 Covariance = Annotated[NDArray[np.float64], *_array_type(np.float64, "number", 9)]
-"""Shape (9,): that of three values, row-major."""
+"""Covariance of three values, shape (9,), row-major."""
 UInt8Array = Annotated[NDArray[np.uint8], *_array_type(np.uint8, "integer")]
 Int8Array = Annotated[NDArray[np.int8], *_array_type(np.int8, "integer")]
 

@@ -1,4 +1,4 @@
-"""What is printed for cameras: the board by which they are calibrated, and colours of discs that robots carry."""
+"""Prints for cameras: the calibration board, and the colours of discs that robots carry."""
 
 from typing import Annotated, Literal, Self
 

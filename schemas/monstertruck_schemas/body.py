@@ -1,8 +1,8 @@
-"""Which robot it is, for the daemon's configuration and for the simulated world's: drive families by ``kind``.
+"""The robot's body, for the configurations of daemon and simulated world: drive families by ``kind``.
 
 Lengths that every robot has (wheelbase, track, wheel radius, gear ratio) are in ``geometry``. Requests are the twist of
-the base, or its speed and two axle angles; a body without axles is then driven as the bicycle of its ``wheelbase`` that
-moves alike. ``devices.drive`` is its first driven shaft, ``drive_2`` to ``drive_4`` are the others, in this order.
+the base, or its speed and two axle angles; a body without axles is then driven as the bicycle of its ``wheelbase`` with
+the same motion. ``devices.drive`` is its first driven shaft, ``drive_2`` to ``drive_4`` are the others, in this order.
 """
 
 import math
@@ -51,7 +51,7 @@ class LensConfig(Schema):
     focal_y: Annotated[float, Field(gt=10, le=20_000)] = 522.2
     """Pixels"""
     centre_x: Annotated[float, Field(ge=0, le=8192)] = 319.5
-    """Where the axis meets the picture; the middle of the first pixel is 0"""
+    """Principal point; the middle of the first pixel is 0"""
     centre_y: Annotated[float, Field(ge=0, le=8192)] = 239.5
     """Pixels"""
     k1: Coefficient = 0.0
@@ -73,11 +73,11 @@ class BodyConfig(Schema):
 
 
 class TurnDeficitConfig(Schema):
-    """What the axles turn less than their linkage says; dimensionless, 0 = as it says.
+    """Turn that the axles lack compared with their linkage; dimensionless, 0 for none.
 
-    The tangent t of an axle angle becomes t (1 - c t^2), with a coefficient c for each axle and the side to which its
-    wheels are turned; where the axles oppose each other, the turn becomes turn (1 + c t_front t_rear), with a
-    coefficient for each side to which the body turns.
+    The tangent t of an axle angle becomes t (1 - c t^2), with a coefficient c for each axle and steering side; where
+    the axles oppose each other, the turn becomes turn (1 + c t_front t_rear), with a coefficient for each direction of
+    turn.
     """
 
     front_left: Coefficient = 0.0
@@ -139,7 +139,7 @@ class SkidSteerBody(BodyConfig):
     motors: Literal["sides", "wheels"] = "sides"
     """One for each side, or for each wheel: front left, front right, rear left, rear right"""
     icr_left: float | None = None
-    """Lateral position of the left side's turning centre, m; default half the track, which is no skidding at all"""
+    """Lateral position of the left side's turning centre, m; default half the track, i.e. without skidding"""
     icr_right: float | None = None
     """Lateral position of the right side's turning centre, m"""
     icr_x: float = 0.0

@@ -1,4 +1,4 @@
-"""Messages of the ``cmd`` group: what the gate, and only the gate, sent to the actuators."""
+"""Messages of the ``cmd`` group: commands to the actuators, sent only by the gate."""
 
 from enum import StrEnum
 
@@ -6,7 +6,7 @@ from monstertruck_schemas.base import Message, servos_of
 
 
 class DriveAction(StrEnum):
-    """What the drive controller has to do."""
+    """Command to the drive controller."""
 
     DISABLE = "disable"
     """Power stage off: the motor coasts."""
@@ -36,9 +36,9 @@ class SteeringCommand(Message):
     """Servo angle, rad, left positive, 0 = straight ahead."""
     rear_servo: float
     front_right_servo: float | None = None
-    """Where every wheel has its own servo: the front right wheel's; ``front_servo`` is the front left one's."""
+    """Servo of the front right wheel, if every wheel has one; ``front_servo`` is then the front left one."""
     rear_right_servo: float | None = None
-    """The rear right wheel's; ``rear_servo`` is the rear left one's."""
+    """Servo of the rear right wheel; ``rear_servo`` is then the rear left one."""
     deadman: bool = True
     """Level of the deadman line, where it is wired: False stops the motor without a word to its controller."""
 

@@ -1,6 +1,6 @@
 """Tables that other installed distributions extend through entry points.
 
-An entry point that is broken is named and left out: it never keeps the robot from starting.
+A broken entry point is reported and skipped: it never keeps the robot from starting.
 """
 
 import importlib.metadata
@@ -11,7 +11,7 @@ from functools import cache, cached_property
 from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
 OURS: Final = "monstertruckd"
-"""Origin of what is in this repository."""
+"""Origin of rows in this repository."""
 
 
 class Named(Protocol):
@@ -19,7 +19,7 @@ class Named(Protocol):
 
     @property
     def name(self) -> str:
-        """By which it is found."""
+        """Name in the table."""
 
 
 R = TypeVar("R", bound=Named)
@@ -46,7 +46,7 @@ class _Read(NamedTuple):
 
 
 class ExtensibleTable(Mapping[str, R]):
-    """Rows by name: ours in the order given, then those of other distributions, which are read on first use.
+    """Rows by name: ours in the order given, then rows of other distributions, read on first use.
 
     Each entry point has the name of the row that it points to.
 
@@ -61,7 +61,7 @@ class ExtensibleTable(Mapping[str, R]):
 
     @abstractmethod
     def fault(self, row: Any) -> str | None:
-        """What is wrong with a row of another distribution, None if nothing is; it may raise as well."""
+        """Fault of a row of another distribution, or None; it may raise as well."""
 
     @cached_property
     def _read(self) -> _Read:

@@ -35,7 +35,7 @@ class Call(Message):
     """A remote call that was answered: who asked for what, and the answer."""
 
     name: str
-    """What was called, e.g. ``goal``."""
+    """Name of the call, e.g. ``goal``."""
     source: str
     """Who called, by the key."""
     payload: str
@@ -43,7 +43,7 @@ class Call(Message):
     reason: Reason
     """``ok``, or why it was refused."""
     answer: str
-    """JSON object, or the text of the refusal; cut likewise."""
+    """JSON object, or the text of the refusal; cut to the same length."""
 
 
 CALL_TEXT = 4096
@@ -55,11 +55,11 @@ class Measurement(Schema):
 
     name: str
     value: float | None = None
-    """None = never measured, or beyond what can be measured."""
+    """None if never measured, or out of range."""
     unit: str = ""
     """SI unit; empty for plain numbers."""
     limit: float | None = None
-    """Where it begins to count, in the same unit."""
+    """Threshold, in the same unit."""
     age: float | None = None
     """Seconds from the measurement to the stop."""
 
@@ -75,11 +75,11 @@ class Cause(Schema):
     text: str
     measurements: tuple[Measurement, ...] = ()
     because: Annotated[int, Field(ge=0)] | None = None
-    """Index of the cause behind this one; None = nothing deeper is known."""
+    """Index of the cause behind this one; None if unknown."""
 
 
 class Stop(Message):
-    """Why the gate stopped the truck: what tripped, since when, by which measurements, and what was behind it.
+    """Cause of a stop by the gate: the tripped checks with start and measurements, and the causes behind them.
 
     ``stamp`` is the moment of the stop. A cause behind it that becomes known a little later (a lost hub is judged once
     all its devices are gone) is added by a second message of the same ``number``.
@@ -99,13 +99,13 @@ class Stop(Message):
     """Source that was driving."""
     role: Role | None = None
     speed: float | None = None
-    """Measured speed when it began, m/s; None = not known."""
+    """Measured speed at its start (m/s); None if unknown."""
     stopping_distance: float = 0.0
     """Metres the truck was still expected to travel."""
     causes: Annotated[tuple[Cause, ...], Field(min_length=1)]
-    """First what tripped the gate, worst first, then what was behind it."""
+    """Tripped checks, worst first, then the causes behind them."""
     black_box: str | None = None
-    """Name of the file that will hold the minute before; None = none is written."""
+    """Name of the black-box file that will hold the minute before; None if none is written."""
     text: str
     """All of it in one line."""
 

@@ -38,19 +38,19 @@ class HealthTable(Message):
 
 
 class CalibrationState(Schema):
-    """What one wizard measured, how well, and until when it counts."""
+    """Calibration by one wizard: value, quality and expiry."""
 
     wizard: str
     grade: Literal["A", "B", "C"]
     """Grade by the width of its intervals: A within the goal, B at most twice as wide, C wider."""
     date: str
-    """Date of the newest measurement, UTC."""
+    """Date of the latest measurement, UTC."""
     until: str
-    """Day until which it counts, UTC."""
+    """Last valid day, UTC."""
     metres_left: float | None = None
     """Distance that may be driven until it expires, m; None: not limited."""
     expired: str = ""
-    """Why it no longer counts; empty while it does."""
+    """Reason for its expiry; empty while it is valid."""
 
 
 class CalibrationHealth(Message):
@@ -60,7 +60,7 @@ class CalibrationHealth(Message):
     odometer: float = 0.0
     """Total distance driven, m."""
     proposed: str = ""
-    """Calibration that a tracker proposes and nobody has accepted, in a sentence; empty if there is none."""
+    """Calibration proposed by a tracker and not accepted yet, as a sentence; empty if none."""
 
 
 class LoopHealth(Message):
@@ -77,13 +77,13 @@ class LoopHealth(Message):
     @property
     def busy(self) -> str:
         """That the daemon gets too little processor time, in words; empty while ticks are less than 20 ms late."""
-        if self.lateness_p99 <= 0.02:  # lateness of the control tick that counts as late, s: a whole period
+        if self.lateness_p99 <= 0.02:  # threshold of a late control tick, s: a whole period
             return ""
         return f"the computer is busy: control ticks come {self.lateness_p99 * 1e3:.0f} ms late; end other programs"
 
 
 class RecorderHealth(Message):
-    """What the recorder wrote."""
+    """Recorder status."""
 
     recording: bool
     path: str | None = None
@@ -115,9 +115,9 @@ class LocalisationStatus(StrEnum):
     LOST = "lost"
     """Scans have not fitted for a while: the pose is odometry."""
     SEARCHING = "searching"
-    """Where on the saved map this is, is being searched for; the pose means nothing."""
+    """The position on the saved map is being searched for; the pose is meaningless."""
     OUTSIDE = "outside"
-    """What is seen fits no place of the saved map: the robot is outside it. The search goes on."""
+    """Scans fit no place of the saved map: the robot is outside it. The search continues."""
 
 
 UNCERTAIN_DEVIATION: Final = 0.1
@@ -128,7 +128,7 @@ PLACELESS: Final = frozenset({LocalisationStatus.SEARCHING, LocalisationStatus.O
 MATCHED: Final = frozenset(LocalisationStatus) - PLACELESS - {LocalisationStatus.LOST}
 """States in which the robot is on the map."""
 NO_PLACE: Final = PLACELESS | {LocalisationStatus.LOST}
-"""States in which no place is to be derived from it."""
+"""States whose pose must not be used for places."""
 
 
 class OdometryUse(StrEnum):
@@ -140,11 +140,11 @@ class OdometryUse(StrEnum):
     MISSING = "missing"
     """No finite odometry at the scans for a second: scans alone."""
     CONTRADICTED = "contradicted"
-    """The motion by the scans is another one: scans alone, until both agree again."""
+    """Scans contradict it: scans alone, until both agree again."""
 
 
 class SlamHealth(Message):
-    """How well the newest scan fitted the map, and what has happened since the start."""
+    """Fit of the latest scan to the map, and counts since the start."""
 
     standing: LocalisationStatus
     accepted: bool
@@ -154,7 +154,7 @@ class SlamHealth(Message):
     residual: Annotated[float, Field(ge=0)]
     """Root mean square distance of those across the surfaces, m."""
     degeneracy: Annotated[float, Field(ge=0)]
-    """Smaller over greater eigenvalue of what the scan knows of the position; near 0 in a corridor."""
+    """Ratio of the eigenvalues of the scan's position information, smaller over larger; near 0 in a corridor."""
     direction: float
     """Yaw in map along which it knows least, rad."""
     scans: Annotated[int, Field(ge=0)] = 0
@@ -170,12 +170,12 @@ class SlamHealth(Message):
     drops: Annotated[int, Field(ge=0)] = 0
     """Scans lost because the worker was too slow."""
     offset: float | None = None
-    """Seconds by which odometry runs ahead of the scans, if it clearly does."""
+    """Lead of odometry over the scans (s), if significant."""
     odometry: OdometryUse = OdometryUse.NONE
 
 
 class OdometryHealth(Message):
-    """What the odometry of ``kind: fusion`` may rely on; published on change and once a second."""
+    """Sensors available to odometry of ``kind: fusion``; published on change and once a second."""
 
     slipping: bool
     """The wheels do not hold the ground: they hardly count."""
@@ -194,7 +194,7 @@ class OdometryHealth(Message):
 
 
 class LinkMedium(StrEnum):
-    """What a network interface is."""
+    """Kind of network interface."""
 
     WIFI = "wifi"
     ETHERNET = "ethernet"
@@ -217,13 +217,13 @@ class LinkHealth(Message):
     """Quality of the network link; that a station is lost shows by its silence, never here."""
 
     interface: str | None = None
-    """Interface that was judged; None = there is none."""
+    """Checked interface, or None."""
     medium: LinkMedium | None = None
     level: LinkLevel
     signal: float | None = None
     """Smoothed signal level, dBm; None on a cable or while disconnected."""
     raw_signal: float | None = None
-    """Newest sample, dBm."""
+    """Latest sample (dBm)."""
     noise: float | None = None
     """Noise level, dBm, where the driver knows it."""
     bit_rate: float | None = None
@@ -237,7 +237,7 @@ class LinkHealth(Message):
 
 
 class HostHealth(Message):
-    """State of the computer the daemon runs on; None = not available."""
+    """State of the daemon's computer; None if not available."""
 
     load: float
     """Mean number of runnable processes over the last minute."""
@@ -249,7 +249,7 @@ class HostHealth(Message):
     frequency: float | None = None
     """Present clock of the fastest core, Hz."""
     frequency_share: float | None = None
-    """Greatest clock the cores may take now, as a share of the greatest they can, 0..1."""
+    """Currently permitted maximum clock of the cores, as a fraction of their maximum, 0..1."""
     throttled: bool = False
     """Slowed down because of heat or supply voltage, now."""
     memory_total: Annotated[int, Field(ge=0)]

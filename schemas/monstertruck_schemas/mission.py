@@ -107,11 +107,11 @@ class WaitStep(MissionStep):
 
 
 class ExploreStep(MissionStep):
-    """Explore what the map does not know."""
+    """Explore unknown parts of the map."""
 
     do: Literal["explore"]
     budget: Seconds | None = None
-    """Seconds after which it ends; null = as the robot is configured"""
+    """Time budget (s); null for the robot's setting"""
     home: bool = False
     """Drive back to where the exploration began"""
     find: Annotated[int, Field(ge=1, le=10_000)] | None = None
@@ -133,7 +133,7 @@ class FollowWallStep(MissionStep):
 
     do: Literal["follow_wall"]
     name: Name
-    """Of the behaviour in the robot's configuration"""
+    """Name of the behaviour in the robot's configuration"""
     distance: Annotated[float, Field(gt=0, le=10_000)]
     """In m"""
 

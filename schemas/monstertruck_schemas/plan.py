@@ -29,14 +29,14 @@ class Path(Message):
     directions: Float64Array
     """Shape (n,): +1 where the truck arrives forward, -1 backward; empty = all forward."""
     steering: tuple[Steering, ...] = ()
-    """n of them: how the axles steer where the truck arrives; empty = as the tracker is configured. Only where it is
-    crab or hybrid is the poses' yaw meant; else it follows from the path."""
+    """Steering mode on arrival at each of the n poses; empty for the tracker's setting. The poses' yaw is used only in
+    the modes crab and hybrid; otherwise it follows from the path."""
     clearance: Float64Array = Field(default_factory=lambda: np.zeros(0))
-    """Shape (n,): distance from the footprint to the nearest obstacle at each pose, m, as far as it was looked for;
-    empty = not known."""
+    """Shape (n,): distance from the footprint to the nearest obstacle at each pose (m), up to the search radius; empty
+    if unknown."""
     speeds: Float64Array = Field(default_factory=lambda: np.zeros(0))
-    """Shape (n,): greatest speed at each pose, m/s, zero or more; empty = the tracker's. The tracker's speed and the
-    limits of curves, ground and obstacles hold as well."""
+    """Shape (n,): maximum speed at each pose (m/s, >= 0); empty for none. The tracker's speed and the limits of curves,
+    ground and obstacles hold as well."""
     closed: bool = False
     """A closed path is a lap: it ends where it began."""
     halts: bool = False
@@ -45,12 +45,12 @@ class Path(Message):
 
 
 class AxleResponse(Schema):
-    """How the axles follow requests: what a tracker assumes, and what the truck's turns say."""
+    """Response of the axles to requests: assumed by a tracker, and estimated from the truck's turns."""
 
     dead_time: Annotated[float, Field(ge=0)]
     """Assumed, from a request to the first movement of the wheels, s."""
     lag: Annotated[float, Field(ge=0)]
-    """Assumed, time constant with which the axles then turn, s."""
+    """Assumed time constant of the axles after the dead time (s)."""
     delay: Annotated[float, Field(ge=0)]
     """Estimated, dead time and lag together, s."""
     deviation: Annotated[float, Field(ge=0)]
@@ -99,7 +99,7 @@ class TrackerState(Message):
     steering: tuple[AxleDeviation, ...] = ()
     """Front and rear axle; empty where nothing is steered."""
     steering_differs: str = ""
-    """What differs from the calibration, in a sentence; empty if nothing is known to."""
+    """Difference from the calibration, as a sentence; empty if none is known."""
 
 
 class TaskState(Protocol):
@@ -107,7 +107,7 @@ class TaskState(Protocol):
 
     @property
     def number(self) -> int:
-        """Counts the tasks of its kind since the start of the daemon; 0 = none yet."""
+        """Number of tasks of its kind since the start of the daemon."""
 
     @property
     def source(self) -> str:
@@ -135,7 +135,7 @@ class TaskState(Protocol):
 
 
 class GoalPhase(StrEnum):
-    """What is being done about a goal."""
+    """State of a goal."""
 
     IDLE = "idle"
     """Nothing: there is none, or ``outcome`` says how the last one ended."""
@@ -150,7 +150,7 @@ class GoalState(Message):
     """Progress towards a goal, in ``frame``."""
 
     number: Annotated[int, Field(ge=0)] = 0
-    """Counts the goals taken on since the start; 0 = none yet."""
+    """Number of goals accepted since the start."""
     source: str = ""
     """Who requested it."""
     goal: Pose2D | None = None
@@ -162,11 +162,11 @@ class GoalState(Message):
     waypoints: Annotated[int, Field(ge=0)] = 0
     """Still to be passed."""
     remaining: Annotated[float, Field(ge=0)] = 0.0
-    """Metres left of the present path."""
+    """Remaining length of the current path (m)."""
     elapsed: Annotated[float, Field(ge=0)] = 0.0
     """Seconds spent on it, pauses left out."""
     routes: Annotated[int, Field(ge=0)] = 0
-    """Routes driven so far, the present one included."""
+    """Number of routes so far, including the current one."""
     recoveries: Annotated[int, Field(ge=0)] = 0
     """Recovery behaviours run so far."""
 
@@ -185,7 +185,7 @@ class BehaviourState(Message):
     """Progress of a behaviour, in the ``frame`` of odometry."""
 
     number: Annotated[int, Field(ge=0)] = 0
-    """Counts the behaviours started since the start of the daemon; 0 = none yet."""
+    """Number of behaviours started since the start of the daemon."""
     behaviour: str = ""
     """Its name in the configuration."""
     kind: str = ""
@@ -193,7 +193,7 @@ class BehaviourState(Message):
     """Who started it."""
     running: bool = False
     phase: str = ""
-    """What it is doing; the names are those of its kind."""
+    """Current phase; each kind has its own names."""
     outcome: Reason = Reason.OK
     """DRIVING while it runs, then BEHAVIOUR_DONE, CANCELLED, or why it stopped."""
     text: str = ""
@@ -212,7 +212,7 @@ class BehaviourState(Message):
 
 
 class ExplorationPhase(StrEnum):
-    """What an exploration is doing."""
+    """State of an exploration."""
 
     IDLE = "idle"
     """Nothing: there is none, or ``outcome`` says how the last one ended."""
@@ -230,7 +230,7 @@ class ExplorationState(Message):
     """Progress of an exploration, in ``frame``."""
 
     number: Annotated[int, Field(ge=0)] = 0
-    """Counts the explorations since the start of the daemon; 0 = none yet."""
+    """Number of explorations since the start of the daemon."""
     kind: str = ""
     source: str = ""
     """Who requested it."""
@@ -238,9 +238,9 @@ class ExplorationState(Message):
     outcome: Reason = Reason.OK
     """DRIVING while it runs, then EXPLORED, BUDGET_SPENT, CHARGE_SPENT, CANCELLED, or why it was given up."""
     text: str = ""
-    """The outcome in words; while it runs, what it waits for."""
+    """Outcome in words; the awaited condition while it runs."""
     target: Pose2D | None = None
-    """Where it is going."""
+    """Current target."""
     frontiers: Annotated[int, Field(ge=0)] = 0
     """Frontiers that can be reached."""
     left_alone: Annotated[int, Field(ge=0)] = 0
@@ -252,13 +252,13 @@ class ExplorationState(Message):
     elapsed: Annotated[float, Field(ge=0)] = 0.0
     """Seconds since it was started."""
     home: Annotated[float, Field(ge=0)] | None = None
-    """Metres of the way back to the start; None = not known."""
+    """Length of the path back to the start (m); None if unknown."""
     goals: Annotated[int, Field(ge=0)] = 0
-    """Places it set off for."""
+    """Number of targets so far."""
     failures: Annotated[int, Field(ge=0)] = 0
     """Number of these whose place was not reached."""
     find: Annotated[int, Field(ge=1)] | None = None
-    """Tags that are looked for; None = it only explores."""
+    """Number of tags to find; None to explore only."""
     found: Annotated[int, Field(ge=0)] = 0
     """Tags in the map."""
 
@@ -289,7 +289,7 @@ class MissionState(Message):
     """Progress of a mission."""
 
     number: Annotated[int, Field(ge=0)] = 0
-    """Counts the missions since the start of the daemon; 0 = none yet."""
+    """Number of missions since the start of the daemon."""
     name: str = ""
     source: str = ""
     """Who requested it."""
@@ -304,9 +304,9 @@ class MissionState(Message):
     lines: tuple[MissionLine, ...] = ()
     """Steps around the present one"""
     doing: str = ""
-    """The present step in words."""
+    """Current step in words."""
     attempt: Annotated[int, Field(ge=0)] = 0
-    """Attempt at the present step, counted from 1."""
+    """Attempt at the current step, counted from 1."""
     failures: Annotated[int, Field(ge=0)] = 0
     """Steps that have failed so far."""
     failed: str = ""
@@ -314,7 +314,7 @@ class MissionState(Message):
     outcome: Reason = Reason.OK
     """DRIVING while it runs, then MISSION_DONE, CANCELLED, or why it ended."""
     text: str = ""
-    """The outcome in words; while it runs what the present step waits for."""
+    """Outcome in words; the condition awaited by the current step while it runs."""
     elapsed: Annotated[float, Field(ge=0)] = 0.0
     """Seconds since it was started or resumed."""
 

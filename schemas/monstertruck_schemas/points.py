@@ -1,4 +1,4 @@
-"""Points of interest: what the camera found in the map, and what an operator marked there."""
+"""Points of interest: found by the camera in the map, or marked there by an operator."""
 
 import math
 from enum import StrEnum
@@ -14,7 +14,7 @@ Coordinate = Annotated[float, Field(ge=-10_000, le=10_000)]
 
 
 class PointKind(StrEnum):
-    """Where a point of interest comes from."""
+    """Origin of a point of interest."""
 
     TAG = "tag"
     """An AprilTag that the camera saw."""
@@ -50,7 +50,7 @@ class PointOfInterest(Schema):
     """There is one: remote call ``point_picture``."""
 
     def before(self, distance: float) -> Pose2D:
-        """Where a robot stands to look at it: a tag from so far before it, m; a mark is a place of its own."""
+        """Viewing pose of a robot: at this distance (m) in front of a tag; a mark is itself the place."""
         if self.kind is PointKind.MARK:
             return Pose2D(x=self.x, y=self.y, yaw=self.yaw)
         x, y = self.x + distance * math.cos(self.yaw), self.y + distance * math.sin(self.yaw)
@@ -58,13 +58,13 @@ class PointOfInterest(Schema):
 
 
 class PointsOfInterest(Message):
-    """All that are known; in the order in which they were found."""
+    """All known points, in the order of discovery."""
 
     points: tuple[PointOfInterest, ...] = ()
 
 
 class PointOrder(StrEnum):
-    """What an operator can do to a point of interest."""
+    """Operator's change to a point of interest."""
 
     MARK = "mark"
     REMOVE = "remove"
@@ -79,4 +79,4 @@ class PointRequest(Request):
     """Place of a mark in map, m; None = where the robot is."""
     y: Coordinate | None = None
     yaw: Coordinate | None = None
-    """Rad; None = the robot's."""
+    """Yaw (rad); None for the robot's yaw."""

@@ -10,7 +10,7 @@ from typing import Self
 
 
 class Reason(StrEnum):
-    """Why something happened, was refused or ended; ``exit_code`` is what the CLI returns for it."""
+    """Why something happened, was refused or ended; ``exit_code`` is the exit code of the command line."""
 
     exit_code: int
     text: str

@@ -2,7 +2,7 @@
 
 The key of every request names its source. The request has a role, carries the robot's nonce (published in
 ``state/gate``, new at every start, so that no recorded request can move another run), a sequence number that must grow
-for each source, and a lease: the time for which the request stands without a newer one. Trust in clocks is not needed.
+for each source, and a lease: its validity without a newer request. Trust in clocks is not needed.
 """
 
 import math
@@ -21,7 +21,7 @@ class Role(StrEnum):
 
     ESTOP = "estop"
     HAND = "hand"
-    """The operator beside the robot, by the receiver on it; no sender outside has this role."""
+    """Operator with a radio control next to the robot, through its receiver; no external sender has this role."""
     GAMEPAD = "gamepad"
     KEYBOARD = "keyboard"
     STATION = "station"
@@ -39,14 +39,14 @@ class Request(Message):
     nonce: Annotated[str, Field(max_length=64)]
     """The robot's nonce from ``state/gate``."""
     gate_stamp: Nanoseconds | None = None
-    """Stamp of the newest ``state/gate`` its sender had, on the robot's clock: what may set the truck in motion must
-    carry a recent one, so that a request that was long on its way moves nothing."""
+    """Stamp of the latest ``state/gate`` known to the sender, on the robot's clock. A request for motion must carry a
+    recent one, so that a delayed request moves nothing."""
     instance: Annotated[str, Field(max_length=32)] | None = None
     """Random name of this run of the sender's program: while its lease runs, no other program takes over its source."""
 
     @property
     def program(self) -> tuple[str, str | None]:
-        """Source and instance: which run of which program asks."""
+        """Source and instance: one run of one program."""
         return self.source, self.instance
 
 
@@ -54,7 +54,7 @@ AnyNumber = Annotated[float, Field(allow_inf_nan=True)]
 
 
 class DriveForm(StrEnum):
-    """How a drive request describes the motion; a body says which forms it takes."""
+    """Form of a drive request; each body accepts some of them."""
 
     AXLES = "axles"
     """Speed and both axle angles."""
@@ -70,7 +70,7 @@ class RequestedTwist(Schema):
     vx: AnyNumber = 0.0
     """Forward, m/s."""
     vy: AnyNumber = 0.0
-    """To the left, m/s."""
+    """Velocity to the left (m/s)."""
     wz: AnyNumber = 0.0
     """Yaw rate, rad/s, counter-clockwise positive."""
 
@@ -141,7 +141,7 @@ class DriveRequest(Request):
 
 
 class Order(StrEnum):
-    """What a control request can ask of the gate; each is a remote call, too. What the gate does not do is none."""
+    """Control requests to the gate; each is a remote call, too."""
 
     ARM = "arm"
     DISARM = "disarm"
@@ -151,11 +151,11 @@ class Order(StrEnum):
     ASK = "ask"
     """Ask the operator who drives to hand over; changes nothing by itself."""
     HAND_OVER = "hand_over"
-    """The operator who drives lets another one drive, who has asked to."""
+    """The driving operator hands over to an operator who has asked."""
 
 
 STARTING: Final = frozenset({Order.ARM, Order.RESET})
-"""Orders after which the truck may move: they must carry a recent gate stamp."""
+"""Orders that permit motion: they must carry a recent gate stamp."""
 
 UNCONDITIONAL: Final = frozenset({Order.ESTOP, Order.STOP})
 """Orders that the gate takes at any rate and whatever they say of themselves: stopping is always safe. They are sent by
@@ -167,12 +167,12 @@ class ControlRequest(Request):
 
     order: Order
     hold: bool = False
-    """Of an order to arm: planners do not drive until the truck is armed without it."""
+    """With an order to arm: planners do not drive until the truck is armed without it."""
     calibrates: bool = False
-    """Of an order to arm: sensors are calibrated on ground that an operator keeps clear. Until the robot is disarmed,
+    """With an order to arm: sensors are calibrated on ground that an operator keeps clear. Until the robot is disarmed,
     measures of motion that disagree, and ground that no sensor has seen, slow it instead of stopping it."""
     to: Annotated[str, Field(max_length=64)] | None = None
-    """Of a hand-over: source that may drive then."""
+    """With a hand-over: source that may drive afterwards."""
 
 
 class Verb(StrEnum):
@@ -198,7 +198,7 @@ class Waypoint(Schema):
     y: float
     """M."""
     yaw: float | None = None
-    """Rad; None = that of the way there and on."""
+    """Yaw (rad); None to follow the path."""
 
 
 class GoalRequest(Request):
@@ -220,7 +220,7 @@ class GoalRequest(Request):
 
 
 class GoalOrder(StrEnum):
-    """What can be asked about the present goal."""
+    """Order about the current goal."""
 
     PAUSE = "pause"
     RESUME = "resume"
@@ -228,7 +228,7 @@ class GoalOrder(StrEnum):
 
 
 class GoalControl(Request):
-    """Interrupt, resume or give up the present goal."""
+    """Interrupt, resume or cancel the current goal."""
 
     order: GoalOrder
     own: bool = False
@@ -252,11 +252,11 @@ class BehaviourRequest(Request):
 
     order: BehaviourOrder
     behaviour: Annotated[str, Field(max_length=64)] = ""
-    """Name of the behaviour to start; of a stop: only that one, empty = whichever runs."""
+    """Name of the behaviour to start; with a stop: only this behaviour, empty for any."""
     settings: Annotated[dict[str, float | str | bool | None], Field(max_length=32)] = Field(default_factory=dict)
     """For a start: settings that replace the configured ones for this run."""
     own: bool = False
-    """Of a stop: only a behaviour that the same program started."""
+    """With a stop: only a behaviour that the same program started."""
 
     @property
     def verb(self) -> Verb:
@@ -276,13 +276,13 @@ class ExploreRequest(Request):
 
     order: ExploreOrder
     home: bool | None = None
-    """Drive back to the start at the end; None = as configured."""
+    """Drive back to the start at the end; None for the configured value."""
     budget: Annotated[float, Field(gt=0)] | None = None
-    """Seconds after which it ends; None = as configured."""
+    """Time budget (s); None for the configured value."""
     find: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """Look for tags on walls, and end when the map has so many of them; None = explore only."""
     own: bool = False
-    """Of a stop: only an exploration that the same program started."""
+    """With a stop: only an exploration that the same program started."""
 
     @property
     def verb(self) -> Verb:
@@ -307,11 +307,11 @@ class MissionRequest(Request):
     moved: bool = False
     """For a resume: the robot is not where the mission was interrupted, and its pose is right."""
     own: bool = False
-    """Of a stop: only a mission that the same program started and that runs."""
+    """With a stop: only a running mission that the same program started."""
 
     @property
     def verb(self) -> Verb:
-        """Request to the task server; resuming a mission is a start, from its present step."""
+        """Request to the task server; resuming a mission is a start, from its current step."""
         return Verb.STOP if self.order is MissionOrder.STOP else Verb.START
 
 
@@ -346,4 +346,4 @@ class PathStart(Request):
     """Drive the path of the configuration once, until its end or until the robot is disarmed."""
 
     path: Annotated[str, Field(min_length=1, max_length=128)]
-    """Its name: that of the file, without the ending."""
+    """Name of the file without its extension."""

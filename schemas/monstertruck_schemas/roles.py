@@ -1,13 +1,13 @@
-"""Names that the whole robot shares: roles of devices, services that are no device, roles of those who ask."""
+"""Names shared by the whole robot: roles of devices, other services, and roles of request sources."""
 
 from enum import StrEnum
 from typing import Final
 
 
 class DeviceRole(StrEnum):
-    """What a device is for: its key in the configuration, the name of its service, the frame it measures in.
+    """Purpose of a device: its key in the configuration, the name of its service, its measuring frame.
 
-    Roles of devices from other packages are names of their own; nothing in the daemon asks for them by name.
+    Devices of other packages have their own role names; nothing in the daemon refers to them by name.
     """
 
     LIDAR = "lidar"
@@ -31,12 +31,12 @@ class DeviceRole(StrEnum):
 
 
 SHAFTS: Final = (DeviceRole.DRIVE, DeviceRole.DRIVE_2, DeviceRole.DRIVE_3, DeviceRole.DRIVE_4)
-"""Driven shafts in the order of the body's; each has a controller of this role, or ``WHEELS`` or
+"""Driven shafts in the body's order; each has a controller of this role, or ``WHEELS`` or
 ``ACTUATORS`` controls them all."""
 
 
 class ServiceName(StrEnum):
-    """Services that are no device. Each takes its name from here; no role of another package may have one of these."""
+    """Services without a device. Each takes its name from here; no role of another package may have one of these."""
 
     BEHAVIOURS = "behaviours"
     BLACKBOX = "blackbox"
@@ -71,7 +71,7 @@ class ServiceName(StrEnum):
 
 
 class AccessRole(StrEnum):
-    """What a source may ask for; each may do all that those before it may."""
+    """Permissions of a source; each role includes the roles before it."""
 
     OBSERVER = "observer"
     """See everything, and order an emergency stop."""
@@ -81,6 +81,6 @@ class AccessRole(StrEnum):
     """Save and undo calibrations, and drive by shaft speeds, open loop."""
 
     def covers(self, needed: "AccessRole") -> bool:
-        """Whether this role may do what takes ``needed``."""
+        """Whether this role includes ``needed``."""
         roles = list(AccessRole)
         return roles.index(self) >= roles.index(needed)

@@ -1,4 +1,4 @@
-"""Messages of the ``sensor`` group: what the devices measured, in SI units, before any estimation."""
+"""Messages of the ``sensor`` group: measurements of the devices, in SI units, before any estimation."""
 
 from enum import StrEnum
 from typing import Annotated, ClassVar, Literal
@@ -9,7 +9,7 @@ from monstertruck_schemas.base import Float64Array, Message, Nanoseconds, Pose2D
 
 
 class LaserScan(Message):
-    """One lidar revolution, beam i at ``start_angle + i * angle_increment``, in the order in which they were measured.
+    """One lidar revolution, beam i at ``start_angle + i * angle_increment``, in the order of measurement.
 
     A scanner that turns clockwise has ``end_angle`` below ``start_angle``. ``stamp`` is the time of the FIRST beam in
     ``ranges``; beam i is ``i * time_increment`` later. The number of beams may vary from scan to scan.
@@ -24,18 +24,18 @@ class LaserScan(Message):
     scan_time: Annotated[float, Field(gt=0)]
     """Seconds of one revolution."""
     range_min: Annotated[float, Field(ge=0)]
-    """Least range the sensor can measure, m."""
+    """Minimum measurable range (m)."""
     range_max: Annotated[float, Field(gt=0)]
-    """Greatest range the sensor can measure, m."""
+    """Maximum measurable range (m)."""
     ranges: Float64Array
     """Shape (n,), m; +inf where the beam has no valid return (see ``codes``)."""
     codes: UInt8Array
     """Shape (n,): ``VALID_BEAM``, a code up to ``NO_ECHO`` where the sensor saw nothing within its range, or another
-    code of the sensor's own (its manual) where it does not know."""
+    code of the sensor (see its manual) for an invalid beam."""
     intensities: UInt8Array | None = None
-    """Shape (n,): strength of the returns in the sensor's own measure, 0 where there is none; None = not measured."""
+    """Shape (n,): intensity of the returns in the sensor's own unit, 0 without a return; None if not measured."""
     tilt: Annotated[float, Field(ge=0)] | None = None
-    """Angle between the scanning plane and the horizontal in the middle of the scan, rad; None = not measured."""
+    """Angle between the scanning plane and the horizontal in the middle of the scan (rad); None if not measured."""
 
     @property
     def angle_increment(self) -> float:
@@ -44,7 +44,7 @@ class LaserScan(Message):
 
     @property
     def field(self) -> tuple[float, float]:
-        """Least and greatest bearing of a beam, rad."""
+        """Minimum and maximum bearing of a beam (rad)."""
         return min(self.start_angle, self.end_angle), max(self.start_angle, self.end_angle)
 
 
@@ -88,7 +88,7 @@ class Attitude(Message):
 
 
 class DriveMode(StrEnum):
-    """DS402 power states, folded to what the robot cares about."""
+    """DS402 power states, reduced to the relevant ones."""
 
     DISABLED = "disabled"
     STARTING = "starting"
@@ -108,7 +108,7 @@ class DriveFeedback(Message):
     """Motor current, A; None in messages that did not read it."""
     mode: DriveMode
     fault_code: int | None = None
-    """Newest entry of the controller's error history while in fault."""
+    """Latest entry of the controller's error history while in fault."""
     supply_voltage: float | None = None
 
 
@@ -120,9 +120,9 @@ class SteeringFeedback(Message):
     rear: float
     """Rear servo angle, rad, left positive, 0 = straight ahead."""
     front_right: float | None = None
-    """Where every wheel has its own servo: the front right wheel's; ``front`` is the front left one's."""
+    """Front right wheel, if every wheel has its own servo; ``front`` is then the front left wheel."""
     rear_right: float | None = None
-    """The rear right wheel's; ``rear`` is the rear left one's."""
+    """Rear right wheel; ``rear`` is then the rear left wheel."""
     error_word: int = 0
     """Non-zero: the controller reported errors since the last read (its own bits)."""
     trusted: bool = True
@@ -151,7 +151,7 @@ class Battery(Message):
     voltage: float | None = None
     """Filtered pack voltage, V; None while the sensor is at fault."""
     raw_voltage: float
-    """Newest single sample, V."""
+    """Latest single sample (V)."""
     cells: int
     level: BatteryLevel
     rest_voltage: float | None = None
@@ -171,26 +171,25 @@ class SonarEcho(Schema):
 
     name: str
     answered: bool = True
-    """False: the sonar is dead or lost, and nothing is known of what is before it."""
+    """False if the sonar is dead or lost; the space in front of it is then unknown."""
     range: Annotated[float, Field(gt=0)] | None = None
     """Distance to the nearest thing in the cone, at an unknown bearing within it, m; None without an echo. A sonar that
     answered without one has nothing before it, or a surface that reflected the sound elsewhere."""
     stamp: Nanoseconds
-    """When the sound met what it came back from, without an echo when it was sent; of a sonar that does not answer,
-    when it was asked."""
+    """Time of the reflection; without an echo, time of the ping; of a silent sonar, time of the query."""
 
 
 class SonarRanges(Message):
-    """All sonars of the robot, each pinged once; ``stamp`` is that of the oldest of them."""
+    """All sonars of the robot, each pinged once; ``stamp`` is the oldest of their stamps."""
 
     sonars: tuple[SonarEcho, ...]
     """Echoes in the order of the configuration."""
     field_of_view: Annotated[float, Field(gt=0, le=3.1416)]
     """Full opening angle of the cones, rad."""
     range_min: Annotated[float, Field(ge=0)]
-    """Least range that is measured, m: what is nearer is reported as about this range, or not at all."""
+    """Minimum range (m): nearer objects are reported at about this range, or not at all."""
     range_max: Annotated[float, Field(gt=0)]
-    """Greatest range, m."""
+    """Maximum range (m)."""
     degraded: bool = False
     """Whether it rests on a calibration that has expired."""
 
@@ -216,13 +215,13 @@ class WheelEncoders(Message):
     left: float
     """Angle of the left wheel since the driver's first reading, rad, unwrapped, forward positive."""
     right: float
-    """Of the right wheel."""
+    """Distance of the right wheel (m)."""
 
 
 class HandControls(Message):
-    """Sticks and switches of the radio control of the operator beside the robot, by the receiver on it.
+    """Sticks and switches of the operator's radio control, through the robot's receiver.
 
-    ``stamp`` is when the newest channels came. While the transmitter is lost all controls are neutral and off.
+    ``stamp`` is the arrival of the latest channels. While the transmitter is lost all controls are neutral and off.
     """
 
     lost: bool
@@ -240,9 +239,9 @@ class HandControls(Message):
     unseen: bool = False
     """Switch to drive into unseen ground."""
     link_quality: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Share of the radio's packets that arrive; None = not known."""
+    """Fraction of the radio's packets that arrive; None if unknown."""
     rssi: float | None = None
-    """Signal at the receiver, dBm; None = not known."""
+    """Signal at the receiver (dBm); None if unknown."""
 
     @property
     def switches(self) -> tuple[bool, ...]:
@@ -273,11 +272,11 @@ class TorqueState(StrEnum):
 
 
 class StabiliserJoint(Schema):
-    """One servo of the lidar's mount; signs are those of the joint angle. Absent unit: measurements are None."""
+    """One servo of the lidar's mount; signs follow the joint angle. Absent unit: measurements are None."""
 
     torque: TorqueState
     error: Annotated[int, Field(ge=0, le=255)] = 0
-    """Error bits of the unit's newest answer (its own bits)."""
+    """Error bits of the unit's latest answer (in its own encoding)."""
     velocity: float | None = None
     """Rad/s."""
     load: float | None = None
@@ -306,10 +305,10 @@ class StabiliserFeedback(Message):
 
 
 class StandPose(Message):
-    """Pose of a robot as a test stand saw it from outside; ``frame`` is the stand's own, whose origin is its middle.
+    """Pose of a robot measured by an external test stand; ``frame`` is the stand's, with its origin in the middle.
 
-    For studies and for judging estimates: no estimator and no planner reads it. The consistency check compares what
-    cameras see with the robot's own measures of its motion.
+    For studies and for judging estimates: no estimator and no planner reads it. The consistency check compares it with
+    the robot's own measures of its motion.
     """
 
     pose: Pose2D

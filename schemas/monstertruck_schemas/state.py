@@ -32,7 +32,7 @@ class Odometry(Message):
     twist_covariance: Covariance
     """Shape (9,), row-major covariance of (vx, vy, wz)."""
     age: Annotated[float, Field(ge=0)]
-    """Seconds since the newest drive reading this estimate rests on; the rest is predicted."""
+    """Age of the latest drive reading in this estimate (s); the time since is predicted."""
     sources: tuple[str, ...] = ()
     """Sensors used in this estimate, e.g. ("drive", "steering", "compass")."""
     degraded: bool = False
@@ -45,7 +45,7 @@ class Odometry(Message):
 
 
 class Peer(Schema):
-    """What another robot says of itself."""
+    """Report of another robot."""
 
     robot: str
     """Name of the robot."""
@@ -56,17 +56,17 @@ class Peer(Schema):
     deviation: Annotated[float, Field(ge=0)] = 0.0
     """Standard deviation of its position along the axis where it is largest, by itself, m; 0 in older recordings."""
     heard: Nanoseconds
-    """When it came in, by this robot's clock: the other one's stamps mean nothing here."""
+    """Time of receipt by this robot's clock: stamps of the other robot are meaningless here."""
 
 
 class Peers(Message):
-    """The newest pose of every other robot received since the start."""
+    """Latest pose of every other robot received since the start."""
 
     peers: tuple[Peer, ...] = ()
 
 
 class ScanMotion(Message):
-    """How base moved between two scans, by the scans alone; ``stamp`` is that of the later one."""
+    """Motion of base between two scans, by the scans alone; ``stamp`` is the later stamp."""
 
     since: Nanoseconds
     """Stamp of the earlier scan."""
@@ -117,7 +117,7 @@ GROUND_UNKNOWN: Final = 255
 
 
 class Ground(Message):
-    """What the ground is like where it is known: row 0 is the lowest y, column 0 the lowest x."""
+    """Condition of the known ground: row 0 is the lowest y, column 0 the lowest x."""
 
     resolution: Annotated[float, Field(gt=0)]
     """Metres per cell."""
@@ -140,7 +140,7 @@ class ClockOffset(Message):
 
 
 class DoubtKind(StrEnum):
-    """What is wrong with a sensor."""
+    """Fault of a sensor."""
 
     MOTION = "motion"
     """It measures another motion than another sensor."""
@@ -158,7 +158,7 @@ class DoubtKind(StrEnum):
 
 
 class Doubt(Schema):
-    """A sensor that cannot be right, or one of two of which one cannot be."""
+    """A wrong sensor, or one of two sensors that contradict each other."""
 
     sensor: str
     """Role of the device."""
@@ -184,7 +184,7 @@ class UnshownMotion(Schema):
     since: Nanoseconds
     """Stamp of the earlier scan."""
     stamp: Nanoseconds
-    """Stamp of the newest scan."""
+    """Stamp of the latest scan."""
     distance: Annotated[float, Field(ge=0)]
     """Distance from where it was, m."""
     turn: float
@@ -197,12 +197,12 @@ class Consistency(Message):
     measures: tuple[str, ...]
     """Measures in use: wheels, scans, gyro, compass, encoders, stand."""
     distances: tuple[str, ...] | None = None
-    """Those of them that measure distances, not turns alone; None = not said."""
+    """Measures of distances, not of turns alone; None if not reported."""
     doubts: tuple[Doubt, ...] = ()
     scans: str | None = None
-    """Scan odometry in use: kiss or own; None = none."""
+    """Scan odometry in use: kiss or own; None if there is none."""
     unshown: UnshownMotion | None = None
-    """Motion of the body that the wheels do not show; None = none."""
+    """Motion of the body that the wheels do not show, or None."""
 
 
 class GateMode(StrEnum):
@@ -231,7 +231,7 @@ class GateMode(StrEnum):
 
 
 class GateState(Message):
-    """The safety gate: who drives, what limits apply and why. Retained; also acknowledges requests."""
+    """State of the safety gate: driver, limits and their reasons. Retained; also acknowledges requests."""
 
     mode: GateMode
     nonce: str
@@ -242,7 +242,7 @@ class GateState(Message):
     lease_left: float | None = None
     """Seconds until the holder's lease runs out."""
     last_seq: int | None = None
-    """Newest accepted sequence number of the holder."""
+    """Latest accepted sequence number of the holder."""
     speed_limit: float
     """Speed allowed now, m/s."""
     reasons: tuple[Reason, ...] = ()
@@ -250,17 +250,18 @@ class GateState(Message):
     stopping_distance: float = 0.0
     """Metres the truck would still travel if stopped now."""
     form: DriveForm | None = None
-    """Form of the holder's newest request."""
+    """Form of the holder's latest request."""
     twist: Twist2D | None = None
     """Commanded velocity of the base, whatever the form of the request."""
     latched: bool = False
     """An emergency stop is on the disk: it outlasts a loss of power. Before that it outlasts the daemon only."""
     weakened: tuple[str, ...] = ()
-    """Settings by which this robot is less safe than by the defaults, each with its value and the default."""
+    """Settings less safe than their defaults, each with its value and the default."""
     waiting: tuple[str, ...] = ()
-    """Planners that ask for motion while nobody drives: they set off as soon as the truck is armed without ``hold``."""
+    """Planners that request motion while no source drives: they start as soon as the truck is armed without
+    ``hold``."""
     asking: tuple[str, ...] = ()
-    """Operators who have asked the one who drives to hand over, the newest last."""
+    """Operators who have asked the driving operator to hand over, latest last."""
     stopping: bool = False
     """The robot is to stand, and its standstill has not been measured since."""
     handed_to: str | None = None
@@ -274,15 +275,15 @@ class GateState(Message):
 
     @property
     def worst(self) -> Reason:
-        """What limits or stops the truck most; ``DISARMED`` if nothing is named."""
+        """Reason that limits the truck most; ``DISARMED`` if there is none."""
         return next(iter(self.reasons), Reason.DISARMED)
 
     @property
     def hindrances(self) -> tuple[Reason, ...]:
-        """``reasons`` without ``DISARMED``, which says no more than that nobody has armed."""
+        """``reasons`` without ``DISARMED``, which only means that the truck is not armed."""
         return tuple(reason for reason in self.reasons if reason is not Reason.DISARMED)
 
     @property
     def why(self) -> str:
-        """Why the truck stands or is slow, in words; its mode where no reason is named."""
+        """Why the truck stands or is slow, in words; without a reason, its mode."""
         return in_words(self.reasons) or f"the robot is {self.mode}"

@@ -1,6 +1,6 @@
 """The topic table: one row per key. Bus, recorder, health, access rules and docs are derived from it.
 
-Other distributions add topics through entry points, each of which names a ``Topic``::
+Other distributions add topics through entry points that name a ``Topic``::
 
     [project.entry-points."monstertruck.topics"]
     "sensor/radar" = "my_package.topics:RADAR"
@@ -93,12 +93,12 @@ class Writer(StrEnum):
     DAEMON = "daemon"
     OUTSIDE = "outside"
     STAND = "stand"
-    """A test stand, or the simulator: sees the robot from outside, and nothing in the robot reads what it says."""
+    """A test stand, or the simulator: observes the robot; nothing in the robot reads its messages."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic(Generic[M]):
-    """One row: what is published under ``mt/<robot>/<name>``, how often, by whom, and who keeps it."""
+    """One row: content of ``mt/<robot>/<name>``, rate, writers, and where it is kept."""
 
     name: str
     model: type[M]
@@ -107,16 +107,15 @@ class Topic(Generic[M]):
     rate: float | None = None
     """Nominal rate in Hz; None = on change."""
     stale_after: float | None = None
-    """Seconds after which the newest message no longer counts, for every reader in the robot. What moves the truck is
-    limited otherwise (requests by their lease, commands by ``command_timeout`` of the drivers): such limits are shown
-    only."""
+    """Age after which the latest message is stale, s, for every reader in the robot. Requests are limited by their
+    lease and commands by ``command_timeout`` of the drivers: their limits here are for display only."""
     logged: bool = True
     retained: bool = False
-    """Late joiners get the newest message at once."""
+    """Late joiners get the latest message at once."""
     foxglove: str | None = None
     """Well-known protobuf schema it travels as; None = JSON with JSON Schema."""
     place: str | None = None
-    """Key below ``mt/`` with ``{robot}`` in it, of what is said about a robot elsewhere; None = below its own name."""
+    """Key below ``mt/`` with ``{robot}``, for messages about a robot from elsewhere; None if below its own name."""
 
     @property
     def group(self) -> str:
@@ -129,7 +128,7 @@ class Topic(Generic[M]):
         return self.foxglove or f"monstertruck.{self.model.__name__}"
 
     def key(self, robot: str, source: str = "*") -> str:
-        """Zenoh key expression of this topic on ``robot``; of a request, that of one source or of all.
+        """Zenoh key expression of this topic on ``robot``; for a request, of one source or of all.
 
         A request ``req/drive`` of ``ann`` travels on ``mt/<robot>/req/ann/drive``.
         """
@@ -145,7 +144,7 @@ class Topic(Generic[M]):
         return self.writer in (Writer.OUTSIDE, Writer.STAND)
 
     def fresh_for(self) -> float:
-        """Seconds for which a message counts; +inf for topics without a limit."""
+        """Validity of a message (s); +inf for topics without a limit."""
         return math.inf if self.stale_after is None else self.stale_after
 
 
@@ -154,7 +153,7 @@ W = Writer
 DRIVE_STALE: Final = 0.2
 """``stale_after`` of every driven shaft, s."""
 POSE_STALE: Final = 0.2
-"""``stale_after`` of dead reckoning and of the pose in the map, s: whoever follows a pose reads either."""
+"""``stale_after`` of dead reckoning and of the pose in the map (s): a tracker reads either."""
 
 SCAN: Final = Topic(
     "sensor/scan", LaserScan, W.DRIVER, "Lidar revolution", 10, stale_after=0.25, foxglove="foxglove.LaserScan"
@@ -188,7 +187,7 @@ ENCODERS: Final = Topic(
     "sensor/encoders", WheelEncoders, W.DRIVER, "Rear wheels of a tricycle, by their encoders", 25, stale_after=0.2
 )
 HAND: Final = Topic(
-    "sensor/hand", HandControls, W.DRIVER, "Radio control of the operator beside the robot", 50, stale_after=0.25
+    "sensor/hand", HandControls, W.DRIVER, "Radio control of the operator next to the robot", 50, stale_after=0.25
 )
 
 ODOMETRY: Final = Topic(
@@ -265,7 +264,7 @@ SEEN: Final = Topic(
     "state/seen",
     Grid,
     W.GATE,
-    "Ground around the robot into which it may reverse: -1 not seen, else the age of the newest view in percent of "
+    "Ground around the robot that it may reverse onto: -1 not seen, else the age of the latest view in percent of "
     "gate.obstacle.memory_time; its frame is base at the stamp",
     1,
     retained=True,
@@ -318,7 +317,7 @@ CALIBRATION: Final = Topic(
     "health/calibration",
     CalibrationHealth,
     W.DAEMON,
-    "What was calibrated, how well, until when; total distance driven",
+    "Calibrations with quality and expiry; total distance driven",
     retained=True,
 )
 LOOP: Final = Topic("health/loop", LoopHealth, W.DAEMON, "Lateness of the control tick", 1, stale_after=3.0)
@@ -375,14 +374,14 @@ OPEN_GROUPS: Final = {
     "plan": (W.PLANNER,),
     "health": (W.DRIVER, W.ESTIMATION, W.PLANNER),
 }
-"""Groups to which other distributions may add topics, and who may write them."""
+"""Groups that other distributions may extend, and who may write them."""
 
 
 class TopicTable(ExtensibleTable[Topic[Message]]):
-    """Topics by name: ours, then those of other distributions."""
+    """Topics by name: ours, then topics of other distributions."""
 
     def fault(self, row: Any) -> str | None:
-        """What is wrong with a topic of another distribution."""
+        """Fault of a topic of another distribution."""
         if not isinstance(row, Topic):
             return f"expected a Topic, found {type(row).__name__}"
         if row.group not in OPEN_GROUPS or not re.fullmatch(r"[a-z]+/[a-z][a-z0-9_]*", row.name):
@@ -422,7 +421,7 @@ def topics_of(group: str) -> Iterator[Topic[Message]]:
 
 
 def rpc_key(robot: str, name: str, source: str | None = None) -> str:
-    """Key of a remote call by ``source``; None = a call that says nothing of its caller."""
+    """Key of a remote call by ``source``; None for a call without a caller."""
     key = f"{KEY_ROOT}/{robot}/rpc/{name}"
     return key if source is None else f"{key}/{source}"
 
@@ -432,12 +431,12 @@ ESTOP_WAY: Final = "req/estop"
 
 
 def estop_key(robot: str, source: str = "*") -> str:
-    """Key of emergency stops, which have one of their own: there they wait behind no other request."""
+    """Key of emergency stops, separate so that they wait behind no other request."""
     return f"{KEY_ROOT}/{robot}/req/{source}/estop"
 
 
 def sender_in(robot: str, key: str) -> tuple[str, str | None] | None:
-    """What is requested with ``key``, and by whom: the opposite of ``Topic.key`` and ``rpc_key``.
+    """Request and source of a ``key``: the inverse of ``Topic.key`` and ``rpc_key``.
 
     Returns:
         Name of a request's topic or of a call, and the source, None where the key has none. None for other keys: those

@@ -9,7 +9,7 @@ from monstertruck_schemas.base import Message, Schema
 
 
 class UsbState(StrEnum):
-    """What a port of the tree is good for at the moment."""
+    """Current state of a port of the tree."""
 
     PRESENT = "present"
     ABSENT = "absent"

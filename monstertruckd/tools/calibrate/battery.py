@@ -1,6 +1,6 @@
 """Scale of the battery voltage from a multimeter, and its offset as far as readings lie apart.
 
-``volts = gain * raw + offset``, ``raw`` being what the input would show with gain 1 and offset 0. A pack moves by 4 V
+``volts = gain * raw + offset``, ``raw`` being the input's reading with gain 1 and offset 0. A pack moves by 4 V
 between full and empty, so a second reading usually comes days later: readings are kept with the result and used again.
 """
 
@@ -24,9 +24,9 @@ from monstertruckd.tools.calibrate.wizard import WizardContext
 METER: Final = Number("meter", "Voltage of the pack at its plug by the multimeter, V", 5.0, 70.0)
 ANOTHER: Final = Confirm("another", "Take another reading now, with the pack at another voltage?", fact=True)
 EARTHING: Final = 0.1
-"""Greatest offset, V: 10 mV along the ground wire, times the divider."""
+"""Maximum offset, V: 10 mV along the ground wire, times the divider."""
 EVEN: Final = math.sqrt(3)
-"""Greatest error over standard deviation where all errors up to the greatest are as likely."""
+"""Ratio of maximum error to standard deviation of a uniform distribution."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class BatteryWizard:
     doc: ClassVar[str] = "scale of the battery voltage from a multimeter, and its offset from two readings apart"
     room: ClassVar[str] = ""
     meter_share: float = 0.005
-    """Greatest error of the multimeter as a share of its reading"""
+    """Maximum error of the multimeter as a fraction of its reading"""
     meter_digits: float = 0.02
     """Maximum constant error of the meter (V)"""
     samples: int = 50
@@ -56,7 +56,7 @@ class BatteryWizard:
 
     @classmethod
     def of(cls, meter_error: float, meter_digits: float, fresh: bool) -> Self:
-        """With the command's options: the meter's proportional and constant error."""
+        """Build it from the command's options: the meter's proportional and constant error."""
         return cls(meter_error, meter_digits, fresh=fresh)
 
     async def __call__(self, context: WizardContext) -> Result:
@@ -130,8 +130,8 @@ class BatteryWizard:
     def scale(self, readings: list[MeterReading]) -> tuple[Interval, Interval]:
         """Gain and offset, by least squares.
 
-        The meter's proportional error has the same sign at every reading, that of its digits is independent. Errors of
-        which only the bound is known are taken as uniform within it.
+        The meter's proportional error has the same sign at every reading, the error of its digits is independent.
+        Errors with only a known bound are taken as uniform within it.
 
         Raises:
             InputError: no line passes every reading within its bounds.
@@ -153,7 +153,7 @@ class BatteryWizard:
         errors = np.linalg.inv(rows.T @ rows)
         gain, offset, _ = errors @ rows.T @ np.concatenate((volts / sigma, (0.0, 0.0)))
         halves = NORMAL * np.sqrt(np.diag(errors))
-        # No offset is beyond the ground wire's; the gain follows it, so that both fit the readings.
+        # The offset is limited to that of the ground wire; the gain follows it, so that both fit the readings.
         low, high = np.clip((offset - halves[1], offset + halves[1]), -EARTHING, EARTHING).tolist()
         within = Interval((low + high) / 2, (high - low) / 2)
         gain += errors[0, 1] / errors[1, 1] * (within.value - offset)
@@ -172,10 +172,10 @@ class BatteryWizard:
 
 
 def check_input(reading: MeterReading, gain: float) -> None:
-    """Raise where the input cannot be the battery's.
+    """Refuse readings that cannot come from the battery.
 
     Raises:
-        InputError: it reads less than half or more than twice what the meter shows.
+        InputError: it reads less than half or more than twice the meter's reading.
     """
     shown = reading.raw * gain
     if not volts_near(shown, reading.volts):

@@ -19,7 +19,7 @@ def stacked_ranges(scans: Sequence[LaserScan], missing: float) -> Array:
 
     Args:
         scans: at least one; their numbers of beams may differ.
-        missing: what stands for a beam without a range.
+        missing: value for a beam without a range.
 
     Returns:
         Shape (number of scans, beams of the first one).

@@ -33,25 +33,25 @@ FLAT: Final = 0.001
 WARPED: Final = 0.003
 """Standard deviation of the direction of a line on it, rad."""
 RANGE: Final = 0.004
-"""Standard deviation of what the lidar measures too far on such a surface, m."""
+"""Standard deviation of the lidar's range excess on such a surface, m."""
 PRINT: Final = 0.003
 """Relative error of the board's size: a ruler, and paper."""
 LEAST_VIEWS: Final = 6
 REACH: Final = np.array((0.5, 0.5, 0.5, 0.8, 0.8, 0.8))
-"""Greatest error of the configured mount, m and rad."""
+"""Maximum error of the configured mount, m and rad."""
 
 
 class LidarPlace(NamedTuple):
-    """Where the lidar is on the body, as configured."""
+    """Mount of the lidar on the body, as configured."""
 
     place: Array
     """(3,), m."""
     axes: Array
-    """(3, 3): from its axes to the body's."""
+    """(3, 3): from its axes to the axes of the body."""
 
     @classmethod
     def of(cls, mount: Mount, pitch: float = 0.0, roll: float = 0.0) -> "LidarPlace":
-        """With the joints of its mount at ``pitch`` and ``roll``, rad."""
+        """Mount with its joints at ``pitch`` and ``roll``, rad."""
         place = np.array((mount.x, mount.y, mount.z))
         return cls(place, rotation(0.0, pitch, roll) @ rotation(mount.yaw, mount.pitch, mount.roll))
 
@@ -71,7 +71,7 @@ class BoardLine:
 def line_on_board(
     view: BoardView, reader: BoardReader, lens: Lens, mount: Array, lidar: LidarPlace, *, known: bool
 ) -> BoardLine | None:
-    """The lidar's line on the board of a view; None = it is not there.
+    """The lidar's line on the board of a view, or None.
 
     Args:
         view: with scans.
@@ -102,7 +102,7 @@ def line_on_board(
     along = (points - middle) @ direction
     off = np.linalg.norm(points - middle - along[:, None] * direction, axis=1)
     noise = float(np.sqrt(np.mean(off**2)))
-    if noise > 0.02:  # m: root mean square by which the points of a line may be off it
+    if noise > 0.02:  # m: maximum RMS distance of a line's points
         return None
     half = float(np.abs(along).max())
     ends = middle + np.array(((-half,), (half,))) * direction
@@ -143,7 +143,7 @@ def longest(chosen: NDArray[np.bool_], ranges: Array) -> NDArray[np.intp]:
 
 
 def plane_sigmas(view: BoardView, reader: BoardReader, lens: Lens, pose: BoardPose, ends: Array) -> tuple[float, float]:
-    """By the noise of the corners: standard deviations of the plane at a line's middle, m, and of its slope, rad.
+    """Standard deviations by the noise of the corners: of the plane at a line's middle, m, and of its slope, rad.
 
     Args:
         view: of the board.
@@ -170,11 +170,11 @@ def plane_sigmas(view: BoardView, reader: BoardReader, lens: Lens, pose: BoardPo
 
 
 def residuals(parameters: Array, lines: Sequence[BoardLine], lidar: LidarPlace) -> Array:
-    """Of lines against planes, over their standard deviations, (n, 2).
+    """Residuals of lines against planes, over their standard deviations, (n, 2).
 
     Args:
-        parameters: mount (``NAMES``), the board's size as a share of what is stated, and what the lidar measures too
-            far, m.
+        parameters: mount (``NAMES``), the board's size as a fraction of the stated size, and the lidar's range excess,
+            m.
         lines: seen.
         lidar: where it is.
     """
@@ -191,7 +191,7 @@ def residuals(parameters: Array, lines: Sequence[BoardLine], lidar: LidarPlace) 
 
 
 def fit(lines: Sequence[BoardLine], mount: Array, lidar: LidarPlace, size_error: float) -> FitResult:
-    """Least squares; parameters as of ``residuals``.
+    """Solve by least squares; parameters as in ``residuals``.
 
     Args:
         lines: seen.
@@ -243,7 +243,7 @@ def fit_mount(
 
 
 def _agreeing(lines: list[BoardLine], found: FitResult, lidar: LidarPlace) -> list[BoardLine]:
-    """Without strays, of which there may be one in five.
+    """Fit without strays, at most one in five.
 
     Raises:
         InputError: there are more.
@@ -261,13 +261,13 @@ def _agreeing(lines: list[BoardLine], found: FitResult, lidar: LidarPlace) -> li
 
 
 def _check_size(found: FitResult, board: BoardConfig) -> None:
-    """Raise where the lidar says that the board was printed at another scale.
+    """Refuse a board printed at another scale, as measured by the lidar.
 
     Raises:
         InputError: so it is.
     """
     size, sigma = float(found.parameters[6]), float(found.standard_errors[6])
-    if abs(size - 1.0) > 0.01 + 3.0 * sigma:  # share by which the board's size must be wrong at least, to be named
+    if abs(size - 1.0) > 0.01 + 3.0 * sigma:  # minimum relative error of the board's size for a report
         raise InputError(
             f"by the lidar the board is {size:.3f} times as large as stated: measure a square, "
             f"{1000 * size * board.square:.1f} mm instead of {1000 * board.square:.1f}; state --square and --marker"

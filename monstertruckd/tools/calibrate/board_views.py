@@ -149,7 +149,7 @@ class BoardGuide:
         scans = [s for s in self._scans if first <= s.stamp and s.stamp + s.scan_time * SECOND <= stamp]
         return BoardView(mean, pose, *of_scans(scans))
 
-    # What is missing
+    # Missing views
 
     def missing(self) -> list[str]:
         """Describe the views still needed."""
@@ -166,7 +166,7 @@ class BoardGuide:
             found += self._steep()
             if self.views and not any(view.ranges.size for view in self.views):
                 found.insert(0, f"scans of the lidar: {LEAST_SCANS} or more in {HOLD / SECOND:g} s")
-            more = 16 - len(self.seen_by_lidar)  # views needed in which the lidar also sees the board
+            more = 16 - len(self.seen_by_lidar)  # required views with the board also in the lidar's view
             found += _more(more, "view across the lidar's beam", "views across the lidar's beam")
         return found
 

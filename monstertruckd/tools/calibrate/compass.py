@@ -27,11 +27,11 @@ from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 ROOM: Final = "2 m x 2 m, level, outdoors or well away from iron: no car, no reinforced wall, no drain within 3 m"
 
 TILT: Final = math.radians(0.5)
-"""Greatest error of the unit's own tilt, rad (its data sheet): through it the vertical field looks like hard iron."""
+"""Maximum error of the unit's tilt, rad (data sheet): through it the vertical field looks like hard iron."""
 LINEARITY: Final = 0.001
-"""Share by which a magnetoresistive sensor's output bends over the earth's field, and with it the ellipse."""
+"""Relative nonlinearity of a magnetoresistive sensor over the earth's field, and so of the ellipse."""
 GAP: Final = math.radians(30)
-"""Greatest gap between directions of the field that still is a circle."""
+"""Maximum gap between directions of the field in a circle."""
 
 _NAMES: Final = ("hard_x", "hard_y", "soft_xx", "soft_xy", "soft_yy")
 
@@ -47,11 +47,11 @@ class FieldCircle:
     roll: Array
     current: Array
     heading: Array
-    """As the unit, or the calibration before, computed it; rad, clockwise."""
+    """Heading by the unit, or by the previous calibration; rad, clockwise."""
 
     @classmethod
     def of(cls, tracks: list[MoveRecord]) -> "FieldCircle":
-        """What was read while the truck moved; also what the driver calls disturbed, for that is what is looked for.
+        """Readings while the truck moved, including those the driver flags as disturbed, because they show the iron.
 
         Raises:
             InputError: the compass sends no field, or too few readings.
@@ -80,7 +80,7 @@ class FieldCircle:
 
 @dataclass(frozen=True, slots=True)
 class CompassWizard:
-    """One circle forward, the same one back: what the motor's current adds changes its sign with the direction."""
+    """One circle forward, the same one back: the effect of the motor's current changes its sign with the direction."""
 
     name: ClassVar[WizardName] = "compass"
     doc: ClassVar[str] = "the robot's own magnetism, from a driven circle"
@@ -120,7 +120,7 @@ def result_of(circle: FieldCircle) -> Result:
     """Fit and evaluate.
 
     Raises:
-        InputError: no full circle was driven, the field turns the wrong way round, or is no ellipse.
+        InputError: no full circle was driven, the field turns the wrong way round, or is not an ellipse.
     """
     if np.ptp(circle.heading) == 0.0:
         raise InputError("the unit's heading stays the same while the robot turns: unplug the compass, and plug it in")
@@ -134,7 +134,7 @@ def result_of(circle: FieldCircle) -> Result:
             "(setting E of the unit)"
         )
     radius = float(fit.parameters[4])
-    # 0.03: residual, as a share of the circle's radius, from which on it is no ellipse: headings would err by 2 degrees
+    # 0.03: maximum residual of an ellipse, as a fraction of the circle's radius: headings would err by 2 degrees
     if not np.isfinite(fit.standard_errors[:5]).all() or fit.rms > 0.03 * radius:
         raise InputError(
             f"the field is {fit.rms:.1f} uT off the ellipse of {radius:.0f} uT that the robot's own iron can make of "
@@ -187,9 +187,9 @@ def result_of(circle: FieldCircle) -> Result:
 
 
 def lasting(residuals: Array) -> float:
-    """Root mean square of what lasts over an eighth of a circle, of residuals in the order of time; 0 = noise only.
+    """RMS of the residuals' slow part, over an eighth of a circle, in the order of time; 0 for noise only.
 
-    By means over so many readings, less what their noise leaves in them; up to twice that counts as noise.
+    By means over so many readings, less what their noise leaves in them; up to twice that is treated as noise.
     """
     window = max(residuals.size // 16, 1)
     means = np.convolve(residuals, np.ones(window) / window, "valid")
@@ -198,7 +198,7 @@ def lasting(residuals: Array) -> float:
 
 
 def _motor(circle: FieldCircle, fit: FitResult) -> list[Estimate]:
-    """What an ampere of the motor's current adds to the field, and how far it turns the heading at most."""
+    """Effect of an ampere of motor current on the field, and its maximum effect on the heading."""
     if not np.isfinite(fit.standard_errors[5:]).all():
         return []
     halves = NORMAL * correlation_factor(fit.residuals) * fit.standard_errors[5:]
@@ -220,10 +220,10 @@ def _motor(circle: FieldCircle, fit: FitResult) -> list[Estimate]:
 
 
 def fit_ellipse(circle: FieldCircle) -> FitResult:
-    """Least squares of the levelled field's length; parameters hard_x, hard_y, u, v, radius, motor_x, motor_y.
+    """Least-squares fit of the levelled field's length; parameters hard_x, hard_y, u, v, radius, motor_x, motor_y.
 
-    ``soft`` is [[e^u w, v], [v, w e^-u]] with w^2 = 1 + v^2: symmetric, determinant 1. ``motor`` is what the motor's
-    current adds to the field, uT/A.
+    ``soft`` is [[e^u w, v], [v, w e^-u]] with w^2 = 1 + v^2: symmetric, determinant 1. ``motor`` is the field of the
+    motor's current, uT/A.
     """
     middle = np.array([(values.max() + values.min()) / 2 for values in (circle.x, circle.y)])
     radius = max(float(np.ptp(circle.x)), float(np.ptp(circle.y)), 1.0) / 2
@@ -249,7 +249,7 @@ def _iron(parameters: Array) -> tuple[float, ...]:
 
 
 def _iron_errors(fit: FitResult) -> Array:
-    """Standard errors in the order of ``_NAMES``, by the slopes of ``_iron`` (those of u and v hardly correlate)."""
+    """Standard errors in the order of ``_NAMES``, by the slopes of ``_iron`` (u and v hardly correlate)."""
     point, errors = fit.parameters[:4], fit.standard_errors[:4]
     step = 1e-6
     slopes = np.array(

@@ -3,8 +3,8 @@
 Only turns of the motor per metre over the floor can be seen: gear ratio and wheel radius never show apart. So the
 radius stays as configured, and the ratio is the one that makes the odometer right with it.
 
-Dead time and lag follow from what the gate commanded and how far the motor had turned. Setting off and stopping are
-apart: drivers pass on a slower speed at once, a faster one with their next cycle.
+Dead time and lag follow from the gate's commands and the motor's turns. Starting and stopping are separate: drivers
+pass on a slower speed at once, a faster one with their next cycle.
 """
 
 import math
@@ -29,7 +29,7 @@ RATE: Final = "devices.drive.driver.rate"
 ROOM: Final = "a straight of 3 m (half a metre of it behind the robot), 1 m wide, level"
 
 TAPE_SCALE: Final = 0.0005
-"""Share by which a class II tape may be wrong, its sag included."""
+"""Relative error of a class II tape, including its sag."""
 SLIP: Final = 0.003
 """Share that rolling slip may differ by on another floor."""
 BENT: Final = 0.35
@@ -114,7 +114,7 @@ class DriveWizard:
         values = [run.turns / run.length for run in runs]
         middle = float(np.median(values))
         for number, value in enumerate(values, start=1):
-            # 0.03: share by which two runs may differ before one of them must be a slip of the pen
+            # 0.03: maximum relative difference of two runs before one of them must be a slip of the pen
             if abs(value / middle - 1) > 0.03:
                 off = 100 * (value / middle - 1)
                 raise InputError(f"run {number} differs by {off:.1f} % from the others: measure again")
@@ -159,7 +159,7 @@ def turns_per_metre(values: Sequence[float], tape_error: float, metres: float, b
         values: of every run, 1/m.
         tape_error: standard deviation of one reading of the tape, m.
         metres: length of a run.
-        bend: greatest share by which a run may have been crooked unseen.
+        bend: maximum unseen crookedness of a run, as a fraction.
     """
     middle = float(np.median(values))
     found = mean_interval(values, middle * math.sqrt(2) * tape_error / metres)
@@ -167,7 +167,7 @@ def turns_per_metre(values: Sequence[float], tape_error: float, metres: float, b
 
 
 def on_any_floor(found: Interval) -> Interval:
-    """What was found on one floor, as it counts on others."""
+    """Value found on one floor, for use on others."""
     return found.joined(found.value * SLIP)
 
 
@@ -180,11 +180,11 @@ class TapedRun:
     length: float
     """Length of the arc, m."""
     bend: float
-    """Share by which the arc is longer than the tape."""
+    """Excess length of the arc over the tape, as a fraction."""
 
     @classmethod
     def of(cls, track: MoveRecord, distance: float, *, straight: bool | None = None) -> "TapedRun":
-        """From the taped chord, m.
+        """Distance along the arc from the taped chord, m.
 
         Args:
             track: the run.
@@ -288,7 +288,7 @@ def drive_response(records: Iterable[MoveRecord], part: Part, cycle: float) -> R
 
 
 def drive_estimates(records: Iterable[MoveRecord], rate: float) -> list[Estimate]:
-    """Of both parts, for information; ``rate`` is that of the driver's cycles, 1/s.
+    """Estimates of both parts, for information; ``rate`` is the rate of the driver's cycles, 1/s.
 
     Raises:
         InputError: as ``drive_response``.

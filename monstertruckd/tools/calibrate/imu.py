@@ -24,8 +24,8 @@ ROOM: Final = "2 m x 2 m, level"
 ONE_G: Final = 9.80665
 """m/s^2."""
 TILT: Final = math.radians(0.2)
-"""Standard deviation of the compass's own tilt, rad (its data sheet: 0.5 degrees at most), and with it of where gravity
-points."""
+"""Standard deviation of the compass's tilt, rad (data sheet: 0.5 degrees at most), and so of the direction of
+gravity."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Turn:
 
     @classmethod
     def of(cls, record: MoveRecord, bias: float, scale: float) -> "Turn":
-        """From a move; rates as published with a correction by ``bias`` (rad/s) and ``scale``.
+        """Build it from a move; rates as published with a correction by ``bias`` (rad/s) and ``scale``.
 
         Raises:
             InputError: no readings of the unit, or none for a while, or too few headings at rest.
@@ -57,7 +57,7 @@ class Turn:
         over = abs(math.remainder(turned, math.tau))
         between = (stamps >= record.left / SECOND - 0.2) & (stamps <= record.arrived / SECOND + 0.2)
         heard = np.concatenate(((record.left / SECOND,), stamps[between], (record.arrived / SECOND,)))
-        # 0.5: seconds without a reading: what the robot turned meanwhile is not known
+        # 0.5: maximum gap between readings, s: the turn meanwhile is unknown
         if (silent := float(np.diff(heard).max())) > 0.5:
             raise InputError(f"the unit was silent for {silent:.1f} s while the robot turned: measure again")
         integral = float(np.trapezoid(rates[between], stamps[between]))
@@ -67,7 +67,7 @@ class Turn:
 
 @dataclass(frozen=True, slots=True)
 class ImuWizard:
-    """At rest for ten seconds; then full circles to both sides."""
+    """Measure at rest for ten seconds, then in full circles to both sides."""
 
     name: ClassVar[WizardName] = "imu"
     doc: ClassVar[str] = "biases of the inertial unit at rest, and the scale of its yaw rate from full turns"
@@ -79,7 +79,7 @@ class ImuWizard:
 
     @classmethod
     def of(cls, rounds: int, still: bool) -> Self:
-        """With the command's options."""
+        """Build it from the command's options."""
         return cls(rounds, turns=not still)
 
     async def __call__(self, context: WizardContext) -> Result:

@@ -1,7 +1,7 @@
 """Mount of the lidar on the body, and the offset of its clock, from scans between rests.
 
 At two rests the lidar sees the same surroundings; how it moved between them follows from its scans alone, and how the
-body moved from wheels and steering. The mount is what makes one of the other: X in A X = X B (Tsai and Lenz, "A New
+body moved from wheels and steering. The mount transforms one into the other: X in A X = X B (Tsai and Lenz, "A New
 Technique for Fully Autonomous and Efficient 3D Robotics Hand/Eye Calibration", IEEE Transactions on Robotics and
 Automation, 1989), here in the plane. The turn is taken from the scans, which measure it best; so neither the compass
 nor an error of the steering counts, only the distance, whose scale is fitted too, and the direction of travel.
@@ -78,11 +78,11 @@ class LidarLeg:
     sigma: float
     """Standard deviation of its position, m."""
     travel: float = 0.0
-    """Direction in which the body travels by its steering, against its axis, rad."""
+    """Direction of the body's travel by its steering, relative to its axis, rad."""
 
     @classmethod
     def of(cls, record: MoveRecord, chassis: Chassis, mount: tuple[float, float, float]) -> "LidarLeg":
-        """From a move with steady steering.
+        """Build it from a move with steady steering.
 
         Args:
             record: with scans.
@@ -143,7 +143,8 @@ class LidarWizard:
             raise RequestRefusedError(Reason.NOT_SUPPORTED, "the lidar's mount is measured with a compass")
         believed = tuple(float(context.value(f"{LIDAR}.{name}")) for name in ("x", "y", "yaw"))
         mount = (believed[0], believed[1], believed[2])
-        # First, so that a wrong number is refused before anything is driven, and nobody walks there afterwards.
+        # First, so that a wrong number is refused before the robot drives, and the operator need not walk there
+        # afterwards.
         level = await self._level(context) if self.heights else ()
         await context.confirm(CLEAR)
         chassis = context.chassis
@@ -220,7 +221,7 @@ async def joint_angles(context: WizardContext) -> tuple[float, float]:
 
 
 def crab_error(context: WizardContext) -> float:
-    """Standard deviation of the angle at which the truck may crab, rad: by the steering's calibration, or by eye."""
+    """Standard deviation of the crab angle, rad: by the steering's calibration, or by eye."""
     steering = context.known.get("steering")
     halves = []
     for axle in AXLES:
@@ -246,7 +247,7 @@ def result_of(
         legs: driven.
         mount: as configured, m and rad.
         crab: standard deviation of the direction of travel, rad.
-        offset: of the clocks; None = not measured.
+        offset: of the clocks; None if not measured.
         level: pitch and roll, where measured.
 
     Raises:
@@ -286,7 +287,7 @@ def result_of(
 
 
 def fit_mount(legs: Sequence[LidarLeg], mount: tuple[float, float, float], crab: float) -> FitResult:
-    """Least squares of the lidar's translations; parameters x, y (m), yaw (rad), scale of the distances, crab (rad)."""
+    """Fit the lidar's translations by least squares; parameters x, y (m), yaw (rad), scale, crab (rad)."""
     distances, seen = np.array([leg.distance for leg in legs]), np.array([leg.seen for leg in legs])
     travels = np.array([leg.travel for leg in legs])
     sigmas = np.array([math.hypot(leg.sigma, LEG_DRIFT * leg.distance, CRAB * leg.distance) for leg in legs])
@@ -352,7 +353,7 @@ def check_way_round(before: Scan, after: Scan, moved: tuple[float, float], mount
         guess = between(turned, compose(body, turned))
         found = register(seen(after), Cloud.of(seen(before)), guess, reach=0.3)
         found = register(seen(after), Cloud.of(seen(before)), found.pose)
-        # 0.2: overlap by which another way round has to be better, to be named
+        # 0.2: minimum gain in overlap to report a reversed mount
         if found.overlap > max(LEAST_OVERLAP, overlap + 0.2):
             raise InputError(
                 f"the lidar {what}: a leg's scans overlap by {found.overlap:.0%} so, by {overlap:.0%} as configured"
@@ -426,9 +427,9 @@ def beam_tilt(heights: Sequence[float], walls: tuple[float, float]) -> tuple[flo
 
 
 def time_offset(records: Sequence[MoveRecord]) -> Offset | None:
-    """Offset of the clocks of odometry and scans, from weaving; None where too little turned, or nothing was seen.
+    """Offset of the clocks of odometry and scans, from weaving; None if it cannot be determined.
 
-    The correlation of ``find_offset`` says whether there is a gross one; least squares of the yaws refine it.
+    The correlation of ``find_offset`` finds a gross one; least squares of the yaws refine it.
     """
     series = [found for record in records if (found := _yaws(record)) is not None]
     if not series:
@@ -438,11 +439,11 @@ def time_offset(records: Sequence[MoveRecord]) -> Offset | None:
 
 
 def fit_offset(series: Sequence[tuple[Array, Array, Array, Array]], coarse: float | None) -> Offset:
-    """Least squares of the offset.
+    """Least-squares fit of the offset.
 
     Args:
         series: of each move, times (s) and yaws (rad) of the scans, times and yaws of odometry.
-        coarse: first guess, s; None = 0.
+        coarse: first guess, s; None for 0.
     """
 
     def residual(parameters: Array) -> Array:

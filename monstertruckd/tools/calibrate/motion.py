@@ -78,7 +78,7 @@ class Mover:
             RequestRefusedError: the gate refused, stopped or holds the truck; carries the gate's reason.
             NoAnswerError: the truck does not move although nothing holds it, or sends no feedback.
         """
-        unmoved = 0.01  # distance up to which a truck is still at the start of its move (m)
+        unmoved = 0.01  # maximum distance of a truck still at the start of its move (m)
         depth = 4096
         with (
             ExitStack() as besides,
@@ -121,7 +121,7 @@ class Mover:
         run.track.left = run.robot_time
         distance, since = 0.0, self._clock.now()
         began = since
-        stuck = 3.0  # time without progress after which a move is cancelled (s)
+        stuck = 3.0  # maximum time without progress in a move (s)
         while True:
             side = move.side((self._clock.now() - began) / SECOND)
             await run.hold(move.speed, side * move.front, side * move.rear, REQUEST_PERIOD)
@@ -177,7 +177,7 @@ class _Run:
 
     @property
     def robot_time(self) -> int:
-        """Latest stamp received from the robot (ns), whose clock differs from this computer's."""
+        """Latest stamp received from the robot (ns), on a clock that differs from this computer's clock."""
         stamps = [0 if self.state is None else self.state.stamp, *(reading.stamp for reading in self.track.drive[-1:])]
         return max(stamps)
 

@@ -1,4 +1,4 @@
-"""Distance scale, wheelbase and steering offset of dead reckoning, from squares driven both ways.
+"""Distance scale, wheelbase and steering offset of dead reckoning, from squares driven in both directions.
 
 After the test of Borenstein and Feng ("Measurement and Correction of Systematic Odometry Errors in Mobile Robots", IEEE
 Transactions on Robotics and Automation, 1996): errors of the offset turn a square driven to the left and one driven to
@@ -32,14 +32,14 @@ CORNER: Final = 0.08
 ANGLE: Final = 0.35
 """Angle of both axles in the corners, in opposite directions, rad."""
 PLACE: Final = 0.03
-"""Standard deviation of the position back at the mark by what slips on 10 m, m."""
+"""Standard deviation of the final position by slip over 10 m, m."""
 FLOOR_DIFFERENCE: Final = 0.003
-"""Share by which the distance differs on another floor, half a 95 % interval."""
+"""Relative change of the distance on another floor, half a 95 % interval."""
 LINKAGE: Final = 0.004
-"""Share of a turn by which a linkage is off its polynomials, half a 95 % interval."""
+"""Relative error of a linkage's polynomials in a turn, half a 95 % interval."""
 ON_THE_SPOT: Final = 0.004
-"""Share of a corner by which wheels turn the body as they are steered at its ends, where it stands, half a 95 %
-interval: 0.005 rad among rigid bodies."""
+"""Relative turn of the body by steering at standstill at the ends of a corner, half a 95 % interval: 0.005 rad among
+rigid bodies."""
 BELIEVED: Final = (0.05, 0.05, math.radians(6.0))
 """Standard deviations before anything is measured: share of distance and of wheelbase, servo angle, rad."""
 
@@ -186,7 +186,7 @@ class OdometryWizard:
 
 
 def _turned(record: MoveRecord, left: float) -> bool:
-    """Whether it has turned by so many rad, left positive: a corner makes up for what the sides bend."""
+    """Whether it has turned by so many rad, left positive: a corner compensates the bend of the sides."""
     return record.turned() * math.copysign(1.0, left) >= abs(left)
 
 
@@ -208,7 +208,7 @@ class SquareModel:
         self._ahead = ahead
 
     def maps(self, offset: float) -> Maps:
-        """With servos that stand by ``offset``, rad, more to the left in front, and to the right at the rear."""
+        """Shift the servos by ``offset``, rad, to the left in front, and to the right at the rear."""
         shift = math.degrees(offset)
         front, rear = (
             c - s * d for c, s, d in zip(self._maps.centres, self._maps.scales, (shift, -shift), strict=True)
@@ -249,7 +249,7 @@ class SquareModel:
         return x + self._ahead * (math.cos(yaw) - 1.0), y + self._ahead * math.sin(yaw)
 
     def fit(self, squares: Sequence[Square], tape: float, string: float) -> FitResult:
-        """Least squares; residuals in standard deviations, the priors last."""
+        """Solve by least squares; residuals in standard deviations, the priors last."""
         legs = [leg for square in squares for leg in square.legs]
         turned = np.array([leg.turn for leg in legs])
         sigmas = np.array([math.hypot(leg.sigma, SLIP * math.sqrt(self._model.distance(leg))) for leg in legs])
@@ -277,7 +277,7 @@ class SquareModel:
 
 
 def check_senses(model: "SquareModel", squares: Sequence[Square]) -> None:
-    """Raise where the truck turned the other way than its steering says, or an axle did.
+    """Refuse turns against the steering, of the truck or of an axle.
 
     Raises:
         InputError: so it is.
@@ -293,7 +293,7 @@ def check_senses(model: "SquareModel", squares: Sequence[Square]) -> None:
 
 
 def intervals(fit: FitResult, measured: int) -> tuple[Interval, Interval, Interval]:
-    """Of distance and wheelbase (shares) and offset (rad), from so many measurements.
+    """Corrections of distance and wheelbase (fractions) and offset (rad), from so many measurements.
 
     Raises:
         InputError: they are off by more than a fit may find.

@@ -1,8 +1,8 @@
 """Turning centres and effective wheels of a skid-steer body, from arcs between two rests.
 
-What says where the body was is a test stand, or the map's pose (``--by``). Each arc has one ratio of wheel rates, so
-that its motion is the exponential of one twist; wheels turned and poses at rest, averaged, are all that counts, and no
-delay of anybody's does.
+A test stand, or the pose in map, gives the body's position (``--by``). Each arc has one ratio of wheel rates, so
+that its motion is the exponential of one twist; only wheel turns and averaged poses at rest are used, so delays have no
+effect.
 """
 
 import math
@@ -54,7 +54,7 @@ class SkidArc:
 
     @classmethod
     def of(cls, record: MoveRecord, observer: Observer, chassis: Chassis) -> "SkidArc":
-        """From a move.
+        """Build it from a move.
 
         Raises:
             InputError: too few poses at rest, or a shaft without feedback.
@@ -85,7 +85,7 @@ class SlipWizard:
     doc: ClassVar[str] = "turning centres and wheels of a skid-steer body, from arcs seen by a stand or in the map"
     room: ClassVar[str] = ROOM
     by: Observer = "stand"
-    """What says where the robot is: a test stand, or its own map"""
+    """Source of the robot's position: a test stand, or its own map"""
     rounds: int = 2
     """Times that each arc is driven"""
     turn: float = 2.0

@@ -1,4 +1,4 @@
-"""Place and axis of every sonar, the width of their cones, and the speed of sound, from arcs beside a flat wall.
+"""Place and axis of every sonar, the width of their cones, and the speed of sound, from arcs next to a flat wall.
 
 A wall sends the sound back along its normal, from wherever in the cone that is: a range is the sonar's distance from
 the wall while the normal lies in the cone, and the cone's edge meets the wall a little beyond. Arcs to both sides turn
@@ -36,20 +36,20 @@ ROOM: Final = (
 NOISE: Final = (0.005, 0.01)
 """Standard deviation of a range: m, and share of it, added in quadrature."""
 ARC_DRIFT: Final = (0.003, 0.003, 0.01)
-"""Standard deviation of what odometry is off by on an arc: distance from the wall (m) and heading (rad) from where the
-arc before ended, and the share by which it turns more, as gyroscopes and slipping wheels let it."""
+"""Standard deviation of the odometry's error on an arc: distance from the wall (m) and heading (rad) since the previous
+arc, and relative excess of the turn, due to gyroscopes and slipping wheels."""
 BELIEVED: Final = 0.01, 0.003
 """Standard deviations before anything is measured, as shares: of the speed of sound (6 degrees Celsius), and of the
 distance by odometry: on another floor or under another load the wheels roll a little further or less far."""
 FIRST_RANGE_ERROR: Final = 0.2
-"""Greatest error of a range that still may be the wall, m, before anything is fitted."""
+"""Maximum error of a range from the wall before the fit, m."""
 BEYOND: Final = 0.3
 """Past the cone's edge the wall is still heard, rad: grazing sound is reflected away."""
 LEAST_ECHOES: Final = 12
 """Minimum echoes per sonar for the fit of its place."""
 COMMON: Final = 5
-"""Parameters before those of the arcs: distance and direction of the wall, half the cone, factors of the ranges and of
-the distance by odometry."""
+"""Parameters before the arcs' parameters: distance and direction of the wall, half the cone, factors of the ranges and
+of the distance by odometry."""
 
 _PARK: Final = Confirm(
     "park", "Stand the robot along the wall, the wall 1.7 m to its left, the middle of the wall beside it. Done?"
@@ -76,7 +76,7 @@ class SonarLeg:
 
     @classmethod
     def of(cls, record: MoveRecord, origin: tuple[float, float, float]) -> "SonarLeg":
-        """From a move.
+        """Build it from a move.
 
         Args:
             record: with odometry and sonars.
@@ -110,7 +110,7 @@ class SonarLeg:
 
 @dataclass(frozen=True, slots=True)
 class SonarWizard:
-    """An arc to each side, driven ahead and back, beside a wall."""
+    """An arc to each side, driven ahead and back, next to a wall."""
 
     name: ClassVar[WizardName] = "sonar"
     doc: ClassVar[str] = "where the sonars sit and look, their cones, and the speed of sound, from arcs beside a wall"
@@ -162,7 +162,7 @@ def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape
         tape_error: its standard deviation, m.
 
     Raises:
-        InputError: arcs to one side only, too few echoes, or sonars that hear what others should.
+        InputError: arcs to one side only, too few echoes, or swapped sonars.
     """
     headings = np.concatenate([p[:, 2] for leg in legs for p in leg.poses.values()] or [np.zeros(1)])
     span = 1.0  # turn to each side, rad, at least
@@ -253,8 +253,8 @@ def swings(poses: Array) -> Array:
 class SonarModel:
     """Ranges of a wall along arcs.
 
-    Parameters: ``COMMON``; for every arc what the robot is nearer to the wall (m) and turned (rad) against odometry
-    (not for the first one), and by what share it turns more, in turn; x, y, yaw of every sonar.
+    Parameters: ``COMMON``; for every arc the robot's shift towards the wall (m) and turn (rad) against odometry (not
+    for the first one), and the relative excess of its turn, in turn; x, y, yaw of every sonar.
 
     Args:
         legs: driven.
@@ -291,11 +291,11 @@ class SonarModel:
         self.kept = self._chosen(self._start, FIRST_RANGE_ERROR, 0.0)
 
     def samples(self, name: str) -> int:
-        """Echoes of a sonar that are the wall's."""
+        """Echoes of a sonar from the wall."""
         return int((self.kept.sonars == self.order.index(name)).sum())
 
     def fit(self) -> FitResult:
-        """Least squares: by what the wall meets within the cones, then by their edges too, then without strays.
+        """Solve by least squares: by the normals within the cones, then by their edges too, then without strays.
 
         Raises:
             InputError: too few echoes of a sonar.
@@ -320,7 +320,7 @@ class SonarModel:
         return least_squares(self._residual, start, self._start - reach, self._start + reach)
 
     def _predicted(self, parameters: Array, echoes: "_Echoes") -> tuple[Array, Array]:
-        """Ranges as the sonars measure them, m, and what the normal is past the cone's edge, rad."""
+        """Ranges as the sonars measure them, m, and angle of the normal beyond the cone's edge, rad."""
         distance, direction, half, factor, scale = parameters[:COMMON].tolist()
         nearer, turned, swung = self._drift(parameters)[echoes.arcs].T
         x, y, yaw = parameters[self.first :].reshape(-1, 3)[echoes.sonars].T
@@ -329,7 +329,7 @@ class SonarModel:
         return due / factor, past
 
     def _drift(self, parameters: Array) -> Array:
-        """Of every arc what the robot is nearer (m), turned (rad), and by what share it turns more; (n, 3)."""
+        """Shift (m), turn (rad) and relative excess of the turn of every arc, (n, 3)."""
         return np.concatenate((np.zeros(2), parameters[COMMON : self.first])).reshape(-1, len(ARC_DRIFT))
 
     def _drifted(self, drift: Array) -> Array:
@@ -352,7 +352,7 @@ class SonarModel:
         return np.concatenate((off, drift.ravel(), believed, [taped]))
 
     def _chosen(self, parameters: Array, bounds: Array | float, beyond: float) -> "_Echoes":
-        """The wall's echoes: as near to what is due as ``bounds``, m, ``beyond`` the cone's edge at most, rad."""
+        """The wall's echoes: within ``bounds`` (m) of the expected range, at most ``beyond`` (rad) the edge."""
         due, past = self._predicted(parameters, self._echoes)
         near = np.abs(self._echoes.ranges - due) < bounds
         near &= (past <= beyond) & (due > self._limits[0]) & (due < self._limits[1])
@@ -374,7 +374,7 @@ class _Echoes(NamedTuple):
 
 
 def _check_places(legs: Sequence[SonarLeg], places: Mapping[str, SonarPose], wall: float, half: float) -> None:
-    """Raise where a sonar looks elsewhere than it should: by the middle of the directions in which it hears the wall.
+    """Refuse a sonar that looks in a wrong direction, by the middle of the directions that hear the wall.
 
     Raises:
         InputError: cables or addresses are swapped, or a sonar hears no wall.
@@ -390,7 +390,7 @@ def _check_places(legs: Sequence[SonarLeg], places: Mapping[str, SonarPose], wal
             due = np.abs(wrap(bearings - place.yaw)) <= half + BEYOND
             off[at] = abs(wrap(mean_angle(bearings[near]) - mean_angle(bearings[due]))) if due.any() else math.pi
         nearest = min(off, key=lambda at: off[at])
-        # 0.4: angle between the middle of the echoes and that of those that are due, rad, that no mount is off by
+        # 0.4: maximum angle between the middles of the measured and of the expected echoes of any mount, rad
         if off[name] > 0.4 and nearest != name:
             wrong.append(f"{name} hears what is due at {nearest}")
     if deaf:

@@ -1,4 +1,4 @@
-"""Zero and direction of the two servos below the lidar, by the height of its beam and by what it sees of the floor.
+"""Zero and direction of the two servos below the lidar, by the height of its beam and by its view of the floor.
 
 The levelling runs as always: it turns the joints against the tilt that the compass measures. On a level floor the
 height of the beam at its window, on a wall ahead and on one to the left gives the tilt of the lidar; minus the tilt of
@@ -40,9 +40,9 @@ TILT: Final = math.radians(0.2)
 BLOCKS: Final = (math.radians(4.0), math.radians(15.0))
 """Tilt range of a body on blocks (rad)."""
 FOLLOWS: Final = math.radians(2.0)
-"""Difference between a joint and the tilt that it takes out, rad, up to which it follows."""
+"""Maximum difference between a following joint and the tilt that it compensates, rad."""
 SECTOR: Final = math.radians(20.0)
-"""Angle to both sides of the direction in which a tilted lidar meets the floor."""
+"""Half angle of the sector where a tilted lidar meets the floor."""
 JOINTS: Final = ("pitch", "roll")
 
 _LEVEL: Final = Confirm("level", "Stand the robot on the level floor, wheels straight, and let go. Done?")
@@ -74,7 +74,7 @@ class RestMeasurement:
     def of(
         cls, scans: Sequence[LaserScan], tilts: Sequence[Attitude], joints: Sequence[StabiliserFeedback]
     ) -> "RestMeasurement":
-        """From messages.
+        """Build it from messages.
 
         Raises:
             InputError: a servo does not answer.
@@ -157,8 +157,8 @@ def result_of(
         tape_error: standard deviation of a height, m.
 
     Raises:
-        InputError: heights that no lidar has; the blocks are missing, a joint does not follow, or what the lidar sees
-            fits neither direction.
+        InputError: heights that no lidar has; the blocks are missing, a joint does not follow, or the scans fit neither
+            direction.
     """
     error = math.hypot(tape_error * math.sqrt(2), FLAT * tape_error)
     lies = RollPitch(*beam_tilt((heights.centre, heights.ahead, heights.left), walls))
@@ -169,7 +169,7 @@ def result_of(
     for axis, (name, joint, change) in enumerate(zip(JOINTS, joints, changes, strict=True)):
         direction = joint.direction * change
         position = joint.zero + joint.direction * flat.joints[axis] / STEP
-        # 0.3: position, steps, to which a unit reads itself: half a step, evenly
+        # 0.3: standard deviation of a unit's position reading, steps: uniform over a step
         zero = Interval(
             position - direction * really[axis] / STEP,
             NORMAL * math.hypot(math.hypot(error / walls[axis], TILT) / STEP, 0.3),
@@ -208,7 +208,7 @@ def result_of(
 
 
 def _turns(stand: RestMeasurement, flat: RestMeasurement, height: float, axis: int, really: RollPitch) -> int:
-    """+1 where a joint turns as its driver says, -1 where it turns the other way.
+    """+1 if a joint turns as its driver reports, -1 if it turns the other way.
 
     Raises:
         InputError: see ``result_of``.
@@ -265,17 +265,17 @@ def _on_floor(
 ) -> float | None:
     """Share of the beams around ``direction`` (rad) that measure the floor of a lidar with such joints (rad).
 
-    None: it would be hardly nearer than what a level lidar sees there.
+    None if it would be hardly nearer than the range of a level lidar there.
     """
     up = beams_up(stand.body, joints, stand.angles)
     floor = np.where(up < 0.0, height / np.maximum(-up, 1e-9), np.inf)
     sector: NDArray[np.bool_] = np.abs(stand.angles - direction) <= SECTOR
-    # 0.8: share of the distance of what stands there, up to which a floor differs clearly from it
-    # 4.0: distance up to which the lidar sees a floor, m
+    # 0.8: maximum distance of a clearly different floor, as a fraction of the range there
+    # 4.0: maximum distance of a visible floor, m
     due = sector & (floor < 0.8 * flat.ranges) & (floor < 4.0)
     if due.sum() < max(10, sector.sum() / 4):  # beams in the sector
         return None
-    # 0.15: share by which a range may differ from the floor's
+    # 0.15: maximum relative difference between a range and the floor
     return float((np.abs(stand.ranges[due] / floor[due] - 1) < 0.15).mean())
 
 

@@ -50,15 +50,15 @@ class Interval:
         return self.value + self.half
 
     def widened(self, bound: float) -> "Interval":
-        """With a systematic error of at most ``bound`` on top, either way."""
+        """Widen by a systematic error of at most ``bound``, either way."""
         return Interval(self.value, self.half + bound)
 
     def joined(self, half: float) -> "Interval":
-        """With an independent error of half-width ``half``, 95 % like this one, added in quadrature."""
+        """Widen by an independent 95 % error of half-width ``half``, added in quadrature."""
         return Interval(self.value, math.hypot(self.half, half))
 
     def times(self, factor: float) -> "Interval":
-        """Of the value times an exact factor."""
+        """Scale by an exact factor."""
         return Interval(self.value * factor, self.half * abs(factor))
 
 
@@ -96,7 +96,7 @@ def mean_interval(values: ArrayLike, least_error: float = 0.0) -> Interval:
 
 
 def correlation_factor(residuals: Array) -> float:
-    """By how much slow errors inflate the standard error of a fit: root of the integrated autocorrelation, at least 1.
+    """Inflation of a fit's standard error by slow errors: root of the integrated autocorrelation, at least 1.
 
     The sum ends at the first correlation below zero (Sokal's window, simplified).
 

@@ -33,7 +33,7 @@ ROUGH: Final = (0.06, 0.1, 0.4)
 dead, should it go the wrong way."""
 
 DEAD_BAND: Final = 2.0
-"""Pulse, us, by which a servo may stop short of its goal."""
+"""Maximum pulse, us, that a servo stops short of its goal."""
 BAND: Final = NORMAL * DEAD_BAND / math.sqrt(3)
 """The dead band as half a 95 % interval, us."""
 SPAN: Final = 50.0
@@ -65,7 +65,7 @@ class SteeringWizard:
     rough: bool = False
     """Directions and a first centre only: before the compass is calibrated"""
     strings: int = 3
-    """Straight runs along a string; 0 = there is none"""
+    """Straight runs along a string; 0 without a string"""
     string_error: float = 0.0035
     """Standard deviation of the string's direction along the truck, rad: 1.4 mm on 0.4 m"""
     weaves: int = 3
@@ -117,7 +117,7 @@ class SteeringWizard:
 
     @staticmethod
     async def _check_compass(context: WizardContext) -> None:
-        """The compass says that both axles steer the other way: the operator sees whether it is the compass.
+        """The compass indicates that both axles steer the other way: the operator checks whether the compass is wrong.
 
         Raises:
             InputError: it is.
@@ -186,7 +186,7 @@ class SteeringWizard:
     ) -> list[SteeringRun]:
         """A full turn to each side with each axle and with both, which no slow error of the compass can falsify.
 
-        The wheels are as far over as they follow; what is commanded for that is known by the ``first`` maps.
+        The wheels are turned as far as they follow; the ``first`` maps give the command for that.
         """
         ends = {(reach.axle, reach.sign): reach.sign * (abs(reach.servo) - SHORT) for reach in travel}
         legs = []
@@ -218,7 +218,7 @@ class SteeringWizard:
         fit = model.fit(legs, first)
         maps = Maps.from_parameters(fit.parameters)
         travel = [AxleTravel.of(reach.axle, reach.sign, reach.legs, model, maps) for reach in travel]
-        # 0.003: share by which a taped wheelbase may be wrong
+        # 0.003: relative error of a taped wheelbase
         halves, share = half_widths(fit), _distance_error(context) + 0.003
         eye = "" if self.strings else "; errors common to both axles by eye and circles alone"
         band = f"95 % of the legs' noise, and the servo's dead band of {DEAD_BAND:g} us"
@@ -280,13 +280,13 @@ class AxleTravel:
 
     @classmethod
     def of(cls, axle: int, sign: int, legs: Sequence[SteeringRun], model: SteeringModel, maps: Maps) -> "AxleTravel":
-        """From arcs with the wheels far over, as far as ``maps`` give the angle of the other axle."""
+        """Samples from arcs with strongly turned wheels, as far as ``maps`` give the angle of the other axle."""
         reached, meant = np.array([model.reached(leg, maps, axle) for leg in legs]).mean(axis=0).tolist()
         stopped = sign * (meant - reached) > SHORT
         servo = reached if stopped else meant
         angle = model.axle_angle(axle, servo, maps)
         noise = max(math.hypot(leg.sigma, SLIP * math.sqrt(model.distance(leg))) / abs(leg.turn) for leg in legs)
-        # 0.02: share by which the scale known from short arcs may be wrong
+        # 0.02: relative error of the scale from short arcs
         half = abs(angle) * (NORMAL * noise / math.sqrt(len(legs)) + 0.02)
         return cls(axle, sign, servo, angle, stopped, half, tuple(legs))
 
@@ -336,7 +336,7 @@ def steered_senses(arcs: tuple[list[SteeringRun], list[SteeringRun]]) -> tuple[i
     """
     signs = []
     for axle, legs in enumerate(arcs):
-        # Left forward, left back, right forward, right back: what is common to both sides is the centre's.
+        # Left forward, left back, right forward, right back: the common part of both sides belongs to the centre.
         pattern = np.array((1, -1, -1, 1)) * (1 if axle == 0 else -1)
         turn = float(pattern @ [leg.turn for leg in legs]) / 4
         error = math.hypot(*(leg.sigma for leg in legs)) / 4
@@ -358,7 +358,7 @@ def _rough(
         arcs: driven.
         model: of the truck.
         start: configured maps, with the directions found.
-        again: what has to follow.
+        again: remaining steps.
     """
     legs = [*arcs[0], *arcs[1]]
     fit = model.fit(legs, start)
@@ -396,13 +396,13 @@ def _centre(name: str, centre: float, half: float, samples: int, meaning: str) -
 
 
 def _deficits(maps: Maps, halves: Array, samples: int, band: str) -> list[Estimate]:
-    """What the turns lack.
+    """Deficit of the turns.
 
     Args:
         maps: fitted.
         halves: half the 95 % intervals; (6,).
         samples: legs.
-        band: what the intervals cover.
+        band: coverage of the intervals.
     """
     return [
         estimated(
@@ -414,9 +414,9 @@ def _deficits(maps: Maps, halves: Array, samples: int, band: str) -> list[Estima
 
 
 def _distance_error(context: WizardContext) -> float:
-    """Share by which the counted distance may be wrong."""
+    """Relative error of the counted distance."""
     drive = context.known.get("drive")
     ratio = None if drive is None else drive.estimate("turns_per_metre")
     if ratio is None or ratio.low is None or ratio.high is None:
-        return 0.02  # share by which the distance may be wrong while the drive is not calibrated
+        return 0.02  # relative error of the distance while the drive is not calibrated
     return (ratio.high - ratio.low) / 2 / float(ratio.value)

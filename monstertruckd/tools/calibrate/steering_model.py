@@ -1,9 +1,9 @@
-"""From pulses to the truck's turns, and back: the fit behind the steering wizard.
+"""Model between pulses and the truck's turns: the fit behind the steering wizard.
 
 Both axles are steered, so a turn shows the difference of their angles only: wz = v_x (tan front - tan rear) / L.
 Driving arcs with one axle at a time shows the gain of each, and straight driving the difference of their centres. Equal
 errors of both centres make the truck crab without turning, which no compass sees: they show as a sideways offset from a
-string, and faintly as unlike circles to the left and to the right, as far as the linkage is what it is taken for.
+string, and faintly as unlike circles to the left and to the right, if the linkage is modelled correctly.
 """
 
 import itertools
@@ -35,7 +35,7 @@ CURVE: Final = 0.006
 SLIP: Final = 0.004
 """Standard deviation of a turn per root metre by tyres that never roll quite along their plane, rad."""
 LINKAGE: Final = 0.005
-"""Share of a turn by which the linkage may differ from its polynomials."""
+"""Relative error of the linkage's polynomials in a turn."""
 EYE: Final = math.radians(3.0)
 """Servo angle, rad, within which straight wheels look straight: without a string the only word on a common error."""
 
@@ -49,11 +49,11 @@ class Maps:
     scales: tuple[float, float]
     """Front and rear, us per degree."""
     deficit: TurnDeficit = field(default_factory=TurnDeficit)
-    """What the axles turn less than the linkage says."""
+    """Turn that the axles lack compared with the linkage."""
 
     @classmethod
     def of(cls, config: TruckConfig) -> "Maps":
-        """As configured.
+        """Build it as configured.
 
         Raises:
             InputError: the truck has no steering.
@@ -72,7 +72,7 @@ class Maps:
 
     @classmethod
     def from_parameters(cls, parameters: Array) -> "Maps":
-        """From (front centre, front scale, rear centre, rear scale) and the fields of the deficit."""
+        """Build it from (front centre, front scale, rear centre, rear scale) and the fields of the deficit."""
         front, front_scale, rear, rear_scale, *deficit = (float(value) for value in parameters)
         return cls((front, rear), (front_scale, rear_scale), TurnDeficit(*deficit))
 
@@ -87,7 +87,7 @@ class Maps:
         return np.asarray(self.centres[axle] + self.scales[axle] * np.degrees(servo))
 
     def servo(self, axle: int, pulses: Array) -> Array:
-        """Servo angles, rad, that pulses mean, cut to what the linkage takes."""
+        """Servo angles of pulses, rad, cut to the linkage's range."""
         angles = np.radians((pulses - self.centres[axle]) / self.scales[axle])
         return np.asarray(np.clip(angles, -SERVO_LIMIT, SERVO_LIMIT))
 
@@ -112,7 +112,7 @@ class SteeringRun:
     def of(
         cls, track: MoveRecord, maps: Maps, offset: float | None = None, offset_sigma: float = 0.01
     ) -> "SteeringRun":
-        """From a move, driven with the maps the daemon runs on."""
+        """Build it from a move, driven with the daemon's maps."""
         motor, *servos = track.steps()
         turn, noise = track.turn()
         part = abs(math.remainder(turn, 2 * math.pi))
@@ -138,7 +138,7 @@ class SteeringModel:
         return replace(self._linkage, deficit=maps.deficit)
 
     def axle_angle(self, axle: int, servo: float, maps: Maps) -> float:
-        """Angle, rad, of an axle at its servo angle, the other one straight."""
+        """Angle, rad, of an axle at its servo angle, with the other axle straight."""
         return self.axles(maps).angles(*((servo, 0.0) if axle == 0 else (0.0, servo)))[axle]
 
     def commands(self, servos: Sequence[float], true: Maps, configured: Maps) -> tuple[float, float]:
@@ -164,7 +164,7 @@ class SteeringModel:
         """Distance rolled on a leg, m."""
         return float(np.abs(self.chassis.drivetrain.distance(leg.motor)).sum())
 
-    # 0.15: share by which a pulse map may differ from the configured one, before anything is measured
+    # 0.15: maximum relative difference of a pulse map from the configured one, before anything is measured
     def fit(self, legs: Sequence[SteeringRun], start: Maps, gain: float = 0.15) -> FitResult:
         """Pulse maps that explain all legs; parameters as ``Maps.parameters``.
 

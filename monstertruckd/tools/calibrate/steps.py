@@ -36,7 +36,7 @@ class MoveRecord:
     left: int = 0
     """Latest robot stamp at the command to start (ns)"""
     arrived: int = 0
-    """Time at which the truck was at rest again (ns, robot's clock)"""
+    """Time of rest after the move (ns, robot's clock)"""
 
     # Time series
 
@@ -151,7 +151,7 @@ class MoveStep:
     rest: float = 1.0
     """Standstill at each end (s)"""
     approach: float = 0.0
-    """Axle angle from which the wheels turn to their set-point (rad): servos stop short of their goal"""
+    """Axle angle before the wheels turn to their set-point (rad): servos stop short of their goal"""
     weave: tuple[float, ...] = ()
     """Times between sign changes of the axle angles during the drive, repeated cyclically (s); empty: no changes"""
     done: Callable[[MoveRecord], bool] | None = None

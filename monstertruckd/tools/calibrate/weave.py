@@ -1,12 +1,12 @@
-"""Dead time and lag of the steering, from a weaving truck: what the gate commanded, and how the compass turned.
+"""Dead time and lag of the steering, from a weaving truck: the gate's commands against the turns of the compass.
 
 The integral of the lagged curvature, times the speed, is the turn that the compass should see. Each weave has its own
 gain (the linkage may turn less than it should) and trim (the axles may be off centre).
 
-The unit's accelerometers take it for tilt that the truck sets off (2 degrees in the first 0.1 s at speed) and that it
-turns (0.1 degrees to either side). A field that is levelled by such a tilt turns the heading by half as much again, by
-where north is, which looks like another delay and less lag. So headings are computed from the field with one tilt for
-the whole weave; the floor is level.
+The unit's accelerometers mistake starting (2 degrees in the first 0.1 s at speed) and turning (0.1 degrees to either
+side) for tilt. A field that is levelled by such a tilt turns the heading by half as much again, by where north is,
+which looks like another delay and less lag. So headings are computed from the field with one tilt for the whole weave;
+the floor is level.
 """
 
 from collections.abc import Iterable, Sequence
@@ -68,10 +68,10 @@ class Weave:
 
     @classmethod
     def of(cls, record: MoveRecord, chassis: TruckChassis, iron: IronConfig) -> Self | None:
-        """From what was read while the truck was at speed; None where that is too little to compare headings."""
+        """Build it from readings at speed; None if they are too few to compare headings."""
         times = np.array([reading.stamp for reading in record.drive]) / SECOND
         speeds = np.abs([reading.velocity for reading in record.drive])
-        # 0.9: share of the greatest speed from which on a truck neither sets off nor stops
+        # 0.9: minimum fraction of the maximum speed of a truck that neither starts nor stops
         steady = times[speeds >= 0.9 * speeds.max(initial=0.0)]
         if not (record.steering_commands and steady.size):
             return None
@@ -143,7 +143,7 @@ def response(records: Iterable[MoveRecord], chassis: TruckChassis, iron: IronCon
 
 
 def estimates(found: ResponseFit) -> list[Estimate]:
-    """What is saved of it."""
+    """Saved form."""
     meanings = (
         "from a command to the first movement of the wheels",
         "time constant of the turning wheels",

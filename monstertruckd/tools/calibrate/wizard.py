@@ -52,8 +52,8 @@ class WizardContext:
         truck: link to it.
         panel: the operator.
         clock: time.
-        config: the daemon's, calibration included.
-        known: the truck's calibration so far, by wizard; what has expired, or is of another part, does not count.
+        config: of the daemon, calibration included.
+        known: the truck's calibration so far, by wizard; expired results, and results of another part, are ignored.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class WizardContext:
         """Yes or no.
 
         Raises:
-            RequestRefusedError: the operator declined what is required.
+            RequestRefusedError: the operator declined a required step.
             InputError: there is no answer.
         """
         yes = await self._panel.confirm(step)
@@ -168,10 +168,10 @@ class WizardContext:
                 self._panel.progress(step.name, done, total)
 
     def fit(self, name: str, function: Callable[[], T]) -> T:
-        """Compute a result from what was measured, as a step of its own.
+        """Compute a result from the measurements, as a separate step.
 
         Raises:
-            InputError: there is none, as the measurements do not determine it; and what ``function`` raises of its own.
+            InputError: there is none, as the measurements do not determine it; and errors of ``function``.
         """
         self._panel.say(f"computing: {name}")
         try:
@@ -222,12 +222,12 @@ async def save(truck: TruckClient, result: Result) -> tuple[Result, str]:
 
 
 def missing(config: TruckConfig, results: Mapping[str, Result], expired: Collection[str] = ()) -> list[WizardRun]:
-    """Return the runs of wizards that a robot still needs, in the order in which each can use the results before it.
+    """Return the runs of wizards that a robot still needs, in an order that lets each use the results before it.
 
     Args:
         config: of the robot.
         results: of the wizards so far.
-        expired: wizards whose results no longer count.
+        expired: wizards with expired results.
     """
     found = []
     for run in sequence():

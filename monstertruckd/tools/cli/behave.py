@@ -1,4 +1,4 @@
-"""``monstertruckd behave``: list, start and stop what reacts to sensors without a path."""
+"""``monstertruckd behave``: list, start and stop behaviours."""
 
 from typing import TYPE_CHECKING, Annotated, Any
 

@@ -1,4 +1,4 @@
-"""``monstertruckd calibrate``: the wizards, what they found so far, and the way back."""
+"""``monstertruckd calibrate``: the wizards, their results so far, and undo."""
 
 import inspect
 import sys
@@ -135,11 +135,12 @@ def all_(
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:
-    """Every wizard that this robot still needs, in order; what is fresh is skipped.
+    """Run every wizard that this robot still needs, in order; valid results are skipped.
 
     Without a stabiliser, which has its own wizard, the lidar's asks the heights of the beam, too.
 
-    After each, restart the daemon: this command waits for it and goes on. Ended half-way, it begins with what is left.
+    After each, restart the daemon: this command waits for it and continues. If you end it half-way, it resumes with the
+    remaining wizards.
     """
     from monstertruck_runtime.clock import run_wall
     from monstertruckd.tools.cli.calibrate_panel import TerminalPanel
@@ -202,7 +203,7 @@ def show(
     config: FileOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Print what was calibrated, when, how well, and which file the daemon runs on."""
+    """Print all calibrations with date and quality, and the daemon's calibration file."""
     from monstertruckd.config.calibration import unused
     from monstertruckd.config.calibration_rpc import SHOW
 
@@ -236,7 +237,7 @@ def show(
 def accept(
     robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT, json_output: JsonOption = False
 ) -> None:
-    """Save what the tracker has learnt about the steering as its calibration; `show` prints it before.
+    """Save the tracker's estimate of the steering as its calibration; `show` prints it before.
 
     The robot must be disarmed. `calibrate steering --undo` takes it back.
     """
@@ -339,7 +340,7 @@ def _proposed(state: dict[str, Any]) -> "Result | None":
 
 
 def _print(result: "Result") -> None:
-    """A table in a pipe; on a terminal a line for each value, and what it means below."""
+    """A table in a pipe; on a terminal a line for each value, with its meaning below."""
     if on_terminal(sys.stdout):
         for e in result.estimates:
             grade = f", {e.grade}" if e.grade else ""

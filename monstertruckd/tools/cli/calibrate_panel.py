@@ -108,7 +108,7 @@ class TerminalPanel:
         return await self._line(name), True
 
     def _forget(self) -> None:
-        """Leave out what was typed before the question: an Enter too much would let the truck move."""
+        """Discard input typed before the question: an extra Enter would let the truck move."""
         if os.isatty(source := sys.stdin.fileno()):
             termios.tcflush(source, termios.TCIFLUSH)
             self._rest = b""

@@ -10,7 +10,7 @@ from monstertruck_runtime.errors import NotFoundError, TruckError
 from monstertruckd.tools.cli.output import remark
 
 SOON: Final = 0.7
-"""Time in which a present robot has answered; after it the command reports that it waits (s)."""
+"""Usual time limit of a robot's answer; after it the command reports that it waits (s)."""
 
 
 if TYPE_CHECKING:
@@ -29,10 +29,10 @@ def with_robot(
     *,
     named: bool = True,
 ) -> T:
-    """Connect, run ``main(client, clock)``, and return what it returns; a link that takes long is said to be awaited.
+    """Connect, run ``main(client, clock)``, and return its result; report a link that takes long.
 
     Args:
-        main: what is done with the robot.
+        main: coroutine that uses the robot.
         robot: its name.
         endpoint: where it listens.
         timeout: seconds to wait for the link and for answers.
@@ -75,7 +75,7 @@ async def robot_config(client: "TruckClient") -> "TruckConfig":
 
 
 async def not_ready(client: "TruckClient") -> str:
-    """Services of the robot that do not work, and why, to follow what is missing; empty where all do."""
+    """Faulty services of the robot with reasons, to follow a remark about missing data; empty if all work."""
     from monstertruck_schemas.health import ServiceState
     from monstertruck_schemas.topics import HEALTH
 

@@ -164,7 +164,7 @@ def simulate(
     """Serve simulated robots' devices behind ptys: at the ports their configurations name, else in a folder of yours.
 
     Faults are read from standard input as with `emulate`, each line beginning with the device's role, the monitor's
-    name, or `usb` (an unknown word lists what it knows); with several robots the robot's name stands before it.
+    name, or `usb` (an unknown word lists the known ones); with several robots the robot's name stands before it.
     `room post X Y` puts an obstacle into the world, `room clear` removes all.
     `tape mark` and `tape` measure how far the robot really is from a mark, as who calibrates it is asked.
     With `--film` nothing is served: robot and daemon run for some seconds on the virtual clock, the robot drives its

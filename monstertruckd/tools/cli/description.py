@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class DescriptionFormat(StrEnum):
-    """Of the file."""
+    """Format of the file."""
 
     URDF = "urdf"
     MJCF = "mjcf"
@@ -32,7 +32,7 @@ def description(
 ) -> None:
     """Print the robot of a configuration as links, masses and joints, with the frames of its sensors.
 
-    The same description is what engine `mujoco` simulates. Of an emulated robot masses and springs are those of its
+    The same description is what engine `mujoco` simulates. Masses and springs of an emulated robot come from its
     section `sim`.
     """
     from monstertruck_kinematics.description import urdf

@@ -35,7 +35,7 @@ OWN_CLIENTS: Final = {
     "video": "no video device: only this project's webcam driver, on `port: { path: ... }`, understands what it speaks",
     "i2c": "no I2C bus: only this project's drivers and `probe` understand what it speaks",
 }
-"""What an emulator's link is not, by what its driver opens."""
+"""Limits of an emulator's link, by the kind of port that its driver opens."""
 
 
 @needs_extra("sim")

@@ -94,7 +94,7 @@ async def _drive(robot: str, endpoint: str, clock: "Clock", command: "Callable[.
 
 
 def _mend(findings: "Sequence[Finding]", *, yes: bool) -> None:
-    """Run what mends something and can break nothing, one after the other."""
+    """Run the harmless remedies in turn."""
     import subprocess
 
     from monstertruckd.tools.doctor.context import Level, safe_fix
@@ -104,7 +104,7 @@ def _mend(findings: "Sequence[Finding]", *, yes: bool) -> None:
             continue
         if not (yes or typer.confirm(f"{finding.check}: run {finding.fix}?", err=True)):
             continue
-        code = subprocess.run(arguments, check=False).returncode  # noqa: S603  # from a list of our own commands
+        code = subprocess.run(arguments, check=False).returncode  # noqa: S603  # from our list of commands
         remark(f"{finding.check}: {'done' if code == 0 else f'ended with {code}'}; run `monstertruckd doctor` again")
 
 

@@ -1,4 +1,4 @@
-"""``monstertruckd explore``: have the robot explore what it does not know, and follow it."""
+"""``monstertruckd explore``: have the robot explore unknown ground, and follow it."""
 
 import re
 from typing import TYPE_CHECKING, Annotated, Final

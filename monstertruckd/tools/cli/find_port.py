@@ -28,7 +28,7 @@ async def find_cable(role: str, machine: Machine, say: Callable[[str], None], ti
     """Ask for a cable to be unplugged and plugged in again, and name its place.
 
     Args:
-        role: what the cable leads to, for the questions and the baud rate.
+        role: device at the cable, for the questions and the baud rate.
         machine: where to look.
         say: shows one line to the user.
         timeout: seconds to wait for either.
@@ -91,7 +91,7 @@ async def _unplugged(machine: Machine, say: Callable[[str], None]) -> UsbDevice:
 
 
 def _lost(before: TreeSnapshot, now: TreeSnapshot) -> list[UsbDevice]:
-    """What is gone, or was for a moment."""
+    """Ports that are gone, or were for a moment."""
     return [
         device
         for name, device in before.devices.items()

@@ -80,8 +80,8 @@ def track(
 ) -> None:
     """Send a path to the robot and follow how it is driven.
 
-    Ends at its end or when it is lost, with the reason's exit code. Ctrl-C stops the robot; armed later, it does not go
-    on along the path.
+    Ends at its end or when it is lost, with the reason's exit code. Ctrl-C stops the robot; armed later, it does not
+    resume the path.
     """
     from monstertruck_planners.track.paths import load_path
     from monstertruck_runtime.drives import follow

@@ -38,7 +38,7 @@ ls: least squares over radii and speeds; max: least worst error. A trajectory of
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Turn what the library refuses into the command line's own error.
+    """Turn the library's refusals into errors of the command line.
 
     Raises:
         InputError: for any KinematicsError of the block.
@@ -181,7 +181,7 @@ def radius_table_command(
     png: Png = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Least turning radius by steering mode and steering limit."""
+    """Print the minimum turning radius by steering mode and steering limit."""
     from monstertruck_kinematics.truck import FourWheelSteering
 
     modes: tuple[SteeringModeName, ...] = ("front", "rear", "counter", "crab", "spot")

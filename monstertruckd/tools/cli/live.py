@@ -78,7 +78,7 @@ def echo(
 async def _explain_silence(client: "TruckClient", clock: "Clock", topic: "Topic[Any]") -> None:
     from monstertruck_schemas.topics import Writer
 
-    await clock.sleep(2.0)  # seconds without a message after which `echo` says what it is waiting for
+    await clock.sleep(2.0)  # seconds without a message before `echo` reports the awaited topic
     if not await client.alive():
         remark(f"no robot {client.robot!r} seen at {client.endpoint}; waiting for {topic.name}")
     elif topic.writer is Writer.STAND:

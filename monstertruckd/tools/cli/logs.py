@@ -35,7 +35,7 @@ RECOVER: Final = "`monstertruckd log recover` repairs it"
 
 
 class ExportFormat(StrEnum):
-    """What a log can be written as."""
+    """Export formats of a log."""
 
     CSV = "csv"
     NPZ = "npz"
@@ -56,7 +56,7 @@ def list_command(
     folder: Annotated[Path, typer.Argument(help="Folder of logs, with all folders in it.")] = Path("logs"),
     json_output: JsonOption = False,
 ) -> None:
-    """The logs of a folder, the newest last: when, whose, how long, how much, finished or not."""
+    """List the logs of a folder, latest last: date, robot, duration, size, finished or not."""
     from monstertruckd.tools.logs.summary import LogState, list_logs
 
     logs = list_logs(folder)
@@ -88,7 +88,7 @@ def list_command(
 
 @app.command("info")
 def info_command(log: LogArgument, json_output: JsonOption = False) -> None:
-    """Show what a log holds: topics, counts, rates, attachments, damage."""
+    """Show the content of a log: topics, counts, rates, attachments, damage."""
     from monstertruckd.recorder.repair import in_use
     from monstertruckd.tools.logs.summary import info
 
@@ -133,7 +133,7 @@ def fetch_command(
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
-    """Fetch a recording from a running robot, going on with what is there of the file already.
+    """Fetch a recording from a running robot; resumes an earlier download.
 
     The robot gives 1 MB/s at most, and one recording at a time.
     """
@@ -252,7 +252,7 @@ def animate_command(
     width: Annotated[int, typer.Option(min=64, max=1920, help="Pixels.")] = 560,
     json_output: JsonOption = False,
 ) -> None:
-    """Write a drive as a moving picture: the robot from above, its path, and what its lidar or sonars see."""
+    """Write a drive as a moving picture: the robot from above, its path, and the echoes of its lidar or sonars."""
     from monstertruckd.recorder.reader import open_log
 
     with needs_extra("logs"):
@@ -295,7 +295,7 @@ def view_command(
 
 
 def finish_log(log: Path, fault: str | None) -> None:
-    """End a command that used a log: if that is damaged, with one sentence and an exit code of its own.
+    """End a command that used a log: if that is damaged, with one sentence and its own exit code.
 
     A log that is being written ends where it ends.
 

@@ -1,4 +1,4 @@
-"""Commands on maps: build one from a log, show it, save a robot's, localise in it."""
+"""Commands on maps: build one from a log, show it, save a robot's map, localise in it."""
 
 import os
 from collections import Counter
@@ -278,7 +278,7 @@ def load_command(
     config: ConfigOption,
     output: Annotated[Path, typer.Option("--output", "-o", help="Configuration to write.")],
 ) -> None:
-    """Write a configuration with which the robot localises in a saved map; one written so before is replaced.
+    """Write a configuration that localises the robot in a saved map; replaces an earlier one.
 
     An explorer is left out: it makes maps.
     """
@@ -362,7 +362,7 @@ def _load(place: Path) -> "SavedMap":
 
 
 def _read(path: Path, options: ReadOptions) -> "ScanLog":
-    """Read a log; what is assumed of its geometry is remarked on."""
+    """Read a log; print a remark for assumed geometry."""
     import math
 
     with needs_extra("logs"):

@@ -100,7 +100,7 @@ def list_command(
     folder: Annotated[Path, typer.Argument(help="Folder with missions.")] = MISSIONS,
     json_output: JsonOption = False,
 ) -> None:
-    """Print the missions of a folder, and what is wrong with those that cannot be run."""
+    """Print the missions of a folder, and the faults of those that cannot be run."""
     if not folder.is_dir():
         raise NotFoundError(f"{folder}: no such folder")
     rows = []
@@ -147,7 +147,7 @@ def read(file: Path) -> "tuple[Mission, Callable[[Key], str]]":
         The mission, and a function that returns file and line of a key.
 
     Raises:
-        ConfigError: one line per mistake, each naming file, line, key and what was expected.
+        ConfigError: one line per mistake, with file, line, key and expectation.
         InputError: a waypoint is invalid, or the file cannot be read.
     """
     from monstertruck_planners.missions.check import dead_ends

@@ -80,10 +80,10 @@ def move(
 
 
 def _check(settings: dict[str, Any]) -> None:
-    """Refuse what is no move before any robot is asked.
+    """Refuse invalid moves before contacting any robot.
 
     Raises:
-        InputError: the text says what was expected.
+        InputError: names the expectation.
     """
     from pydantic import ValidationError
 

@@ -1,4 +1,4 @@
-"""Options and arguments that many commands share, with what a shell completes for them."""
+"""Options and arguments that many commands share, with their shell completion."""
 
 import inspect
 import math
@@ -20,7 +20,7 @@ ALWAYS: Final = "estop"
 
 
 def complete_topic(incomplete: str) -> Iterator[tuple[str, str]]:
-    """Topics with what they carry."""
+    """Topics with their content."""
     from monstertruck_schemas.topics import TOPICS
 
     return ((topic.name, topic.doc) for topic in TOPICS if topic.name.startswith(incomplete))
@@ -50,7 +50,7 @@ def complete_role(incomplete: str) -> list[str]:
 
 
 def complete_config(incomplete: str) -> list[str]:
-    """Bundled configurations, and those of the folder ``configs``; the shell completes other file names itself."""
+    """Bundled configurations, and files of the folder ``configs``; the shell completes other file names itself."""
     files = (*Path("configs").glob("*.yaml"), *Path("configs", "robots").glob("*.yaml"))
     return [word for word in (*names(), *sorted(map(str, files))) if word.startswith(incomplete)]
 
@@ -203,9 +203,9 @@ ViaOption = Annotated[
 def with_parameters(
     command: Callable[..., None], *functions: Callable[..., Any], without: Collection[str] = ()
 ) -> Callable[..., None]:
-    """Let ``command``, which takes any keywords, have the parameters of ``functions``: theirs are its options.
+    """Give ``command``, which takes any keywords, the parameters of ``functions`` as its options.
 
-    Those that collect keywords and those named in ``without`` are left out. The help is that of the first function.
+    Those that collect keywords and those named in ``without`` are left out. The help comes from the first function.
     """
     every = (parameter for function in functions for parameter in inspect.signature(function).parameters.values())
     parameters = [

@@ -82,7 +82,7 @@ async def give(client: "TruckClient", order: "Order", *, hold: bool = False) -> 
 
 
 async def _announce(client: "TruckClient", *, hold: bool) -> None:
-    """Say before arming who sets off then, and which calibrations no longer count."""
+    """Print before arming which planners will start, and which calibrations have expired."""
     from monstertruck_schemas.topics import CALIBRATION, GATE
 
     calibration = await client.get_retained(CALIBRATION)
@@ -157,7 +157,7 @@ def arm(
         bool, typer.Option("--hold", help="Let no tracker drive, along a configured path too, until armed without.")
     ] = False,
 ) -> None:
-    """Allow the robot to move; says before who sets off then, such as the tracker of a configured path."""
+    """Allow the robot to move; prints before which planners will start, such as the tracker of a configured path."""
     _run("arm", robot, endpoint, json_output=json_output, hold=hold)
 
 

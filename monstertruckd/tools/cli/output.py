@@ -59,11 +59,11 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Machine-readable outpu
 
 
 def print_json(value: Any, *, indent: int | None = 2) -> None:
-    """Print one JSON value; models and enums become plain, what is not finite becomes null.
+    """Print one JSON value; models and enums become plain, non-finite numbers become null.
 
     Args:
         value: built of mappings, sequences, models, scalars.
-        indent: None = on one line, for streams of values.
+        indent: None for one line, in streams of values.
     """
     from monstertruck_runtime.plain import plain
 
@@ -71,7 +71,7 @@ def print_json(value: Any, *, indent: int | None = 2) -> None:
 
 
 def console(*, error: bool = False) -> "Console":
-    """Where styled text goes: plain and uncut unless it is a terminal."""
+    """Console for styled text: plain and uncut unless it is a terminal."""
     from rich.console import Console
 
     class PipedConsole(Console):
@@ -92,7 +92,7 @@ def print_table(
 ) -> None:
     """Print rows under headings: on a terminal as a table that folds, in a pipe one unfolded line for each row.
 
-    Where a terminal has no room for the last column, its cells have lines of their own, broken between words: a path
+    If a terminal has no room for the last column, its cells are printed on separate lines, broken between words: a path
     is whole.
 
     Args:
@@ -123,7 +123,7 @@ def _has_room(lines: Sequence[Sequence[str]]) -> bool:
     *others, last = zip(*lines, strict=True)
     room = shutil.get_terminal_size().columns - sum(max(map(len, column)) + 2 for column in others)
     longest_word = max((len(word) for cell in last for word in cell.split()), default=0)
-    # 24: least width of a column of words on a terminal; what has less room stands below its row
+    # 24: minimum width of a column of words on a terminal; narrower columns are printed below their row
     return max(map(len, last)) <= room or (room >= 24 and longest_word <= room)
 
 
@@ -165,7 +165,7 @@ def print_words(text: str) -> None:
 
 
 def wrapped(text: str, indent: str = "") -> str:
-    """Text broken between words where the terminal ends; what has no blanks, such as a path, stays whole."""
+    """Text broken between words at the width of the terminal; words without blanks, such as paths, stay whole."""
     wrapper = textwrap.TextWrapper(
         shutil.get_terminal_size().columns,
         initial_indent=indent,
@@ -206,7 +206,7 @@ REMEDIES: Final = {
     Reason.DISARMED: ("monstertruckd arm", "lets it drive"),
     Reason.ESTOPPED: ("monstertruckd reset", "clears the emergency stop"),
 }
-"""The command that removes the cause of a refusal, and what it does."""
+"""Command that removes the cause of a refusal, and its effect."""
 
 WHICH_ROBOT: Final = "monstertruckd.which_robot"
 """Key of a command's context: its options ``--robot`` and ``--endpoint`` as they were given."""

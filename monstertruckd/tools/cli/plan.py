@@ -60,7 +60,7 @@ def plan(
 ) -> None:
     """Plan a route over a map and print or draw it.
 
-    The truck is the author's; poses are of its base. The exit code follows the reason if there is no route.
+    The truck is the Monstertruck; poses are of its base. The exit code follows the reason if there is no route.
     """
     from monstertruck_planners.route.api import RouteMap, Vehicle, make_planner, warm_up
     from monstertruck_planners.route.catalog import ROUTE_PLANNERS

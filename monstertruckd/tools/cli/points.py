@@ -59,7 +59,7 @@ def export_command(
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:
-    """Write all points of interest to a file, whose ending says how."""
+    """Write all points of interest to a file; its extension sets the format."""
     from monstertruck_runtime.small_files import replace_file
 
     if file.suffix not in FORMATS:
@@ -172,7 +172,7 @@ def row_of(point: "PointOfInterest") -> tuple[str, ...]:
 
 
 def values_of(point: "PointOfInterest") -> dict[str, Any]:
-    """What is exported, by ``COLUMNS``."""
+    """Exported values, by ``COLUMNS``."""
     from monstertruck_schemas.base import position_deviation
 
     yaw_sigma = math.sqrt(float(point.covariance[8]))

@@ -67,7 +67,7 @@ def topics(json_output: JsonOption = False) -> None:
 def plugins(json_output: JsonOption = False) -> None:
     """List the kinds that a configuration can choose, and the topics, with the distribution each comes from.
 
-    Those of other distributions are loaded to try them; the ones that are broken are named with the error.
+    Kinds of other distributions are loaded to test them; broken ones are listed with the error.
     """
     from monstertruckd.assembly.catalogs import plugins
 
@@ -107,7 +107,7 @@ def reasons(
 def plan_server(robot: RobotOption = "truck", endpoint: EndpointOption = DEFAULT_ENDPOINT) -> None:
     """Plan and track for a robot whose configuration says `placement: remote`, until Ctrl-C.
 
-    It dials the robot, and again whenever the robot restarts; what it knows comes from there.
+    It dials the robot, and again whenever the robot restarts; all its data comes from the robot.
     """
     from monstertruck_planners.steps import CODEC, STEPS
     from monstertruck_runtime.actors.remote import POLL, serve

@@ -31,7 +31,7 @@ class RunEnd:
 
     @classmethod
     def of(cls, end: TaskEnd[Any], *figures: str) -> "RunEnd":
-        """With these figures of a task's last report."""
+        """Add figures of a task's last report."""
         state = end.state
         return cls(end.reason, end.text, {} if state is None else {name: getattr(state, name) for name in figures})
 
@@ -64,9 +64,9 @@ async def run_exploration(
     arm: bool,
     report: Report | None = None,
 ) -> RunEnd:
-    """Start an exploration and wait for its end, see ``run_task``; its arguments are those of ``TruckClient.explore``.
+    """Start an exploration and wait for its end, see ``run_task``; its arguments are as in ``TruckClient.explore``.
 
-    Cancelled, it waits until the map is saved, and its end says where.
+    Cancelled, it waits until the map is saved, and reports where.
     """
     shown: tuple[Any, ...] | None = None
     due = 0.0
@@ -123,7 +123,7 @@ async def run_mission(
             again = f", attempt {state.attempt}" if state.attempt > 1 else ""
             lines.append(f"step {state.node} of {state.steps}: {state.doing}{again}")
         stands = _why_it_stands(stand)
-        trouble = "stands" if stands else state.text  # what is stale comes and goes while it stands
+        trouble = "stands" if stands else state.text  # stale inputs come and go while it stands
         if trouble and trouble != said:
             lines.append(f"it stands: {stands}" if stands else f"it waits: {state.text}")
         before, said = state, trouble
@@ -156,7 +156,7 @@ def _why_it_stands(stand: StandstillMonitor) -> str:
 
 
 def progress_line(state: ExplorationState, stands: str = "") -> str:
-    """How far an exploration has come, in less than 80 characters, why the truck ``stands``, or what it waits for."""
+    """Progress of an exploration in less than 80 characters, or why the truck ``stands`` or waits."""
     where = "" if state.target is None else f" to ({state.target.x:.1f}, {state.target.y:.1f})"
     if stands:
         return f"{state.elapsed:5.0f} s  it stands: {stands}"

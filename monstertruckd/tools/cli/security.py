@@ -38,7 +38,7 @@ def init(
 ) -> None:
     """Make an authority and the robot's certificate and configuration; again: renew the robot's certificate.
 
-    What is not given stays as it was.
+    Options that are not given keep their values.
     """
     kept = _folder(folder)
     new = kept.init(robot, tuple(address) if address else None, place, _now(), days)
@@ -141,7 +141,7 @@ def check(
     folder: FolderOption = HERE,
     json_output: JsonOption = False,
 ) -> None:
-    """Try a running robot as pilot, observer, under another name, as strangers, without TLS, with what expires.
+    """Try a running robot as pilot, observer, stranger, under another name, and without TLS; list expiries.
 
     Nothing moves. Ends with code 12 if one of them gets more or less than it should.
     """

@@ -22,7 +22,7 @@ def get(
 ) -> None:
     """List the settings that may be changed while the robot runs, with their values and bounds.
 
-    What is bounded by other settings or by the robot's body is said when it is refused.
+    Bounds by other settings or by the robot's body are reported when a value is refused.
     """
     rows = [
         row
@@ -51,7 +51,7 @@ def set_value(
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
-    """Change a setting while the robot runs; it counts from the next control tick on.
+    """Change a setting while the robot runs; it applies from the next control tick on.
 
     The whole configuration is checked as at the start: nothing passes the ceilings of the robot's body. Without --save
     it is forgotten when the daemon ends.

@@ -25,7 +25,7 @@ StandFile = Annotated[Path, typer.Option("--config", "-c", help="The stand's YAM
 def run_command(config: StandFile, endpoint: EndpointOption = DEFAULT_ENDPOINT) -> None:
     """Track the robots and send their poses to their daemons, until Ctrl-C: `mt/stand/sensor/pose_<robot>`.
 
-    A daemon with `stand: overhead` records it. Cameras that are gone, or have moved, are named.
+    A daemon with `stand: overhead` records it. Cameras that are gone, or have moved, are reported.
     """
     from monstertruckd.tools.cli.output import until_stopped
     from monstertruckd.tools.cli.stand_session import run

@@ -105,7 +105,7 @@ def print_tags(out: Path, numbers: str, columns: int, rows: int) -> Iterator[Pat
 
 
 class RobotLink:
-    """Link to one robot's daemon, whenever there is one; that it is there, or why not, is said once.
+    """Link to one robot's daemon, whenever it runs; reports once that it is connected, or why not.
 
     Args:
         robot: its name.
@@ -118,8 +118,8 @@ class RobotLink:
         self._robot, self._endpoint, self._clock, self._say = robot, endpoint, clock, say
         self._said = ""
         self._client: Any = None
-        self._ways: deque[int] = deque(maxlen=100)  # newest messages of a robot by which its clock is known
-        """This clock's time of receipt less the robot's stamp, of its newest messages, ns."""
+        self._ways: deque[int] = deque(maxlen=100)  # number of latest messages of a robot that determine its clock
+        """Time of receipt by this clock minus the robot's stamp, of its latest messages, ns."""
         self._count = 0
 
     async def run(self) -> None:
@@ -146,7 +146,7 @@ class RobotLink:
                 self._report(f"no robot answers at {self._endpoint}")
             except TruckError as error:
                 self._report(str(error))
-            await self._clock.sleep(2.0)  # seconds after which a robot that is not there is looked for again
+            await self._clock.sleep(2.0)  # seconds before a missing robot is searched for again
 
     def _report(self, text: str) -> None:
         if text != self._said:
@@ -162,12 +162,12 @@ class RobotLink:
 
 
 def clocks_apart(ways: Iterable[int]) -> int:
-    """Nanoseconds by which the robot's clock is behind this computer's: 0 on the same computer.
+    """Lag of the robot's clock behind this computer (ns): 0 on the same computer.
 
-    The quickest of ``ways``, from the robot's stamps to their receipt, counts as no time: a millisecond on a network.
+    The shortest of ``ways``, from the robot's stamps to their receipt, is taken as zero: a millisecond on a network.
     """
     least = min(ways)
-    # 200_000_000: nanoseconds from which a robot's clock is another one than this computer's; messages take less
+    # 200_000_000: minimum difference between distinct clocks of robot and computer, ns; messages take less
     return 0 if abs(least) < 200_000_000 else least
 
 

@@ -124,7 +124,7 @@ async def _rerun(address: "RobotAddress", clock: "WallClock") -> None:
 
 
 def _tls(certificate: Path | None, key: Path | None) -> "SSLContext | None":
-    """Of the page; TLS 1.2 at least.
+    """TLS context of the page; TLS 1.2 at least.
 
     Raises:
         InputError: a file is missing, or they do not belong together.

@@ -63,7 +63,7 @@ def analyse_command(
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the figures 6 to 15.")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Radii, speeds, drifts of the centre, spread, bend and turns, beside the paper's, and its figures."""
+    """Print radii, speeds, drifts, spread, bend and turns next to the paper's values, and draw its figures."""
     from monstertruckd.recorder.reader import open_log
     from monstertruckd.tools.logs.geometry import recorded_geometry
     from monstertruckd.tools.study import report
@@ -99,10 +99,10 @@ def analyse_command(
 
 
 def _results(runs: "list[Run]") -> "list[Result]":
-    """What the runs say; those that say nothing, such as one that was stopped at once, are named and left out.
+    """Results of the runs; runs without a result, such as one stopped at once, are reported and skipped.
 
     Raises:
-        InputError: none says anything.
+        InputError: no run has a result.
     """
     from monstertruckd.tools.study.report import analyse
 

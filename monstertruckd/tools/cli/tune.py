@@ -30,7 +30,7 @@ def wall_command(
     robot: RobotOption = "sonar",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
 ) -> None:
-    """Arm the robot, which stands beside a wall, and raise K_p and K_d by the coursework's recipe, run by run."""
+    """Arm the robot, which stands next to a wall, and raise K_p and K_d by the coursework's recipe, run by run."""
     from monstertruckd.tools.tune.runs import tune
 
     if plot is not None:

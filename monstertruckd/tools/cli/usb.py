@@ -18,7 +18,7 @@ def usb(
     local: Annotated[bool, typer.Option("--local", help="This machine's own tree, without a daemon.")] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """USB hubs, ports and devices of a running robot: what hangs where, its role, state and replugs."""
+    """List USB hubs, ports and devices of a running robot, with role, state and replugs."""
     from monstertruck_runtime.clock import run_wall
     from monstertruckd.tools.cli.usb_tree import draw, local_tree, plain, robot_tree
 

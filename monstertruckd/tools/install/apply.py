@@ -1,4 +1,4 @@
-"""Puts a plan into a system, or takes it out; what is already so is skipped."""
+"""Installs a plan into a system, or removes it; steps already done are skipped."""
 
 import os
 import shlex
@@ -35,11 +35,11 @@ UNFINISHED: Final = FOLDER / ".unfinished"
 BOOTED: Final = Path("/run/systemd/system")
 """There while systemd runs, see sd_booted(3)."""
 FILES: Final = (ENABLED, UNIT, RULES, MODULES, TMPFILES, SYSUSERS)
-"""What is taken out; configuration, logs, state and the user stay."""
+"""Removed files; configuration, logs, state and the user stay."""
 
 
 class Change(StrEnum):
-    """What becomes of a file."""
+    """Action on a file."""
 
     NEW = "new"
     CHANGED = "changed"
@@ -51,12 +51,12 @@ class Change(StrEnum):
 
 @dataclass(slots=True)
 class InstallReport:
-    """What was done, or would be."""
+    """Actions done, or planned."""
 
     changes: dict[Path, Change] = field(default_factory=dict)
     commands: list[Command] = field(default_factory=list)
     previous: list[Path] = field(default_factory=list)
-    """Where replaced configurations went."""
+    """Copies of replaced configurations."""
 
     @property
     def changed(self) -> bool:
@@ -90,12 +90,12 @@ def runs_here(root: Path) -> bool:
 
 
 def install(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_command) -> InstallReport:
-    """Write what differs, then notify the running system; an image that does not run is only written.
+    """Write changed files, then notify the running system; an image that does not run is only written.
 
     Raises:
         InputError: a file is masked, is none, or is behind a link out of ``root``; nothing has been written then.
         NotPermittedError: not allowed to write there.
-        NotFoundError, CommandFailedError: see ``run_command``; running it again goes on from there.
+        NotFoundError, CommandFailedError: see ``run_command``; running it again continues from there.
     """
     report = InstallReport({file.path: _change(root, file) for file in plan.files})
     unfinished = below(root, UNFINISHED)
@@ -144,7 +144,7 @@ def uninstall(root: Path, *, dry: bool = False, run: Run = run_command) -> Insta
 
 
 def place_of(root: Path, path: Path) -> Path:
-    """Where a file of the system below ``root`` is.
+    """Path of a system file below ``root``.
 
     Raises:
         InputError: a link on the way there leads out of ``root``.

@@ -17,17 +17,17 @@ from monstertruckd.tools.shipped import shipped
 
 HOMES: Final = (Path("/home"), Path("/root"), Path("/run/user"))
 """Hidden from the service but for the program itself."""
-HIDDEN: Final = (Path("/tmp"), Path("/var/tmp"))  # noqa: S108  # names what the service must not be run from
+HIDDEN: Final = (Path("/tmp"), Path("/var/tmp"))  # noqa: S108  # lists folders that the service must not run from
 LINKS: Final = Path("/dev/truck")
 """Folder of the links that the udev rules make."""
 _PLAIN: Final = re.compile(r"/[A-Za-z0-9/._+=,:~-]*")
 _USER: Final = re.compile(r"[a-z_][a-z0-9_-]{0,31}")
 GROUP = "dialout"
-"""Owns what the daemon may write below /sys."""
+"""Group of the files that the daemon may write below /sys."""
 
 
 def shipped_file(name: str) -> Path:
-    """Where a file of the folder ``systemd`` is.
+    """Path of a file of the folder ``systemd``.
 
     Raises:
         NotFoundError: the installation is not whole.
@@ -39,7 +39,7 @@ def shipped_file(name: str) -> Path:
 
 
 def filled(name: str, values: dict[str, str]) -> str:
-    """Text of a shipped file, its ``@names@`` replaced; a line of its own vanishes if its value is empty."""
+    """Text of a shipped file, its ``@names@`` replaced; a line with nothing else vanishes if its value is empty."""
 
     def value(match: re.Match[str]) -> str:
         return values[match["name"]]
@@ -53,7 +53,7 @@ def filled(name: str, values: dict[str, str]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """What the service runs."""
+    """Command of the service."""
 
     python: Path
     """Interpreter, of the environment the packages are in."""
@@ -76,9 +76,9 @@ def unit_text(config: TruckConfig, config_file: Path, user: str, program: Progra
 
     Args:
         config: whose drives are stopped after a death.
-        config_file: what the service is started with.
+        config_file: configuration file of the service.
         user: it runs as.
-        program: what is run.
+        program: command of the service.
 
     Raises:
         InputError: systemd or its sandbox could not use the user's name or one of the paths.
@@ -102,7 +102,7 @@ def user_name(name: str) -> str:
     """``name``, if a user may be called so.
 
     Raises:
-        InputError: it may not; a line break in it would be a setting of its own.
+        InputError: it may not; a line break in it would add a setting.
     """
     if not _USER.fullmatch(name):
         raise InputError(f"user {name!r}: expected a lower-case letter or _, then at most 31 of a-z 0-9 _ -")
@@ -110,7 +110,7 @@ def user_name(name: str) -> str:
 
 
 def node_of(role: str, port: AnyPort) -> Path:
-    """Where the device of ``role`` is in /dev once the udev rules are in place."""
+    """Path of the device of ``role`` in /dev once the udev rules are in place."""
     return port.path if isinstance(port, PortConfig) else LINKS / role
 
 
@@ -132,14 +132,14 @@ def _stop_words(device: Device[Any], words: str) -> str:
 
 
 def temporary(program: Program) -> str | None:
-    """Why the service could not run ``program``; None = it can."""
+    """Why the service could not run ``program``, or None."""
     hidden = (place for place in program.reads if any(place.is_relative_to(folder) for folder in HIDDEN))
     place = next(hidden, None)
     return None if place is None else f"{place}: temporary, a service has its own /tmp; install to /opt/monstertruckd"
 
 
 def _at_home(program: Program) -> list[Path]:
-    """What the service must still see of the folders that are hidden from it."""
+    """Paths in hidden folders that the service must still see."""
     return [place for place in program.reads if any(place.is_relative_to(home) for home in HOMES)]
 
 
@@ -177,7 +177,7 @@ def _devices(config: TruckConfig) -> Iterator[str]:
 def _device(role: str, port: UsbPortConfig, method: CycleMethod | None, *, camera: bool) -> Iterator[str]:
     """Rules of one device; by its interface's name, as a hub in its port must not pass for it."""
     device, by_topology = port.device, is_topology(port.device)
-    # What stands before the controller in udev's name depends on the board; the bus is no part of it.
+    # The prefix of the controller in udev's name depends on the board; the bus is not part of it.
     itself, key = (
         (f'ENV{{ID_PATH}}=="*{device}"', "ENV{ID_PATH}") if by_topology else (f'KERNEL=="{device}"', "KERNELS")
     )
@@ -204,7 +204,7 @@ def _device(role: str, port: UsbPortConfig, method: CycleMethod | None, *, camer
 
 
 def _switch(port: UsbPortConfig) -> Iterator[str]:
-    """Rules by which the daemon may switch a port off: those of its hub, and of the other half of a USB 3 hub."""
+    """Rules that let the daemon switch a port off: for its hub, and for the other half of a USB 3 hub."""
     hub = f'ENV{{ID_PATH}}=="*{port.hub}:1.0"'
     if not is_topology(port.device):
         hub = f'KERNEL=="{port_directory(port.device).split("/")[-2]}"'

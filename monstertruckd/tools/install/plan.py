@@ -55,14 +55,14 @@ class PlannedFile:
     path: Path
     text: str = ""
     data: bytes | None = None
-    """Content that is no text."""
+    """Binary content."""
     target: Path | None = None
     keep_previous: bool = False
     """An operator may have edited it: the old one is kept next to the new one."""
 
     @property
     def content(self) -> bytes:
-        """What the file holds."""
+        """Content of the file."""
         return self.text.encode() if self.data is None else self.data
 
 
@@ -76,16 +76,16 @@ class InstallPlan:
 
 
 def plan(config_file: Path | None, user: str | None, program: Program, root: Path) -> InstallPlan:
-    """What belongs to the service of a configuration.
+    """Files of a configuration's service.
 
     Args:
         config_file: copied to /etc; None, or one that is there: the one the installed unit names, as it is.
-        user: the service runs as; None: as whom the installed unit says, else ``USER``.
-        program: what it runs.
+        user: user of the service; None for the installed unit's user, else ``USER``.
+        program: command of the service.
         root: of the system that gets it.
 
     Raises:
-        NotFoundError: no configuration was named and none is installed.
+        NotFoundError: no configuration was given and none is installed.
         ConfigError: it was refused.
         InputError: systemd could not use the user's name or one of the paths; or the service of the system that runs
             could not see the program.
@@ -133,15 +133,15 @@ def installed_user(root: Path) -> str | None:
 
 
 def below(root: Path, path: Path) -> Path:
-    """Where an absolute path is in the system below ``root``."""
+    """Place of an absolute path in the system below ``root``."""
     return root / path.relative_to("/")
 
 
 def _placed(files: Sequence[Path], maps: Sequence[Path], folder: Path) -> tuple[Path, tuple[PlannedFile, ...]]:
-    """Where the configuration will be, and what must be copied for that; all files keep their place to each other.
+    """Place of the configuration, and the files to copy there; relative places stay the same.
 
     Args:
-        files: of the configuration, its own first; what it names absolutely stays where it is.
+        files: of the configuration, its own first; files with absolute paths stay in place.
         maps: that it names.
         folder: of installed configurations.
 
@@ -168,7 +168,7 @@ def _placed(files: Sequence[Path], maps: Sequence[Path], folder: Path) -> tuple[
 
 
 def _save_name(saved: Path, saves: Path) -> str:
-    """Number under which a save is installed: above those that are installed, as the newest of them is read."""
+    """Number under which a save is installed: above the installed numbers, because the latest is read."""
     newest = next(iter(numbered_saves(saves)), None) if saves.is_dir() else None
     if newest is None:
         return saved.name

@@ -32,7 +32,7 @@ def upgrade(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_
         InputError: the system below ``root`` does not run, or see ``install``.
         NotFoundError: no service is installed.
         BusyError: the truck is armed; nothing has been restarted.
-        CommandFailedError: the new version did not become ready; the text says whether the one before is back.
+        CommandFailedError: the new version did not become ready; the text tells whether the previous one is back.
         NotPermittedError: see ``install``.
     """
     if not runs_here(root):
@@ -50,7 +50,7 @@ def upgrade(plan: InstallPlan, root: Path, *, dry: bool = False, run: Run = run_
 
 @dataclass(frozen=True, slots=True)
 class _Before:
-    """What is at a place before it is replaced."""
+    """Previous content of a place."""
 
     place: Path
     text: str | None
@@ -85,7 +85,7 @@ def _replace(plan: InstallPlan, root: Path, before: list[_Before], run: Run) -> 
 
 
 def _refuse_armed(run: Run) -> None:
-    """By the status that systemd last got from the daemon, at most a watchdog's third ago.
+    """Refuse by the daemon's last status in systemd, at most a third of the watchdog period old.
 
     Raises:
         BusyError: the truck is armed, drives or is being stopped.

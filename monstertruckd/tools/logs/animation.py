@@ -1,4 +1,4 @@
-"""A drive as a moving picture: the robot from above, its path, and what its lidar or sonars have seen so far."""
+"""A drive as a moving picture: the robot from above, its path, and the echoes of lidar or sonars so far."""
 
 import math
 from dataclasses import dataclass, field
@@ -38,7 +38,7 @@ PAPER, WALL, PLANNED, DRIVEN, BEAM, BODY, TEXT = COLOURS
 
 @dataclass(slots=True)
 class AnimationFrame:
-    """What one picture adds to those before."""
+    """Additions of one picture."""
 
     seconds: float
     """Since the log's begin."""
@@ -47,11 +47,11 @@ class AnimationFrame:
     speed: float
     """M/s."""
     points: Array
-    """Returns of the newest scan in map, or the middles of ``arcs``, shape (n, 2), m."""
+    """Returns of the latest scan in map, or the middles of ``arcs``, shape (n, 2), m."""
     path: Array
-    """Poses of the present path, shape (n, 3)."""
+    """Poses of the current path, shape (n, 3)."""
     arcs: list[Array]
-    """On which the newest echoes of sonars lie, in map, each of shape (n, 2), m."""
+    """Arcs of the sonars' latest echoes, in map, each of shape (n, 2), m."""
 
 
 @dataclass(slots=True)
@@ -59,7 +59,7 @@ class _Gathering:
     """Reads a log in its order; keeps one scene per period."""
 
     period: int
-    """Of the log's time, ns."""
+    """Log time, ns."""
     scans: PlacedScans = field(default_factory=PlacedScans)
     scenes: list[AnimationFrame] = field(default_factory=list)
     odometry: Odometry | None = None
@@ -107,7 +107,7 @@ def animate(
     Args:
         reader: of the log.
         output: the file.
-        speed: seconds of the log in one of the picture's.
+        speed: ratio of log time to display time.
         width: pixels.
         report: called with the bytes read.
 
@@ -130,7 +130,7 @@ def animate(
         needed = speed * len(scenes) / MOST_FRAMES
         raise InputError(f"{len(scenes)} pictures, at most {MOST_FRAMES}: expected --speed {math.ceil(needed)} or more")
     canvas = _AnimationCanvas(scenes, width, recorded_geometry(reader.path, reader.config()))
-    rest = 1.5  # seconds for which the last picture stays
+    rest = 1.5  # display time of the last picture, s
     try:
         with MovingPicture(output, 1 / frames_per_second, rest) as pictures:
             for scene in scenes:
@@ -142,7 +142,7 @@ def animate(
 
 
 def _scenes(reader: LogReader, period: int, report: Progress) -> list[AnimationFrame]:
-    """Poses in map; those of odometry where the log has no others."""
+    """Poses in map, or of odometry if the log has no others."""
     for pose in (POSE.name, ODOMETRY.name):
         gathering = _Gathering(period)
         wanted = {pose, SCAN.name, SONAR.name, PATH.name, TRANSFORMS.name}
@@ -172,7 +172,7 @@ class _AnimationCanvas:
         self._body = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * (geometry.length / 2, geometry.width / 2)
         poses = np.array([scene.pose[:2] for scene in scenes])
         seen = np.vstack([poses, *(scene.points for scene in scenes)])
-        empty_edge = 0.25  # empty edge around what was seen, m
+        empty_edge = 0.25  # empty margin around the echoes, m
         low = np.minimum(np.quantile(seen, 0.002, axis=0), poses.min(axis=0)) - empty_edge
         high = np.maximum(np.quantile(seen, 0.998, axis=0), poses.max(axis=0)) + empty_edge
         self._low, self._scale = low, width / (high[0] - low[0])
@@ -205,6 +205,6 @@ class _AnimationCanvas:
         return picture.quantize(palette=self._palette, dither=Image.Dither.NONE)
 
     def _pixels(self, points: Array) -> list[tuple[float, float]]:
-        """Of points in map, shape (n, 2), m."""
+        """Bounds of points in map, shape (n, 2), m."""
         scaled = (points - self._low) * self._scale
         return [(x, self._height - y) for x, y in scaled.tolist()]

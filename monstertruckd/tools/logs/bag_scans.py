@@ -44,7 +44,7 @@ def scans_of(path: Path, make: str, content: BagContent, given: dict[str, Any], 
         path: the bag, for refusals.
         make: kind of log.
         content: of it.
-        given: geometry; overrides the bag's.
+        given: geometry; overrides the bag.
         topics: choice of scans and odometry where there are several.
 
     Raises:
@@ -147,19 +147,19 @@ def _in_order(stamps: NDArray[np.int64], poses: Array) -> OdometryLog:
 
 
 def _limits(found: list[BagScan]) -> dict[str, float]:
-    """Least and greatest range by the first message; empty if it has none."""
+    """Minimum and maximum range by the first message; empty if it has none."""
     limits = found[0].limits
     return {} if limits is None or not limits[0] < limits[1] else {"range_min": limits[0], "range_max": limits[1]}
 
 
 def _furthest(found: list[BagScan]) -> float:
-    """The range from which on there was no return, if no message says so; infinity if nothing returned."""
+    """Range without a return, if no message gives it; infinity if nothing returned."""
     ranges = np.concatenate([scan.ranges for scan in found])
     return no_return(ranges) if np.isfinite(ranges).any() else math.inf
 
 
 def _scan(scan: BagScan, stamp: int, *, mirrored: bool, geometry: dict[str, Any]) -> ScanInput:
-    """A scan with its own angles; those of a lidar that hangs upside down run the other way."""
+    """A scan with its own angles; a lidar that hangs upside down reverses them."""
     sign = -1.0 if mirrored else 1.0
     own = {
         "start_angle": sign * scan.start_angle,
@@ -179,7 +179,7 @@ class _Edge:
     """Shape (n, 4, 4)."""
 
     def at(self, stamps: NDArray[np.int64]) -> Array:
-        """The newest poses by then, or the first ones, shape (len(stamps), 4, 4)."""
+        """Latest poses by then, or the first ones, shape (len(stamps), 4, 4)."""
         newest = np.searchsorted(self.stamps, stamps, side="right") - 1
         return self.poses[np.maximum(newest, 0)]
 
@@ -192,7 +192,7 @@ class _Frames:
 
     @classmethod
     def of(cls, transforms: list[BagPose], clock: int) -> "_Frames":
-        """Sort transforms by child; of several parents the one that is named most often counts."""
+        """Sort transforms by child; of several parents the most frequent one is used."""
         by_edge: dict[tuple[str, str], list[BagPose]] = {}
         for one in transforms:
             by_edge.setdefault((one.child, one.parent), []).append(one)

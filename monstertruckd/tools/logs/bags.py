@@ -29,9 +29,9 @@ class MessageTimes:
     """MessageTimes of one message, ns."""
 
     stamp: int
-    """In its header."""
+    """Stamp in its header."""
     logged: int
-    """Of its recording."""
+    """Time of its recording."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class BagScan:
     ranges: Array
     """Shape (n,), m."""
     limits: tuple[float, float] | None
-    """Least and greatest range, m; None = not in the message."""
+    """Minimum and maximum range (m); None if not in the message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class BagPose:
 
 @dataclass(slots=True)
 class BagContent:
-    """What a bag holds for mapping, by topic."""
+    """Content of a bag for mapping, by topic."""
 
     scans: dict[str, list[BagScan]] = field(default_factory=dict)
     odometry: dict[str, list[BagPose]] = field(default_factory=dict)
@@ -89,7 +89,7 @@ class RawMessage:
     logged: int
     data: bytes
     definition: bytes = b""
-    """Of the schema, where the log holds one."""
+    """Text of the schema, if the log holds one."""
 
 
 def homogeneous(translation: Any, rotation: Any) -> Array:
@@ -194,14 +194,14 @@ def _ros_time(stamp: Any) -> int:
 
 
 def _foxglove_time(stamp: Any) -> int:
-    """Of a protobuf timestamp, or of the same as JSON."""
+    """Time of a protobuf timestamp, or of its JSON form."""
     if hasattr(stamp, "seconds"):
         return int(stamp.seconds) * SECOND + int(stamp.nanos)
     return int(stamp.sec) * SECOND + int(stamp.nsec)
 
 
 def _frame(name: str) -> str:
-    """Name of a frame; those of tf began with a slash."""
+    """Name of a frame; names of tf began with a slash."""
     return name.removeprefix("/")
 
 
@@ -238,7 +238,7 @@ def _checked(scan: BagScan) -> BagScan:
     """The same scan.
 
     Raises:
-        ValueError: its angles, times or limits are no numbers, or its beams have one angle.
+        ValueError: its angles, times or limits are not numbers, or all its beams have one angle.
     """
     numbers = scan.start_angle, scan.angle_increment, scan.time_increment, *(scan.limits or ())[:1]
     if not all(map(math.isfinite, numbers)) or scan.angle_increment == 0:
@@ -291,4 +291,4 @@ READERS: Final[dict[str, Callable[[BagContent, RawMessage, Any], None]]] = {
     "foxglove.FrameTransform": _foxglove_transform,
     "foxglove.FrameTransforms": _foxglove_transforms,
 }
-"""What is done with a message, by its schema."""
+"""Handlers of messages by schema."""

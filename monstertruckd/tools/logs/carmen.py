@@ -23,7 +23,7 @@ KINDS: Final = {
     "ROBOTLASER1": "ROBOTLASER1 8 numbers, n ranges, m, m remissions, 11 numbers, time",
     "FLASER": "FLASER n, n ranges, 6 numbers, time",
 }
-"""What is expected of the lines that hold scans; the first kind is preferred."""
+"""Expected form of lines with scans; the first kind is preferred."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ def read_carmen(path: Path, given: dict[str, Any], topics: tuple[str, ...] = ())
 
     Args:
         path: text, or text packed by gzip (``.gz``).
-        given: geometry that overrides the log's.
+        given: geometry, overrides the log.
         topics: the kind of line to read; empty = the one with the most scans.
 
     Raises:

@@ -15,14 +15,14 @@ from monstertruck_runtime.errors import InputError
 KEPT_BYTES: Final = 16_000_000
 """Approximate limit of values in memory (bytes)."""
 PLAIN: Final = 64
-"""Bytes of a value that is no array and no text."""
+"""Bytes of a value that is neither array nor text."""
 
 
 class Spool:
     """Values of many columns.
 
     Args:
-        file: open for reading and writing, that nobody else can open: what is read from it is trusted.
+        file: open for reading and writing, and inaccessible to others: its content is trusted.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -31,7 +31,7 @@ class Spool:
         self._size = 0
 
     def column(self, text: Callable[[Any], str]) -> "Column":
-        """A new column; ``text`` makes text of what is no array and no number."""
+        """A new column; ``text`` converts values that are neither array nor number."""
         made = Column(self, text)
         self._columns.append(made)
         return made
@@ -62,7 +62,7 @@ class Column:
 
     Args:
         spool: keeps them.
-        text: of what is no array and no number.
+        text: converts values that are neither array nor number.
     """
 
     def __init__(self, spool: Spool, text: Callable[[Any], str]) -> None:
@@ -98,7 +98,7 @@ class Column:
         self._spool.grow(size)
 
     def flush(self) -> None:
-        """Move what waits to the file."""
+        """Move waiting values to the file."""
         if self._waiting:
             self._places.append(self._spool.write(self._waiting))
             self._waiting = []

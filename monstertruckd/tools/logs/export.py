@@ -1,7 +1,7 @@
 """Export of logs: CSV for spreadsheets, NPZ for numpy, MCAP with the stamps inside its messages in UNIX time as well.
 
-Of a recorded log only the log times are dates: its messages are those of the bus. A viewer that looks up transforms by
-the stamps inside them needs log times and stamps of one clock.
+In a recorded log only the log times are dates: its messages are copies from the bus. A viewer that looks up transforms
+by the stamps inside them needs log times and stamps of one clock.
 """
 
 import csv
@@ -213,7 +213,7 @@ def _cell(value: Any) -> Any:
 S = TypeVar("S", bound=Schema)
 
 _DIFFERENCES: Final = {"offset", "stepped"}
-"""Fields in ns that are no instants."""
+"""Fields in ns that are not instants."""
 
 
 @cache

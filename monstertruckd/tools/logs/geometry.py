@@ -12,7 +12,7 @@ from monstertruckd.config.truck import Geometry
 
 
 def recorded_geometry(log: Path, config: Mapping[str, Any]) -> Geometry:
-    """Geometry by the configuration attached to a log; the default one where it says none.
+    """Geometry by the configuration attached to a log; the default where it is missing there.
 
     Args:
         log: named in complaints.

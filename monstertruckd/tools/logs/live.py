@@ -1,4 +1,4 @@
-"""A running robot in the rerun viewer: what a log of it would show, as it comes. A program of ``live_process``.
+"""A running robot in the rerun viewer, drawn like its log. A program of ``live_process``.
 
     python -m monstertruckd.tools.logs.live ROBOT ENDPOINT VIEWER
 
@@ -29,14 +29,14 @@ DRAWN: Final[tuple[Topic[Any], ...]] = (
 
 
 async def follow(robot: str, endpoint: str, clock: Clock, stream: rr.RecordingStream) -> None:
-    """Draw what a robot publishes into a recording until cancelled."""
+    """Draw a robot's messages into a recording until cancelled."""
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     drawn: list[Topic[Any]] = [*DRAWN, *(curve.topic for figure in FIGURES for curve in figure.curves)]
     topics = {topic.name: topic for topic in drawn}
     scene = Scene(stream, clock.real_offset())
     laid_out: set[str] = set()
-    retry = 1.0  # seconds between two attempts to reach the robot, and in which it answers
+    retry = 1.0  # seconds between two attempts to reach the robot, and time limit of its answer
     while True:
         with suppress(TruckError):
             async with TruckClient(robot, endpoint, clock=clock, timeout=retry) as client:

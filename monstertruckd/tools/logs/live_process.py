@@ -1,7 +1,7 @@
-"""A running robot in the rerun viewer, drawn by a process of its own.
+"""A running robot in the rerun viewer, drawn by a separate process.
 
-The SDK keeps what a viewer does not take, and when that is too much it stands still until the viewer does: in the
-station's process its page would stand still, too. The process runs only while a viewer listens.
+The SDK keeps messages that a viewer does not take, and blocks when they are too many: in the station's process it would
+block the page, too. The process runs only while a viewer listens.
 """
 
 import asyncio
@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from monstertruck_runtime.clock import Clock
 
 VIEWER: Final = "rerun+http://127.0.0.1:9876/proxy"
-"""Where a viewer on this machine listens: ``rerun --bind 127.0.0.1``."""
+"""Address of a viewer on this machine: ``rerun --bind 127.0.0.1``."""
 LISTENER_LOOK_PERIOD: Final = 2.0
 """Seconds between two looks whether it listens."""
 PROGRAM: Final = (sys.executable, "-m", "monstertruckd.tools.logs.live")
@@ -30,13 +30,13 @@ async def show_live(
         robot: its name.
         endpoint: where it listens.
         clock: time.
-        viewer: of rerun, as an address of its own.
-        program: what draws, given robot, endpoint and viewer.
+        viewer: address of the rerun viewer.
+        program: program that draws, given robot, endpoint and viewer.
     """
     while True:
         while not await listens(viewer):
             await clock.sleep(LISTENER_LOOK_PERIOD)
-        # A session of its own: Ctrl-C is for the station, which ends it.
+        # A separate session: Ctrl-C is for the station, which ends it.
         drawing = await asyncio.create_subprocess_exec(
             *program, robot, endpoint, viewer, stdin=PIPE, stdout=DEVNULL, start_new_session=True
         )
@@ -51,7 +51,7 @@ async def show_live(
 
 
 async def listens(viewer: str) -> bool:
-    """Whether anybody answers at a viewer's address."""
+    """Whether a viewer answers at an address."""
     place = urlsplit(viewer)
     try:
         async with asyncio.timeout(LISTENER_LOOK_PERIOD):

@@ -1,7 +1,7 @@
 """Messages of a log for the tools: which ones, decoded, and their real time.
 
 The tools count in the daemon's monotonic time, because a robot without a real-time clock learns the date late and its
-clock then jumps by hours. The newest offset in a log dates all of its messages.
+clock then jumps by hours. The latest offset in a log dates all of its messages.
 """
 
 import math
@@ -63,12 +63,12 @@ class Selection:
 
     @property
     def nothing(self) -> str:
-        """What to say of a log of which it selects no message."""
+        """Remark about a log without a selected message."""
         every = not self.topics and self.start == 0.0 and self.end == math.inf
         return "no message of a topic of this version" if every else "no message of these topics and times"
 
     def of(self, reader: LogReader, progress: Progress | None = None) -> Iterator[tuple[LogMessage, Message]]:
-        """The selected messages with their decoded forms; those of other schemas are skipped.
+        """The selected messages with their decoded forms; other schemas are skipped.
 
         Raises:
             InputError: a selected message is invalid; names file, message and field.
@@ -95,10 +95,10 @@ ALL = Selection()
 
 
 def real_offset(reader: LogReader) -> int:
-    """Real (UNIX) minus daemon time, ns, by the newest message about it in the log; 0 without one.
+    """Real (UNIX) minus daemon time, ns, by the latest message about it in the log; 0 without one.
 
     Raises:
-        InputError: the log's metadata of it is no number.
+        InputError: the log's metadata of it is not a number.
     """
     newest = _newest_clock(reader)
     if newest is not None:
@@ -110,7 +110,7 @@ def first_offset(log: Path, metadata: Mapping[str, str]) -> int:
     """Real minus daemon time, ns, at the start of a run, by its metadata; 0 without.
 
     Raises:
-        InputError: the metadata is no number.
+        InputError: the metadata is not a number.
     """
     text = metadata.get("real_offset_ns", "0")
     try:

@@ -1,8 +1,8 @@
 """Mount of the lidar, checked against odometry over a whole log: the yaw, and whether the scans are mirrored.
 
-Wheels measure motion in the robot's axes, scans in the lidar's. A lidar that is turned by an angle against its mount
-sees every motion turned by that angle the other way, and the map is none the worse for it; one that hangs upside down
-sees every turn reversed.
+Wheels measure motion in the robot's axes, scans in the axes of the lidar. A lidar that is turned by an angle against
+its mount sees every motion turned by that angle the other way, and the map is none the worse for it; one that hangs
+upside down sees every turn reversed.
 """
 
 import math
@@ -26,7 +26,7 @@ class MountCheck:
     """Result of the check."""
 
     yaw: float
-    """Yaw of the lidar beyond that of its mount, rad."""
+    """Yaw of the lidar relative to its mount, rad."""
     deviation: float
     """Standard deviation of ``yaw``, rad."""
     mirrored: bool
@@ -44,7 +44,7 @@ class MountCheck:
             None if there are too few stretches of odometry.
         """
         pairs = list(_stretches(scans, trajectory))
-        if len(pairs) < 10:  # stretches with which anything is reported
+        if len(pairs) < 10:  # minimum number of stretches for a report
             return None
         by_wheels, by_scans = (np.array(motions) for motions in zip(*pairs, strict=True))
         turns = float(np.sum(by_wheels[:, 2] * by_scans[:, 2]))
@@ -57,7 +57,7 @@ class MountCheck:
 
     @property
     def fault(self) -> str | None:
-        """What is wrong with the mount, and the remedy; None if nothing is beyond doubt."""
+        """Fault of the mount, and the remedy; None if none is certain."""
         if self.mirrored:
             return "scans turn against odometry: the lidar hangs upside down, or its beams run the other way"
         sure = 3.0  # standard deviations

@@ -1,6 +1,6 @@
 """A log for a notebook: topics as NumPy arrays, pandas or polars tables, pictures, maps and events.
 
-Every read passes the file once, in bounded memory: what remains is what was asked for, so choose columns of long logs,
+Every read passes the file once, in bounded memory: only the selected data remains, so choose columns of long logs,
 or go through ``batches`` or ``frames``.
 """
 
@@ -35,9 +35,9 @@ Library = Literal["pandas", "polars"]
 
 
 class OpenedLog:
-    """A log opened for analysis, finished or not; damage is a warning, and what is whole is read.
+    """A log opened for analysis, finished or not; damage is a warning, and intact parts are read.
 
-    Topics are named in full (``state/odometry``) or by their last part where only one topic besides ``health/`` has it
+    Give topics in full (``state/odometry``) or by their last part where only one topic besides ``health/`` has it
     (``odometry``).
     ``start`` and ``end`` of its methods are seconds after the log's first message.
 
@@ -115,7 +115,7 @@ class OpenedLog:
         end: float = np.inf,
         library: Library = "pandas",
     ) -> Any:
-        """Several topics in one table: a row per message of ``at``, beside it the messages nearest by their stamps.
+        """Several topics in one table: a row per message of ``at``, with the messages nearest by their stamps.
 
         Columns carry the topic's name as it is given here: ``odometry.pose.x``.
 
@@ -175,7 +175,7 @@ class OpenedLog:
         selection, first = Selection(tuple(wanted), times.start, times.end), self._first()
 
         def beside(rows: pa.Table, tables: Mapping[str, pa.Table]) -> pa.Table:
-            """The other topics' rows beside those of ``at``."""
+            """The other topics' rows matched to ``at``."""
             stamps = rows[STAMP].to_numpy()
             parts = {TIME: pa.array((rows[LOG_TIME].to_numpy() - first) / SECOND)}
             for topic, table in tables.items():
@@ -272,7 +272,7 @@ def _ready(tables: Mapping[str, pa.Table], at: str, seconds: float) -> pa.Array:
 
 
 def _rest(tables: Mapping[str, pa.Table], at: str, ready: pa.Array, seconds: float) -> dict[str, pa.Table]:
-    """The rows of ``at`` that wait, and those of other topics that may be nearest to them or to later ones."""
+    """Waiting rows of ``at``, and rows of other topics that may be nearest to them or to later ones."""
     waiting = tables[at].filter(pc.invert(ready))
     since = max(_greatest(table[STAMP]) for table in tables.values()) - seconds * SECOND
     if len(waiting):

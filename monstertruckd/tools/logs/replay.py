@@ -83,7 +83,7 @@ def replay_log(
 
 
 def _rpc(clock: ReplayClock, reader: LogReader) -> Rpc:
-    """Answers to what a station asks a robot: its configuration and versions, as attached to the log."""
+    """Answers to a station's calls: configuration and versions, as attached to the log."""
     rpc = Rpc(clock)
     attached = {"config": reader.config()}
     with suppress(InputError, ConfigError):  # nothing but people reads them

@@ -39,7 +39,7 @@ from monstertruckd.tools.logs.messages import ALL, Progress, Selection, real_off
 from monstertruckd.tools.logs.report.signals import FIGURES, Curve, DrivenPath, Figure
 
 TIMELINE: Final = "time"
-"""Real time if the log has it, else the daemon's."""
+"""Real time if the log has it, else daemon time."""
 APPLICATION: Final = "monstertruckd"
 
 _CAMERA: Final = "camera"
@@ -226,7 +226,7 @@ class Scene:
         layers = np.stack((ground.roughness, ground.tilt)).reshape(2, ground.height, ground.width)
         known = layers[0] != GROUND_UNKNOWN
         # 0.03: roughness that is shown in full, m
-        # 0.35: tilt likewise, rad
+        # 0.35: range of the tilt, rad
         full = np.array((0.03 / ROUGHNESS_STEP, 0.35 / TILT_STEP)).reshape(2, 1, 1)
         red, blue = np.where(known, np.minimum(layers / full, 1.0) * 255.0, 0.0).astype(np.uint8)
         pixels = np.stack((red, np.zeros_like(red), blue, np.where(known, np.maximum(red, blue), 0)), axis=-1)
@@ -335,7 +335,7 @@ def _plot(figure: Figure) -> rrb.TimeSeriesView:
 
 
 _NOWHERE: Final = "http://127.0.0.1:9"
-"""The discard port, on which nothing listens."""
+"""The discard port, where nothing listens."""
 
 
 def show(recording: Path) -> None:

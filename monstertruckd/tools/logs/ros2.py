@@ -1,7 +1,7 @@
 """ROS 2 bags: standard messages where ROS has them, JSON text in ``std_msgs/String`` for everything else.
 
 Topics keep their names (``/sensor/scan``), but for transforms (``/tf``) and pictures (``/sensor/camera/compressed``).
-Stamps are real time. Frames and units are those of REP 103 and 105 already.
+Stamps are real time. Frames and units follow REP 103 and 105 already.
 """
 
 import json

@@ -19,7 +19,7 @@ from monstertruckd.tools.logs.bags import METADATA, READERS, RawMessage, mcap_me
 
 
 def _bounded(decompressor: Any) -> Callable[[bytes], bytes]:
-    """Return what unpacks a chunk of at most ``MOST_UNPACKED`` bytes, by a new ``decompressor``."""
+    """Return a function that unpacks a chunk of at most ``MOST_UNPACKED`` bytes, by a new ``decompressor``."""
 
     def unpack(data: bytes) -> bytes:
         unpacking = decompressor()
@@ -36,7 +36,7 @@ BOUNDED: Final[dict[Any, Callable[[bytes], bytes]]] = {
     bz2.decompress: _bounded(bz2.BZ2Decompressor),
     lz4.frame.decompress: _bounded(lz4.frame.LZ4FrameDecompressor),
 }
-"""What unpacks chunks of ROS 1 within bounds, by the function that does so without."""
+"""Bounded unpackers of ROS 1 chunks, by the unbounded function."""
 
 
 def ros_messages(path: Path, version: int) -> Iterator[RawMessage]:
@@ -98,7 +98,7 @@ def _mcap_parts(folder: Path) -> list[Path] | None:
     """Files of a bag of ROS 2 that is stored as MCAP; None for one that is stored otherwise.
 
     Raises:
-        InputError: its description cannot be read, or says that it is packed.
+        InputError: its description cannot be read, or it is packed.
     """
     about = read_yaml(folder / METADATA)["rosbag2_bagfile_information"]
     packed = str(about.get("compression_mode") or "none").lower()

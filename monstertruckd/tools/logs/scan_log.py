@@ -1,4 +1,4 @@
-"""Scans of a log, with what the reader of any format needs to make them: geometry, clocks, odometry at a scan."""
+"""Scans of a log, and their common inputs for readers of any format: geometry, clocks, odometry at a scan."""
 
 import math
 from dataclasses import dataclass, field, fields, replace
@@ -15,23 +15,23 @@ from monstertruck_runtime.clock import SECOND
 BEGIN: Final = SECOND
 """Stamp of the first scan of a log with times of another origin, ns."""
 SHORTEST_RANGE: Final = 0.02
-"""Shorter ranges are no returns where the log does not say from where on, m."""
+"""Default minimum range of a return, m."""
 LONGEST_RANGE: Final = 80.0
 """Ranges from here on are no-returns of the lasers that CARMEN logs come from, m."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogGeometry:
-    """Geometry of the scans of a log that does not hold it; None = as in the log, or assumed."""
+    """Geometry of the scans of a log without it; None for the log's value, or a default."""
 
     start_angle: float | None = None
     """Angle of the first beam, rad, counter-clockwise from ahead."""
     angle_increment: float | None = None
     """Angle between neighbouring beams, rad."""
     range_min: float | None = None
-    """Shorter ranges are no returns, m."""
+    """Minimum range of a return, m."""
     range_max: float | None = None
-    """Ranges from here on are no returns, m."""
+    """Range without a return, m."""
     time_increment: float | None = None
     """Seconds between neighbouring beams."""
     mount: Pose2 | None = None
@@ -51,13 +51,13 @@ class ScanLog:
     make: str
     scans: list[ScanInput]
     begin: float = 0.0
-    """Time of the log's own clock that is stamp 0 here, s."""
+    """Time of the log's clock at stamp 0 here, s."""
     assumed: tuple[str, ...] = field(default=())
     """Parts of the geometry that neither the log nor the caller gave."""
     fault: str | None = None
-    """What is wrong with the file, whose end is missing perhaps."""
+    """Fault of the file, such as a missing end."""
     sources: dict[str, str] = field(default_factory=dict)
-    """Where in the log scans, odometry and mount come from, where there was a choice."""
+    """Sources of scans, odometry and mount in the log, if there was a choice."""
 
 
 def vector(values: Any) -> Pose2:
@@ -72,7 +72,7 @@ def missing(known: dict[str, Any]) -> tuple[str, ...]:
 
 
 def no_return(ranges: Array) -> float:
-    """The range from which on there was no return: a greatest one that recurs, or infinity.
+    """Range without a return: a maximum that recurs, or infinity.
 
     Args:
         ranges: of any shape, at least one of them finite, m.

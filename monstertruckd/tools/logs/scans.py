@@ -38,7 +38,7 @@ from monstertruckd.tools.logs.scan_log import (
 BAG: Final = b"#ROSBAG V"
 DATABASE: Final = b"SQLite format 3\0"
 OWN_FIELD: Final = b"codes"
-"""Name of a field of our scans that those of others do not have."""
+"""Name of a field that only our scans have."""
 STRANGERS: Final = {
     b"version https://git-lfs": "a git-LFS pointer, not the file itself: fetch it with `git lfs pull`",
     b"\x1f\x8b": "packed by gzip: unpack it first (CARMEN and URG text may stay packed as NAME.gz)",
@@ -56,7 +56,7 @@ def read_scans(path: Path, geometry: LogGeometry | None = None, topics: tuple[st
 
     Args:
         path: the log; of ROS 2, its folder.
-        geometry: of a log that does not hold it; it overrides what an npz log or a bag says.
+        geometry: of a log that does not hold it; it overrides an npz log or a bag.
         topics: of scans and odometry, for logs that have several; of a CARMEN log the word that its lines begin with.
 
     Raises:
@@ -144,7 +144,7 @@ def _own(reader: LogReader) -> Iterator[ScanInput]:
 
 
 def _arrays(path: Path, given: dict[str, Any]) -> ScanLog:
-    """An npz log; its geometry is what is ``given``, else its arrays of the same names, else assumed."""
+    """An npz log; its geometry is ``given``, else its arrays of the same names, else assumed."""
     arrays = arrays_of(path, "arrays t, ranges and perhaps odom")
     ranges = _array(path, arrays, "ranges", (-1, -1))
     times = _array(path, arrays, "t", (len(ranges),))

@@ -110,7 +110,7 @@ class LogSummary:
 
 
 def list_logs(folder: Path) -> list[LogSummary]:
-    """All logs in ``folder`` and below, the newest last; one that is removed meanwhile is none.
+    """All logs in ``folder`` and below, latest last; one that is removed meanwhile is skipped.
 
     They are sorted by their begin, or by the file's last change where that is not known.
 
@@ -169,7 +169,7 @@ def _robot(reader: LogReader) -> str | None:
 
 
 def _first_date(reader: LogReader) -> str | None:
-    """UTC of the first message of a log without an index, by what its run knew of the date when it began."""
+    """UTC of the first message of a log without an index, by its run's offset at the start."""
     first = next(iter(reader), None)
     if first is None:
         return None
@@ -181,7 +181,7 @@ def _first_date(reader: LogReader) -> str | None:
 
 def _offset(reader: LogReader) -> int:
     """Real time minus the file's log time, ns."""
-    reader.metadata()  # passes what says of which clock the log times are
+    reader.metadata()  # passes the metadata that names the clock of the log times
     try:
         return real_offset(reader) - reader.log_offset
     except InputError:

@@ -2,9 +2,9 @@
 
 TUM: ``t x y z qx qy qz qw``, metres and seconds. KITTI: the matrix of base in map, 3 x 4, row by row, without times.
 
-A scan's stamp, and the pose estimated for it, are of its first beam. To draw a whole scan at one pose, or
-compares poses with another system, needs that of the middle: so each line has the time of the middle of the sweep, by
-the clock of the log, and the pose at that time (between the poses of neighbouring scans).
+A scan's stamp, and the pose estimated for it, are of its first beam. Drawing a whole scan at one pose, and comparing
+poses with another system, need the middle: so each line has the time of the middle of the sweep, by the clock of the
+log, and the pose at that time (between the poses of neighbouring scans).
 """
 
 import itertools
@@ -24,7 +24,7 @@ from monstertruckd.tools.logs.scan_log import ScanLog
 
 
 def mid_sweep(stamps: Array, poses: Array, delay: float) -> Array:
-    """Poses, shape (n, 3), ``delay`` seconds after each stamp; after the last one the last motion goes on.
+    """Poses, shape (n, 3), ``delay`` seconds after each stamp; after the last one the last motion continues.
 
     Args:
         stamps: shape (n,), s, rising.
@@ -75,7 +75,7 @@ def write_trajectory(
         lines: format of the first file.
 
     Returns:
-        What was written, for people.
+        Description of the files written.
 
     Raises:
         OSError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""What a robot would have made of a recorded run: its sensors once more through estimation, the outputs compared."""
+"""Repetition of a recorded run: its sensor data through estimation again, the outputs compared."""
 
 from monstertruckd.tools.replay_check.check import check_log
 from monstertruckd.tools.replay_check.recorded import parts_of, run_of

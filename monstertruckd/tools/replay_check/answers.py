@@ -1,7 +1,7 @@
 """Answers of planner and local planner in a replay: computed again, delivered when the log shows the recorded ones.
 
-The truck drove the recorded path, so the goal service gets that one, and what follows can be compared. The path that
-was computed is kept, to be compared with it.
+The truck drove the recorded path, so the goal service gets the recorded one, and later outputs can be compared. The
+computed path is kept and compared with it.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ from monstertruckd.tools.replay_check.pace import PacedClock
 
 
 class ComputedPaths:
-    """What was computed where another path was driven."""
+    """Computed result where another path was driven."""
 
     def __init__(self) -> None:
         self._computed: dict[str, PosePath | None] = {}
@@ -38,7 +38,7 @@ class ComputedPaths:
         return replace(path, steering=path.steering or _steering(computed, path.poses))
 
     def as_computed(self, path: Path) -> Path:
-        """``path`` as it would be if no other one had been driven."""
+        """``path`` as it would be if no other path had been driven."""
         if path.name not in self._computed:
             return path
         computed = self._computed[path.name]
@@ -49,7 +49,7 @@ class ComputedPaths:
 
 
 class _Replayed:
-    """Takes steps in the loop, and takes from a log when their results count."""
+    """Takes steps in the loop; a log gives the delivery times of their results."""
 
     def __init__(self, target: str, clock: PacedClock, record: GoalRecord, book: ComputedPaths, latency: float) -> None:
         self._inner = LoopActor(target, WallClock(), 0.0)  # not virtual: it answers at once
@@ -86,7 +86,7 @@ class ReplayedPlanner(_Replayed):
 
 
 class ReplayedDeformer(_Replayed):
-    """What becomes of a route; most of it shows nowhere and counts after the configured latency."""
+    """Delivery of a route; mostly unrecorded, and due after the configured latency."""
 
     async def step(self, task: DeformTask) -> DeformAnswer:
         """Answer when a path shows the recorded answer, else in time."""
@@ -107,7 +107,7 @@ class ReplayedActors(ActorFactory):
         self._paced, self._record, self._book = clock, record, book
 
     def actor(self, placement: Placement, name: str, target: str, *, latency: float, **limits: Any) -> Actor:
-        """In the loop, wherever it was."""
+        """Run in the loop, wherever it ran before."""
         how = target, self._paced, self._record, self._book, latency
         match name:
             case "planning":

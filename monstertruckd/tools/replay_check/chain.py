@@ -50,7 +50,7 @@ WORKER: Final = (topics.SLAM.name, topics.SCAN_MOTION.name, topics.MAP.name, top
 """Outputs of the estimation worker, which come when it is done."""
 
 LINKS: Final = 16
-"""Iterations of the event loop after which a worker's answer has certainly been delivered."""
+"""Iterations of the event loop that suffice to deliver a worker's answer."""
 
 GIVEN: Final = frozenset({topics.PATH.name, topics.GATE.name})
 """Not computed again, but read by the tracker."""
@@ -115,7 +115,7 @@ def outputs_of(config: TruckConfig) -> frozenset[str]:
 
 
 def why_no_goals(own: TruckConfig, used: TruckConfig, log: GoalRecord) -> str | None:
-    """What keeps the planner of a robot from being computed again; None = nothing does, or it has none."""
+    """Reason why the planner of a robot cannot be computed again; None if it can, or there is none."""
     if own.own_planner is None or used.own_planner is None:
         return None if own.own_planner is used.own_planner else "only one of the two configurations has a planner"
     if not log.reports:
@@ -169,7 +169,7 @@ class Chain:
         config: of the robot; see ``replayable``.
         clock: of the running replay.
         unseen: ticks that were not recorded, see ``unseen_ticks``.
-        log: what was read from the log beforehand.
+        log: data read from the log beforehand.
     """
 
     def __init__(self, config: TruckConfig, clock: PacedClock, unseen: Iterable[tuple[int, str]], log: Survey) -> None:
@@ -181,7 +181,7 @@ class Chain:
         self._goal_ticks = [] if config.own_planner is None else log.goals.ticks(period_of(config.own_planner))
         self._called = [one.state.stamp for one in log.goals.reports if one.sequence in self._calls]
         self._asked: Counter[str] = Counter()
-        """Newest number of a request for goals, by source."""
+        """Latest number of a request for goals, by source."""
         self._turns = RecordedTurns() if topics.SLAM.name in log.counts else None
         if self._turns is not None:
             use_delivery(clock, self._turns)
@@ -231,7 +231,7 @@ class Chain:
         await asyncio.sleep(0)  # who waits for it goes first
 
     async def tick(self, outputs: Sequence[LogMessage]) -> None:
-        """Whoever wrote ``outputs``, recorded in a row, had its turn then; who reads them did not come in between."""
+        """The writer of ``outputs``, recorded in a row, had its turn then; their readers did not run in between."""
         await self._catch_up(outputs[0].log_time)
         for output in outputs:
             await self._take_unseen_turns(output.log_time)
@@ -259,7 +259,7 @@ class Chain:
         self._answering = output.topic != topics.SLAM.name
 
     async def finish(self, end: int) -> None:
-        """Let workers go on until ``end``, ns."""
+        """Let workers run until ``end``, ns."""
         await self._catch_up(end)
 
     @property
@@ -277,14 +277,14 @@ class Chain:
         return topic in self._inputs
 
     def as_computed(self, topic: Topic[Message], message: Message, payload: bytes) -> bytes:
-        """An output's bytes as they would be if what was computed had been driven."""
+        """An output's bytes as they would be if the computed path had been driven."""
         if not isinstance(message, Path):
             return payload
         computed = self._book.as_computed(message)
         return payload if computed is message else wire.encode(topic, computed)
 
     def _writer_of(self, output: LogMessage) -> str:
-        """Service that had its turn when ``output`` was written; of what waits for no turn its topic."""
+        """Service that had its turn when ``output`` was written; its topic if no turn is awaited."""
         if output.topic == topics.PATH.name and _near(self._goal_ticks, output.stamp) is not None:
             return output.topic if is_deformed(output) else GoalService.name
         if output.topic == topics.PLAN_DRIVE.name and self._goals is not None and asks_standstill(output):
@@ -296,7 +296,7 @@ class Chain:
         return output.topic == topics.GOAL.name and output.stamp == self._goal_record.start
 
     def _turn_of(self, service: str, output: LogMessage) -> int:
-        """When that turn was, ns: what one of the goal service publishes on the wall clock has several stamps."""
+        """Time of that turn, ns: messages of one turn of the goal service on the wall clock have several stamps."""
         near = _near(self._goal_ticks, output.stamp) if service == GoalService.name else None
         return output.stamp if near is None else near
 
@@ -339,7 +339,7 @@ class Chain:
     def _build(self, config: TruckConfig) -> Iterator[Service]:
         body = Body.of(config)
         places = ReplayedActors(self._clock, self._goal_record, self._book)
-        compared = config.model_copy(update={"consistency": None})  # what it finds depends on no other output
+        compared = config.model_copy(update={"consistency": None})  # its results depend on no other output
         yield from build_estimation(
             compared, self.bus, self._clock, body, places, build_slam(compared, self.bus, self._clock)
         )

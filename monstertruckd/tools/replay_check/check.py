@@ -1,9 +1,9 @@
-"""Computes a log again and says how far that is from what was recorded.
+"""Computes a log again and compares the result with the recorded outputs.
 
 Outputs of services in the daemon's loop follow from the log's messages and their order alone, so they are expected bit
-for bit. So are those of the estimation worker and what rests on them in a log of the virtual clock. On the wall clock
-the log shows when the worker's results counted, but not which of two inputs of one instant it had read: there what
-rests on them may differ by 0.02 (SI units), and its own messages are shown, not judged. So are paths to goals,
+for bit. So are the estimation worker's outputs, and outputs based on them, in a log of the virtual clock. On the wall
+clock the log shows when the worker's results arrived, but not which of two simultaneous inputs it had read: there,
+outputs based on them may differ by 0.02 (SI units), and its own messages are shown, not judged. So are paths to goals,
 whose search ended by time there, not by work, and reports on goals: most results of their workers show nowhere.
 """
 
@@ -71,7 +71,7 @@ def check_log(
     _refuse_the_middle(log, found, compared)
     virtual = first_offset(log, reader.first.metadata().get("run", {})) == 0
     loose, shown = (frozenset[str](),) * 2 if virtual else _inexact(own, used)
-    # Greatest difference, SI units, of outputs that rest on a worker's, in a log of the wall clock.
+    # Maximum difference, SI units, of outputs based on a worker's, in a log of the wall clock.
     worker_tolerance = 0.02
     comparisons = {
         topic.name: TopicComparison(
@@ -165,7 +165,7 @@ def _into(comparisons: Mapping[str, TopicComparison], chain: Chain) -> TapCallba
 
 
 def _inexact(*configs: TruckConfig) -> tuple[frozenset[str], frozenset[str]]:
-    """On the wall clock: topics that may differ a little, and topics that are not judged."""
+    """Topics that may differ a little on the wall clock, and topics that are not judged."""
     loose, shown = frozenset[str](), frozenset[str]()
     if any(config.slam is not None for config in configs):
         loose, shown = RESTS_ON_WORKER, shown | frozenset(WORKER)

@@ -23,7 +23,7 @@ LENGTHS: Final = frozenset({"cross_track", "along", "length"})
 
 
 class Kind(StrEnum):
-    """What a difference is measured in."""
+    """Unit of a difference."""
 
     LENGTH = "m"
     ANGLE = "rad"
@@ -33,7 +33,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Of one field."""
+    """Difference of one field."""
 
     kind: Kind
     field: str
@@ -42,7 +42,7 @@ class Difference:
 
 
 def differences(before: Message, after: Message) -> list[Difference]:
-    """Every field in which two messages differ, but for their headers; NaN is infinitely far from any number."""
+    """Every field that differs between two messages, except headers; NaN is infinitely far from any number."""
     found = (replace(one, value=math.inf) if math.isnan(one.value) else one for one in _walk("", before, after))
     return [one for one in found if one.value > 0]
 
@@ -77,7 +77,7 @@ def _walk(name: str, a: Any, b: Any) -> Iterator[Difference]:
 
 
 def _figure(name: str, a: Any, b: Any) -> Iterator[Difference]:
-    """Of what is more than its fields."""
+    """Difference of composite values, such as poses and grids."""
     if isinstance(a, Transform):
         yield from _transform(name, a, b)
     elif isinstance(a, Grid):
@@ -93,14 +93,14 @@ def _number(name: str, a: float, b: float) -> Difference:
 
 
 def _turn(a: float, b: float) -> float:
-    """Between two angles, rad; infinite if one of them alone is no finite number."""
+    """Between two angles, rad; infinite if only one of them is finite."""
     if _same(a, b):
         return 0.0
     return abs(wrap_angle(b - a)) if math.isfinite(b - a) else math.inf
 
 
 def _distance(a: Sequence[float], b: Sequence[float]) -> float:
-    """Between two points; coordinates that are the same, or NaN both, are no distance."""
+    """Between two points; equal coordinates, or both NaN, have distance 0."""
     return math.hypot(*(0.0 if _same(one, other) else other - one for one, other in zip(a, b, strict=True)))
 
 
@@ -146,7 +146,7 @@ def _path(a: Path, b: Path) -> Iterator[Difference]:
 
 
 def _grid(a: Grid, b: Grid) -> Iterator[Difference]:
-    """Cells as mean difference of occupancy, 0..1: one cell says little."""
+    """Mean difference of the cells' occupancy, 0..1: a single cell means little."""
     yield from _walk("origin", a.origin, b.origin)
     yield _text("size", (a.width, a.height, a.resolution), (b.width, b.height, b.resolution))
     if a.cells.shape == b.cells.shape:
@@ -185,17 +185,17 @@ class FirstDifference:
 @dataclass(frozen=True, slots=True)
 class _TopicOutput:
     time: int
-    """Daemon time at which it was handed over, ns."""
+    """Daemon time of its delivery, ns."""
     payload: bytes
 
 
 @dataclass(slots=True)
 class TopicComparison:
-    """Of one topic. The n-th recorded output is compared with the n-th of the replay.
+    """Comparison of one topic. The n-th recorded output is compared with the n-th of the replay.
 
     Args:
         topic: its row of the table.
-        tolerance: greatest difference of a field that agrees, SI units; 0 = equal bit for bit.
+        tolerance: maximum difference of an agreeing field, SI units; 0 = equal bit for bit.
         begin: start of the log, ns.
         judged: whether a difference matters.
     """

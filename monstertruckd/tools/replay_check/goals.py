@@ -39,10 +39,10 @@ class RecordedCall:
     source: str
     frame: str
     what: Pose2D | GoalOrder
-    """The goal, or what is to become of it."""
+    """The goal, or an order about it."""
 
     def request(self, gate: GateState, stamp: int, seq: int) -> GoalRequest | GoalControl:
-        """The request it carried, but for what is in no report, with the rights it must have had."""
+        """The request behind a report, without unreported fields, with the rights it must have had."""
         header: dict[str, Any] = {
             "stamp": stamp,
             "received": stamp,
@@ -69,7 +69,7 @@ class GoalReport:
 
 @dataclass(slots=True)
 class GoalRecord:
-    """Of one log."""
+    """Remote calls of one log."""
 
     reports: list[GoalReport] = field(default_factory=list)
     paths: list[Path] = field(default_factory=list)
@@ -127,9 +127,9 @@ class GoalRecord:
         return found
 
     def calls(self, period: int) -> dict[int, RecordedCall]:
-        """What came by remote call, by the number of the report that shows it.
+        """Requests by remote call, by the number of the report that shows them.
 
-        What comes by topic is in the log itself, and shows within two ticks.
+        Requests by topic are in the log itself, and show within two ticks.
         """
         found: dict[int, RecordedCall] = {}
         for before, after in itertools.pairwise(self.reports):
@@ -141,12 +141,12 @@ class GoalRecord:
         return found
 
     def unknown_waypoints(self, period: int) -> bool:
-        """Whether a remote call named waypoints: reports only count them."""
+        """Whether a remote call had waypoints: reports give only their number."""
         goals = {number for number, call in self.calls(period).items() if isinstance(call.what, Pose2D)}
         return any(one.sequence in goals and one.state.waypoints for one in self.reports)
 
     def decided(self, since: int) -> int | None:
-        """When the answer to what was asked of the route planner at ``since``, ns, counted; None = not any more."""
+        """Time of the route planner's answer to the request at ``since``, ns; None if it was dropped."""
         for before, after in itertools.pairwise(self.reports):
             if after.state.stamp > since and _answered(before.state, after.state):
                 return after.state.stamp
@@ -159,7 +159,7 @@ class GoalRecord:
 
 
 def asks_standstill(entry: LogMessage) -> bool:
-    """Whether a drive request is the goal service's, not the tracker's."""
+    """Whether the goal service made a drive request, not the tracker."""
     request = entry.decode()
     return isinstance(request, DriveRequest) and request.source == SOURCE
 

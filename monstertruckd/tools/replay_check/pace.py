@@ -1,4 +1,4 @@
-"""A clock on which services tick when they ticked in a recorded run, not when their schedules say so.
+"""A clock for services to tick as they did in a recorded run, not by their schedules.
 
 A tick on the wall clock comes some time after it is due; whether a reading in between was taken follows from the log.
 Messages are logged in the order of their publication, and a service that reads its inputs and publishes without an
@@ -23,7 +23,7 @@ class Pace:
 
     def __init__(self) -> None:
         self.instant: int | None = None
-        """Time of the newest tick, ns; None before the first."""
+        """Time of the latest tick (ns); None before the first."""
         self._held: asyncio.Future[None] | None = None
 
     def adopt(self) -> None:
@@ -34,7 +34,7 @@ class Pace:
 
     @staticmethod
     def current() -> "Pace | None":
-        """Of the running task."""
+        """Pace of the running task."""
         task = asyncio.current_task()
         return None if task is None else _PACES.get(task)
 
@@ -83,7 +83,7 @@ class RecordedTurns:
         await turn
 
     def next(self) -> None:
-        """The oldest result that waits counts now; none waits = the recorded one came of what the log does not hold."""
+        """Deliver the oldest waiting result now; if none waits, the recorded one came from inputs outside the log."""
         while self._waiting:
             turn = self._waiting.popleft()
             if not turn.done():
@@ -98,7 +98,7 @@ class RecordedTurns:
 
 
 class PacedClock(ReplayClock):
-    """A replay clock; in tasks that adopted a ``Pace``, time is that of their ticks."""
+    """A replay clock; tasks that adopted a ``Pace`` see the time of their ticks."""
 
     def now(self) -> int:
         """Nanoseconds of the log's daemon time."""

@@ -23,11 +23,11 @@ ALIKE: Final = ("config.json", "versions.json", "calibration.json")
 """Attachments that all parts of a run share."""
 
 Identity = tuple[dict[str, str], dict[str, bytes]]
-"""What the parts of a run have in common: its metadata, and the attachments of ``ALIKE``."""
+"""Common data of a run's parts: metadata, and the attachments of ``ALIKE``."""
 
 
 def parts_of(log: Path) -> list[Path]:
-    """All parts of the run of ``log``, in their order; ``log`` alone if its name is none of the recorder's.
+    """All parts of the run of ``log``, in their order; ``log`` alone if the recorder did not name it.
 
     Raises:
         InputError: the run's first part is not there.
@@ -44,7 +44,7 @@ def parts_of(log: Path) -> list[Path]:
 
 
 def run_of(log: Path) -> tuple[Path, int | None]:
-    """What is computed again for ``log``, whose filters begin with its run, and up to which daemon time, ns.
+    """Log to compute again for ``log``, whose filters begin with its run, and its end in daemon time, ns.
 
     Returns:
         The log itself, to its end; for a black box a log of its run, up to the end of the box.
@@ -69,7 +69,7 @@ class RunLog:
 
     Args:
         log: any part of it, or a log under another name.
-        until: daemon time, ns, up to which it counts; None = to its end.
+        until: daemon time of the end, ns; None for the whole log.
 
     Raises:
         NotFoundError: no such file.
@@ -101,11 +101,11 @@ class RunLog:
 
     @property
     def first(self) -> LogReader:
-        """Of the first part: what is attached there is of the run."""
+        """Attachments of the first part: they belong to the run."""
         return self._readers[0]
 
     def __iter__(self) -> Iterator[LogMessage]:
-        """What begins a later part that stood in an earlier one, the newest of every retained topic, comes but once."""
+        """Skip the retained messages at the start of a later part that an earlier part contains."""
         newest: dict[str, int] = {}
         self.damage, self._reader = None, self._readers[0]
         for number, reader in enumerate(self._readers):
@@ -133,7 +133,7 @@ class RunLog:
 
 
 def _alike(one: Identity, other: Identity) -> bool:
-    """Whether two parts say the same of themselves, as far as both say it: what is damaged says nothing."""
+    """Whether two parts agree in their common data; damaged data is ignored."""
     return one[0] == other[0] and all(one[1][name] == other[1][name] for name in one[1].keys() & other[1].keys())
 
 

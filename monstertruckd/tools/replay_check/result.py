@@ -1,4 +1,4 @@
-"""What a check of a log found."""
+"""Result of a check of a log."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -34,14 +34,14 @@ class CheckedReplay:
     duration: float
     """Duration of the log, s."""
     end: int
-    """Instant up to which outputs were recorded, ns."""
+    """Last instant of recorded outputs, ns."""
     topics: tuple[TopicComparison, ...]
     unreadable: tuple[Unreadable, ...]
     lost: dict[str, int]
     """Messages that never reached the log, by topic."""
     damage: str | None
     left_out: str | None = None
-    """Why planner and tracker were not computed; None = they were, or there are none."""
+    """Why planner and tracker were not computed; None if they were, or there are none."""
 
     @property
     def compared(self) -> int:
@@ -50,7 +50,7 @@ class CheckedReplay:
 
     @property
     def equal(self) -> int:
-        """Of them, equal bit for bit."""
+        """Number of them that are equal bit for bit."""
         return sum(comparison.equal for comparison in self.topics)
 
     @property
@@ -75,18 +75,18 @@ class CheckedReplay:
 
     @property
     def sufficient(self) -> float:
-        """Tolerance, SI units, with which a check that is ``rounded`` agrees."""
+        """Tolerance, SI units, that makes a ``rounded`` check agree."""
         return max([ROUND_OFF, *(comparison.tolerance for comparison in self.topics if comparison.judged)])
 
     @property
     def reason(self) -> Reason:
-        """How the check ended; another configuration may change what it likes."""
+        """Outcome of the check; with another configuration any difference is permitted."""
         if self.damage is not None:
             return Reason.LOG_DAMAGED
         return Reason.OK if self.agrees or self.config is not None else Reason.REPLAY_DIFFERS
 
     def figures(self) -> dict[str, Any]:
-        """Everything as plain values for JSON: what is not finite becomes null."""
+        """Everything as plain values for JSON: non-finite numbers become null."""
         return {
             "log": str(self.log),
             "parts": [str(part) for part in self.parts],

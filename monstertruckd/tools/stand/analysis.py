@@ -1,7 +1,7 @@
-"""What a log says of estimates against the stand: odometry, pose in map, tracker; and the stand's latency.
+"""Estimates of a log against the stand: odometry, pose in map, tracker; and the stand's latency.
 
 An estimate's frame is laid over the stand's by least squares of the poses (rotation and shift, no scale). The latency
-is the shift of time at which the turns of odometry and stand agree best.
+is the time shift with the best agreement between the turns of odometry and stand.
 """
 
 from dataclasses import asdict, dataclass
@@ -23,7 +23,7 @@ LEAST_COMMON: Final = 40
 
 @dataclass(frozen=True)
 class EstimateError:
-    """An estimate against what the stand saw."""
+    """An estimate against the stand."""
 
     what: str
     poses: int
@@ -34,7 +34,7 @@ class EstimateError:
     heading_rms: float
     """rad"""
     latency: float | None
-    """Seconds by which the stand's stamps are late against the estimate's; None: too little turn to determine it"""
+    """Delay of the stand's stamps relative to the estimate, s; None: too little turn to determine it"""
 
 
 def errors_of(log: LogReader) -> list[EstimateError]:
@@ -64,7 +64,7 @@ def errors_of(log: LogReader) -> list[EstimateError]:
 
 
 def tracker_errors(log: LogReader) -> dict[str, float] | None:
-    """What the tracker itself reported as its distance from the path, m; None where none drove."""
+    """Distance from the path reported by the tracker, m; None if none drove."""
     reports: list[Any] = [entry.decode() for entry in log if entry.topic == TRACKER.name]
     off = [abs(report.cross_track) for report in reports]
     if not off:
@@ -95,7 +95,7 @@ def error_of(what: str, seen: Array, estimate: Array) -> EstimateError:
 
 
 def latency_of(seen: Array, estimate: Array) -> float | None:
-    """Seconds by which the stand's stamps are late; None: hardly any turn."""
+    """Delay of the stand's stamps, s; None: hardly any turn."""
     yaw, other = np.unwrap(seen[:, 3]), np.unwrap(estimate[:, 3])
     if np.ptp(yaw) < 0.5:  # least turn to determine the latency, rad
         return None

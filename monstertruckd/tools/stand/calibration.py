@@ -67,7 +67,7 @@ def middles(sightings: Sequence[Sighting]) -> dict[int, Array]:
 
 
 def seen_marks(pictures: Sequence[Picture]) -> dict[int, Array]:
-    """Middles of tags, averaged over pictures in which nothing moves, pixels."""
+    """Centres of tags, averaged over pictures of a still scene, pixels."""
     found: dict[int, list[Array]] = {}
     for picture in pictures:
         for tag, middle in middles(TagReader(everywhere=1).read(picture)).items():
@@ -94,7 +94,7 @@ def place(lens: Lens, seen: Mapping[int, Array], marks: Mapping[int, MarkConfig]
 def check_places(
     placed: PlacedCamera, seen: Mapping[int, Array], marks: Mapping[int, MarkConfig], ruler: float
 ) -> None:
-    """Raise where a mark does not lie where it was said to.
+    """Refuse a mark that is not at its given place.
 
     Args:
         placed: camera, by all of its marks.
@@ -103,9 +103,9 @@ def check_places(
         ruler: standard deviation of a mark's place, m.
 
     Raises:
-        InputError: so it is. The mark without which all others fit is named, else the three that fit worst.
+        InputError: a mark is elsewhere; names the mark whose removal makes the others fit, else the three worst.
     """
-    # a mark is not where it was said to be beyond so many m, and so many standard deviations of the ruler
+    # maximum error of a mark's place, m, and in standard deviations of the ruler
     misplaced = (0.002, 5.0)
     limit = misplaced[0] + misplaced[1] * ruler
 
@@ -134,7 +134,7 @@ def join(
     marks: Mapping[int, MarkConfig],
     ruler: float,
 ) -> dict[str, PlacedCamera]:
-    """All places fitted together: marks lie where the ruler says, and where the other cameras see them.
+    """All places fitted together: marks lie at their measured places, and where the other cameras see them.
 
     Args:
         cameras: placed one by one.
@@ -183,7 +183,7 @@ def calibrate(
         floors: pictures of the table by camera.
 
     Raises:
-        InputError: a camera lacks pictures or marks, or a mark lies elsewhere; it is named.
+        InputError: a camera lacks pictures or marks, or a mark lies elsewhere; names it.
     """
     lenses: dict[str, tuple[LensFit, int]] = {}
     seen, placed = {}, {}

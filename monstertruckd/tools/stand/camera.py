@@ -16,7 +16,7 @@ class PlacedCamera:
 
     lens: Lens
     rotation: Array
-    """(3,): rotation vector from the stand's axes to the camera's, rad."""
+    """(3,): rotation vector from the stand's to the camera's axes, rad."""
     translation: Array
     """(3,): the stand's origin as the camera has it, m."""
 
@@ -35,7 +35,7 @@ class PlacedCamera:
 
         Args:
             pixels: seen.
-            height: of the plane over the stand's, m.
+            height: of the plane above the stand's plane, m.
         """
         return meet(self.lens.directions(pixels), self.axes, self.translation, height)
 
@@ -51,7 +51,7 @@ class PlacedCamera:
         return np.asarray(shown).reshape(-1, 2)
 
     def border(self, pixels: Array) -> float:
-        """Least distance of pixels from the picture's border, as a share of its height."""
+        """Minimum distance of pixels from the picture's border, as a fraction of its height."""
         width, height = self.lens.size
         x, y = pixels[:, 0], pixels[:, 1]
         return float(min(x.min(), y.min(), (width - 1 - x).min(), (height - 1 - y).min())) / height
@@ -63,7 +63,7 @@ def rotation_matrix(vector: Array) -> Array:
 
 
 def meet(directions: Array, axes: Array, translation: Array, height: float = 0.0) -> Array:
-    """Where rays of a camera meet a level plane, m; (n, 2).
+    """Intersections of a camera's rays with a level plane, m; (n, 2).
 
     Args:
         directions: x and y at z = 1 of the camera, (n, 2).

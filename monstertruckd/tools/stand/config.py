@@ -54,9 +54,9 @@ class MarkedRobot(Schema):
     """A robot that carries a marker."""
 
     x: float = 0.0
-    """Centre of the marker ahead of the robot's, m"""
+    """Offset of the marker's centre ahead of the robot's centre, m"""
     y: float = 0.0
-    """Centre of the marker to the left of the robot's, m"""
+    """Offset of the marker's centre to the left of the robot's centre, m"""
     yaw: float = 0.0
     """Yaw of the marker relative to the robot, left positive, rad"""
     height: Annotated[float, Field(ge=0, le=2)] = 0.08
@@ -77,7 +77,7 @@ class BlobRobot(MarkedRobot):
     apart: Annotated[float, Field(gt=0.03, le=1)]
     """Distance of the discs' middles, m"""
     start: Annotated[tuple[float, float] | None, Field(strict=False)] = None
-    """Where it stands at the beginning, m: for robots that look like others"""
+    """Its place at the start, m: for robots that look like others"""
 
     @model_validator(mode="after")
     def _two_colours(self) -> Self:
@@ -118,12 +118,12 @@ class OverheadConfig(Schema):
 
     @property
     def names(self) -> list[str]:
-        """Of all robots."""
+        """Tags of all robots."""
         return [*self.robots, *self.blobs]
 
     @property
     def colours(self) -> frozenset[Colour]:
-        """Of all discs."""
+        """Colours of all discs."""
         return frozenset(colour for robot in self.blobs.values() for colour in robot.colours)
 
     @model_validator(mode="after")

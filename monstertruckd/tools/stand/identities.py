@@ -1,8 +1,8 @@
-"""Which robot is which, where robots carry two coloured discs and several may look alike.
+"""Identities of robots with two coloured discs, of which several may look the same.
 
 A front disc and a rear one at the right distance are a robot's place; it belongs to the robot that is expected next to
-it (nearest neighbour from where each would be by its speed, nearest first, no disc twice). Robots that look alike and
-were out of sight together are not guessed at: one of them has to be seen at its start.
+it (nearest neighbour from where each would be by its speed, nearest first, no disc twice). Robots that look the same
+and were out of sight together are not guessed: one of them has to be seen at its start.
 """
 
 import math
@@ -20,9 +20,9 @@ from monstertruckd.tools.stand.config import BlobRobot
 from monstertruckd.tools.stand.poses import MarkerPose, weight_of
 
 AT_START: Final = 0.15
-"""m from its start at which a robot is known that cannot be distinguished from others."""
+"""Maximum distance from its start to identify a robot that looks like others, m."""
 UNSURE: Final = 0.5
-"""Seconds out of sight after which robots that look alike may be mistaken for each other."""
+"""Maximum time out of sight before robots that look the same may be confused, s."""
 
 
 class Pair(NamedTuple):
@@ -32,7 +32,7 @@ class Pair(NamedTuple):
     rear: int
     pose: MarkerPose
     off: float
-    """m by which their distance is not the robot's."""
+    """Difference between their distance and the robot's distance of discs, m."""
 
 
 @dataclass(slots=True)
@@ -87,7 +87,7 @@ class Identities:
         return list(found.items())
 
     def learn(self, stamp: int, name: str, pose: MarkerPose) -> None:
-        """Where a robot is, by all cameras together."""
+        """Pose of a robot, by all cameras together."""
         place = np.array((pose.x, pose.y))
         track = self._tracks.get(name)
         self._mistakable.discard(name)
@@ -129,7 +129,7 @@ class Identities:
         return AT_START + pair.off if seconds > UNSURE and not self._alike[name] else None
 
     def _may_be_another(self, name: str, stamp: int, pair: Pair) -> bool:
-        """Whether a robot that was long out of sight could be another one that was, too."""
+        """Whether a robot that was long out of sight could be another such robot."""
         if self._long_gone(name, stamp) and not self._at_start(name, pair):
             others = {
                 o for o in self._alike[name] if self._long_gone(o, stamp) and self._cost(o, stamp, pair) is not None

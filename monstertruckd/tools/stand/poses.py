@@ -18,7 +18,7 @@ class MarkerPose(NamedTuple):
     x: float
     y: float
     yaw: float
-    """Direction in which a tag's printed upper edge, or the front disc, lies from the middle, rad."""
+    """Direction from the middle to a tag's printed upper edge, or to the front disc, rad."""
     weight: float
     sigma: float
     """Standard deviation of x and y, m."""
@@ -41,9 +41,9 @@ class RobotPose(NamedTuple):
 
 
 def tag_pose(camera: PlacedCamera, sighting: Sighting, height: float) -> MarkerPose:
-    """Where a level tag is.
+    """Pose of a level tag.
 
-    The tag's x axis is the direction in which its printed upper edge lies, as a robot's front.
+    The tag's x axis points to its printed upper edge, the robot's front.
     """
     points = camera.on_plane(sighting.corners, height)
     middle = points.mean(axis=0)
@@ -65,7 +65,7 @@ def tag_pose(camera: PlacedCamera, sighting: Sighting, height: float) -> MarkerP
 
 
 def weight_of(camera: PlacedCamera, pixels: Array) -> float:
-    """Of what lies at these pixels, (n, 2): 1, and less near the picture's border."""
+    """Weight of points at these pixels, (n, 2): 1, and less near the picture's border."""
     # 0.12: share of a picture's height: nearer to its border a sighting has less weight
     return min(max(camera.border(pixels) / 0.12, 0.0), 1.0) + 1e-3  # least weight
 
@@ -86,7 +86,7 @@ def merged(poses: Sequence[MarkerPose]) -> MarkerPose:
 def robot_pose(
     name: str, robot: TaggedRobot | BlobRobot, stamp: int, tag: MarkerPose, cameras: tuple[str, ...]
 ) -> RobotPose:
-    """Of a robot from its marker."""
+    """Pose of a robot from its marker."""
     yaw = math.remainder(tag.yaw - robot.yaw, math.tau)
     c, s = math.cos(yaw), math.sin(yaw)
     x, y = tag.x - c * robot.x + s * robot.y, tag.y - s * robot.x - c * robot.y

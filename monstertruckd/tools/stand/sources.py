@@ -1,4 +1,4 @@
-"""Where pictures come from: cameras of the computer, films, folders of pictures."""
+"""Sources of pictures: cameras of the computer, films, folders of pictures."""
 
 import asyncio
 import queue
@@ -47,7 +47,7 @@ def _files(folder: Path) -> list[Path]:
 def stream(
     source: VideoDevice | FileSource | RenderedCamera, size: tuple[int, int], rate: float, *, colour: bool = False
 ) -> Iterator[Picture]:
-    """Pictures one after the other, grey or blue, green and red; blocks for each.
+    """Iterate over pictures, grey or blue, green and red; blocks for each.
 
     Raises:
         DeviceLostError: the camera is not there, or sends no more.
@@ -77,10 +77,10 @@ def stream(
 
 
 def _rendered(port: Path, mode: Mode, *, colour: bool) -> Iterator[Picture]:
-    """Pictures of an emulated camera, the newest one whenever one is requested."""
+    """Pictures of an emulated camera; each request returns the latest."""
     box: queue.Queue[bytes | BaseException] = queue.Queue(1)
     ended = threading.Event()
-    # A thread of its own takes what comes: a pty keeps 4 kB.
+    # A separate thread reads continuously: a pty keeps 4 kB.
     reading = threading.Thread(target=_read_port, args=(port, mode, box, ended), name=f"camera {port}", daemon=True)
     reading.start()
     try:

@@ -1,4 +1,4 @@
-"""Cameras to poses: a thread for each camera reads tags and discs, the loop joins what they saw at one instant."""
+"""Cameras to poses: a thread for each camera reads tags and discs, the loop joins their simultaneous results."""
 
 import asyncio
 import threading
@@ -27,7 +27,7 @@ class StandReader:
         marks: tags that lie on the table.
         colours: of robots' discs; empty: pictures may be grey.
         tagged: there are robots with tags; otherwise tags are read in one picture of ``EVERYWHERE``, for the marks.
-        phase: number of the camera: in each picture another one looks for tags everywhere.
+        phase: number of the camera: in each picture a different camera looks for tags everywhere.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class StandRun:
         rate: pictures a second.
         clock: stamps a picture when it was read.
         put: gets every pose.
-        say: gets what is wrong with a camera.
+        say: gets faults of cameras.
         live: a source that ends is a fault, and tried again.
         colours: of robots' discs; pictures have to be in colour for any.
     """
@@ -154,7 +154,7 @@ class StandRun:
             self._ended.set()
 
     def _watch(self, loop: asyncio.AbstractEventLoop, name: str, stream: Stream) -> None:
-        """One camera, in a thread of its own: OpenCV gives the interpreter free while it works."""
+        """One camera, in a separate thread: OpenCV releases the interpreter while it works."""
         said = ""
         while not self._ended.is_set():
             reader = self._reader(name)
@@ -170,4 +170,4 @@ class StandRun:
                     said = str(error)
                     with suppress(RuntimeError):  # the loop has ended
                         loop.call_soon_threadsafe(self._say, f"camera {name}: {error}")
-            self._ended.wait(1.0)  # seconds after which a lost camera is tried again
+            self._ended.wait(1.0)  # seconds before a lost camera is tried again

@@ -1,9 +1,9 @@
-"""From tags in several cameras' pictures to the poses of robots, without jumps where one camera hands over to the next.
+"""Poses of robots from tags in several cameras' pictures, without jumps between cameras.
 
 Each camera that sees a robot's tag gives a pose on the plane of the tag; they are averaged with weights that fall to
-nothing towards a picture's border, so that a robot leaves a camera's view gradually. Who is who the tags say, or where
-robots with coloured discs came from. A pose
-that no robot can have reached is left out, until it is seen again and again; so is what a camera sees that has moved.
+nothing towards a picture's border, so that a robot leaves a camera's view gradually. Tags identify robots; robots with
+coloured discs are identified by their motion. A pose that no robot can have reached is dropped until it is seen
+repeatedly; so are the results of a camera that has moved.
 """
 
 import math
@@ -24,9 +24,9 @@ from monstertruckd.tools.stand.identities import Identities
 from monstertruckd.tools.stand.poses import MarkerPose, RobotPose, merged, robot_pose, tag_pose
 
 EXPECTED: Final = 0.5
-"""Seconds for which a robot is expected where its speed takes it."""
+"""Time that a robot's motion is extrapolated, s."""
 BLIND: Final = 5.0
-"""Seconds without any mark after which a camera looks elsewhere."""
+"""Maximum time without a mark before a camera counts as moved, s."""
 
 
 @dataclass(slots=True)
@@ -49,9 +49,9 @@ class CameraState:
     """How a camera is."""
 
     heard: int
-    """Stamp of its newest picture, ns."""
+    """Stamp of its latest picture, ns."""
     marked: int
-    """Stamp of the newest one with marks, ns."""
+    """Stamp of the latest one with marks, ns."""
     unmarked: int = 0
     """Pictures since."""
     off: Array = field(default_factory=lambda: np.zeros(4))
@@ -61,14 +61,14 @@ class CameraState:
 
     @property
     def distance(self) -> float:
-        """By how much its marks are off, m."""
+        """Error of its marks, m."""
         return float(np.sqrt(self.off @ self.off))
 
 
 def shift_of(seen: Array, places: Array) -> Array:
-    """What is common to marks that are off their places, (4,): to x, to y, by a turn and by a scale, m rms over them.
+    """Common displacement of marks, (4,): in x, in y, by a turn and by a scale, m RMS over them.
 
-    Errors of the ruler are not common to them.
+    Errors of the ruler are independent.
 
     Args:
         seen: where they are seen, (n, 2), m.
@@ -150,7 +150,7 @@ class StandTracker:
         return poses
 
     def expected(self, stamp: int) -> dict[str, list[Array]]:
-        """Where cameras should see the tags of robots at ``stamp``, ns: corners by camera, (4, 2) each, pixels."""
+        """Expected corners of the robots' tags at ``stamp``, ns, by camera, (4, 2) each, pixels."""
         squares = []
         for name, robot in self._robots.items():
             known = self._known.get(name)
@@ -173,9 +173,9 @@ class StandTracker:
         return bool(self._tagged)
 
     def complaints(self, now: int) -> list[str]:
-        """What is newly wrong with cameras, or right again, and robots that are not distinguished."""
+        """New and cleared faults of cameras, and robots that are not distinguished."""
         said = self._identities.complaints()
-        silent = 1.0  # seconds without a picture after which a camera counts as lost
+        silent = 1.0  # maximum gap between pictures before a camera is lost, s
         for name, state in self.cameras.items():
             lost = now - state.heard > silent * SECOND
             if lost != state.lost:
@@ -203,7 +203,7 @@ class StandTracker:
         return said
 
     def _carried(self, name: str, pose: MarkerPose, late: int) -> MarkerPose:
-        """Where a robot's marker is ``late`` ns after it was seen."""
+        """Place of a robot's marker ``late`` ns after it was seen."""
         known = self._known.get(name)
         if known is None or not late:
             return pose
@@ -218,8 +218,8 @@ class StandTracker:
         seconds = (pose.stamp - known.pose.stamp) / SECOND
         jump = math.hypot(pose.x - known.pose.x, pose.y - known.pose.y)
         # 3.0: greatest speed of a robot, m/s
-        # 0.05: distance up to which a change is no jump, m
-        # 5: pictures after which an impossible pose is accepted
+        # 0.05: maximum change that is not a jump, m
+        # 5: pictures before an impossible pose is accepted
         if jump > 3.0 * max(seconds, 0.0) + 0.05 and known.doubts < 5:
             known.doubts += 1
             self.left_out += 1

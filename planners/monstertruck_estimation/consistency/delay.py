@@ -61,11 +61,11 @@ class Delay(NamedTuple):
 
     seconds: float
     sigmas: float
-    """Significance with which all tolerated lags and the longest are rejected."""
+    """Significance for the rejection of all tolerated lags and the longest."""
 
 
 def lag_question(steps: list[ScanStep], others: list[tuple[Errors, MotionTrack]], tolerated: float) -> LagQuestion:
-    """Collect the motions from which ``scan_delay`` finds the lag.
+    """Collect the motions for ``scan_delay``.
 
     Args:
         steps: consecutive steps of the scans, at least one.

@@ -42,7 +42,7 @@ WITNESSES: Final = (Measure.WHEELS, Measure.GYRO, Measure.ENCODERS, Measure.STAN
 GAP: Final = SECOND // 2
 """Maximum time between joined headings or rates (ns)."""
 IN_USE: Final = 2 * SECOND
-"""Time without a sample after which a measure is not in use (ns)."""
+"""Maximum age of a sample of a measure in use (ns)."""
 
 
 class _OpenDisagreement(NamedTuple):
@@ -277,7 +277,7 @@ class ConsistencyMonitor:
             return
         self._rest_since = stamp if self._rest_since is None else self._rest_since
         self._rest.append(rate)
-        rest = SECOND // 2  # time at rest after which the bias of a gyroscope is known, ns
+        rest = SECOND // 2  # minimum time at rest to measure the bias of a gyroscope, ns
         if stamp - self._rest_since >= rest:
             mean = math.fsum(self._rest) / len(self._rest)
             self._bias = mean if abs(mean) <= 0.1 else self._bias  # maximum bias: a higher mean rate is none, rad/s
@@ -313,7 +313,7 @@ class ConsistencyMonitor:
         """Return the difference that delays and stamp errors explain (m, rad).
 
         A constant delay costs the change of the speed; a stamp error costs the distance travelled meanwhile. Stamps
-        of sparse scans, or of scans in bursts, are no better than the interval between them. Scans whose motions
+        of sparse scans, or of scans in bursts, are as uncertain as the interval between them. Scans whose motions
         scatter more than they state are that uncertain.
         """
         interval, delay = max(self._intervals), self._config.delay
@@ -366,7 +366,7 @@ class ConsistencyMonitor:
         self._delayed_at = self._steps[-1].stamp
         steps = [step for step in self._steps if step.since >= self._active_since]
         interval, tolerated = max(self._intervals), self._config.delay
-        tolerated += interval if interval > tolerated else 0.0  # stamps of sparse scans are no better
+        tolerated += interval if interval > tolerated else 0.0  # stamps of sparse scans are that uncertain
         others = [(self._errors[measure], self._tracks[measure]) for measure in self._witnesses]
         return lag_question(steps, others, tolerated) if len(steps) >= FEWEST else None
 

@@ -63,7 +63,7 @@ class RepeatDetector:
 
 
 MOVED: Final = 0.15
-"""Motion (m or rad) after which repeats are no coincidence, even without noise."""
+"""Minimum motion (m or rad) that rules out repeats by chance, even without noise."""
 
 
 class WholeRepeats:

@@ -19,7 +19,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between
 
 SECTOR: Final = math.radians(15)
-"""Angle of view that one person at a distance of 2 m covers (rad)."""
+"""Angle of view covered by a person at a distance of 2 m (rad)."""
 DIMENSIONS: Final = 3
 """Number of dimensions of a planar motion."""
 LEAST: Final = np.finfo(float).tiny
@@ -41,7 +41,7 @@ def rest_evidence(scan: Scan, earlier: Scan, own: Array, claim: Claim, origin: t
     Args:
         scan: latest scan.
         earlier: scan at the start of the claim.
-        own: motion between both by scan odometry, shape (3,), at which the registration begins.
+        own: motion between both by scan odometry, shape (3,): start of the registration.
         claim: motion by the wheels.
         origin: position of the sensor in base (m).
     """

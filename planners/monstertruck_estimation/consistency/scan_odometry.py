@@ -77,7 +77,7 @@ class ScanMotionStep:
         self._revolution: Revolution | None = None
         """Latest revolution, the reference of the next one's scale."""
         self._reference: tuple[Cloud, Array] | None = None
-        """Scan to which others are registered, and its pose."""
+        """Reference scan of the registration, and its pose."""
         self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=128)  # number of scans kept for claims
         """Stamp, scan and its pose."""
 
@@ -150,8 +150,8 @@ class ScanMotionStep:
             front.keep(scan, self._pose)
         assert self._reference is not None
         moved = between(self._reference[1], self._pose)
-        keep_way = 0.3  # distance after which another scan is the reference, m
-        if math.hypot(moved[0], moved[1]) > keep_way or abs(moved[2]) > 0.35:  # turn after which it is, rad
+        keep_way = 0.3  # maximum distance from the reference scan, m
+        if math.hypot(moved[0], moved[1]) > keep_way or abs(moved[2]) > 0.35:  # maximum turn, rad
             self._reference = Cloud.of(scan), self._pose
 
     def _found(

@@ -12,7 +12,7 @@ from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.clock import SECOND
 
 KEPT: Final = 9 * SECOND
-"""Minimum time for which motion is kept (ns); the maximum is half as long again."""
+"""Minimum time that motion is kept (ns); the maximum is half as long again."""
 STILL: Final = 0.02, 0.02
 """Maximum speed (m/s) and turn rate (rad/s) of a standing robot."""
 
@@ -61,7 +61,7 @@ class MotionTrack:
     def covers(self, since: int, stamp: int) -> bool:
         """Whether the motion between two instants (ns) is known."""
         stamps = self._stamps
-        # maximum time (ns) beyond the latest sample at which a motion may be read; the robot is assumed to keep moving
+        # maximum time (ns) beyond the latest sample for reading a motion; the robot is assumed to keep moving
         ahead = SECOND // 10
         return len(stamps) > 1 and stamps[0] <= since and stamp <= stamps[-1] + ahead
 

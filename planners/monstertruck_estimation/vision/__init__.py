@@ -1,1 +1,1 @@
-"""What cameras see: needs the extra ``vision``, and is loaded on use only."""
+"""Computer vision: needs the extra ``vision``, and is loaded on use only."""

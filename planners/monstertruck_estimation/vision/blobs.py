@@ -55,7 +55,7 @@ class BlobReader:
             for k in range(1, count):
                 x, y, wide, high, pixels = (int(v) for v in boxes[k])
                 # 12: pixels of a disc
-                # 0.02: share of the picture: more is no disc
+                # 0.02: maximum area of a disc, as a fraction of the picture
                 # 1.8: longer side of a disc's box over its shorter one, at most
                 if not 12 <= pixels <= 0.02 * width * height or max(wide, high) > 1.8 * min(wide, high):
                     continue

@@ -1,6 +1,6 @@
 """The ChArUco board in a picture: a chessboard whose white squares carry markers, so that a part of it is enough.
 
-Corners are those of the chessboard, to a part of a pixel; the markers say which they are (Garrido-Jurado et al.,
+Corners are the chessboard's, to a fraction of a pixel; the markers identify them (Garrido-Jurado et al.,
 "Automatic generation and detection of highly reliable fiducial markers under occlusion", Pattern Recognition 2014;
 OpenCV's ``CharucoDetector``).
 """
@@ -48,7 +48,7 @@ class BoardReader:
         """Markers seen so far that are not of this board."""
 
     def read(self, picture: Picture) -> BoardSighting | None:
-        """The board in the next picture; None = it is not seen, or too few of its corners, or these in one line."""
+        """The board in the next picture; None if too few of its corners are seen, or all in one line."""
         corners, ids, _, markers = self._detector.detectBoard(picture)
         self.strangers |= (
             {int(tag) for tag in np.ravel(markers) if tag >= self._known} if markers is not None else set()

@@ -38,7 +38,7 @@ class Lens:
 
     @classmethod
     def of(cls, config: LensConfig, width: int, height: int) -> "Lens":
-        """As configured, for pictures of another size than it was measured with."""
+        """Build it as configured, also for pictures of another size than in the calibration."""
         across, up = width / config.width, height / config.height
         matrix = np.array(
             (
@@ -69,7 +69,7 @@ class LensFit(NamedTuple):
     sigmas: Array
     """(8,): standard deviations of ``PARAMETERS``, by the corners' noise or by how views disagree, the larger one."""
     rms: float
-    """Of the corners, pixels: both axes together."""
+    """RMS residual of the corners, pixels: both axes together."""
     corners: int
     by_view: tuple[float, ...]
     """The same of each view, pixels."""
@@ -108,9 +108,9 @@ def fit_lens(views: Sequence[BoardSighting], reader: BoardReader, size: tuple[in
 def sigmas_by_view(views: Sequence[tuple[Array, Array, Array]]) -> Array:
     """Standard deviations of a lens's parameters by how views disagree, (8,).
 
-    What is wrong with the corners of a view may be alike (a board that is bent, an edge that pixels cut slantwise), so
-    corners are no independent measurements, but views are: the covariance by clusters of Liang and Zeger
-    ("Longitudinal data analysis using generalized linear models", Biometrika 1986), with their number's correction.
+    Errors of the corners of a view may be correlated (a bent board, an edge that pixels cut slantwise), so only views
+    are independent measurements: the covariance by clusters of Liang and Zeger ("Longitudinal data analysis using
+    generalized linear models", Biometrika 1986), with their number's correction.
 
     Args:
         views: by view, slopes by the parameters of the lens (2 n, 8) and of the pose (2 n, 6), and residuals (2 n,).
@@ -129,7 +129,7 @@ def sigmas_by_view(views: Sequence[tuple[Array, Array, Array]]) -> Array:
 def _slopes(
     view: BoardSighting, reader: BoardReader, lens: Lens, turn: Array, place: Array
 ) -> tuple[Array, Array, Array]:
-    """As ``sigmas_by_view`` wants them."""
+    """Inputs of ``sigmas_by_view``."""
     shown, slopes = cv2.projectPoints(reader.points[view.ids], turn, place, lens.matrix, lens.distortion)
     found = np.asarray(slopes, dtype=np.float64)
     return found[:, 6 : 6 + len(PARAMETERS)], found[:, :6], (view.corners - np.asarray(shown).reshape(-1, 2)).ravel()
@@ -145,28 +145,28 @@ def lens_from_pictures(pictures: Sequence[Picture], reader: BoardReader) -> tupl
 
 
 class BoardPose(NamedTuple):
-    """Where a board is before a camera."""
+    """Pose of a board in front of a camera."""
 
     axes: Array
     """(3, 3), columns: its right, its down, and away from its face, in the camera's axes."""
     place: Array
     """(3,): its upper left corner, m."""
     rms: float
-    """Of the corners, pixels."""
+    """RMS residual of the corners, pixels."""
 
     @property
     def turn(self) -> float:
-        """By which it is turned about the vertical, rad: positive where its left edge is nearer."""
+        """Turn about the vertical, rad: positive if its left edge is nearer."""
         return math.atan2(-float(self.axes[0, 2]), float(self.axes[2, 2]))
 
     @property
     def lean(self) -> float:
-        """By which it leans, rad: positive where its upper edge is nearer."""
+        """Lean, rad: positive if its upper edge is nearer."""
         return math.atan2(-float(self.axes[1, 2]), float(self.axes[2, 2]))
 
 
 def board_pose(view: BoardSighting, reader: BoardReader, lens: Lens) -> BoardPose | None:
-    """Where a board is (Collins and Bartoli's solution, refined); None if no pose fits."""
+    """Pose of a board (Collins and Bartoli's solution, refined); None if no pose fits."""
     points = reader.points[view.ids]
     fine, turn, place = cv2.solvePnP(points, view.corners, lens.matrix, lens.distortion, flags=cv2.SOLVEPNP_IPPE)
     if not fine:

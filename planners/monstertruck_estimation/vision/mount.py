@@ -6,6 +6,6 @@ from monstertruck_kinematics.elementary import Array, rotation
 
 
 def camera_axes(yaw: float, pitch: float, roll: float) -> Array:
-    """From a camera's axes (right, down, ahead) to those of its body, (3, 3), by the mount's angles, rad."""
+    """Rotation from a camera's axes (right, down, ahead) to its body's, (3, 3), by the mount's angles, rad."""
     turned = rotation(yaw, pitch, roll)
     return np.stack((-turned[:, 1], -turned[:, 2], turned[:, 0]), axis=1)

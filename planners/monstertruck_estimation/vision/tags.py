@@ -104,7 +104,8 @@ class TagReader:
         return list(by_tag.values())
 
     def _detect(self, picture: Picture, x0: int, y0: int) -> list[Sighting]:
-        # 32: pixels around a tag, one for each of its cells: what is smaller is noise, of which every speck takes time
+        # 32: minimum outline of a tag in pixels, one for each of its cells: smaller outlines are noise, and each costs
+        # time
         self._parameters.minMarkerPerimeterRate = 32 / max(picture.shape)
         self._detector.setDetectorParameters(self._parameters)
         corners, ids, _ = self._detector.detectMarkers(picture)
@@ -123,7 +124,7 @@ ACROSS: Final = np.linspace(-2.5, 2.5, 21)
 def along_edges(picture: Picture, corners: Array) -> Array:
     """Corners as crossings of the lines through the steps of the picture along each edge, (4, 2).
 
-    OpenCV's own ones lie inwards of the true ones: at 35 pixels a side a tag seems 1.4 % smaller, so farther away.
+    OpenCV's own ones lie inwards of the true ones: at 35 pixels a side a tag seems 1.4 % smaller, so more distant.
     """
     lines = []
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
@@ -140,7 +141,7 @@ def along_edges(picture: Picture, corners: Array) -> Array:
         clear = steps.max(axis=1) > 3.0  # least step of an edge from sample to sample, of 255
         if clear.sum() < 4:
             return corners
-        # 0.7: pixels from the others at which a sample of an edge is none of it
+        # 0.7: maximum distance of a sample from its edge, pixels
         clear &= np.abs(off - np.median(off[clear])) < 0.7
         on = points[clear] + off[clear, None] * across
         middle = on.mean(axis=0)
@@ -174,7 +175,7 @@ def drawn(tag: int, pixels: int, family: TagFamily = "36h11") -> Picture:
 
 
 def _windows(places: Sequence[Array], width: int, height: int) -> list[tuple[int, int, int, int]]:
-    """Around the corners of each tag, those that overlap joined: x0, y0, x1, y1, pixels."""
+    """Boxes around the corners of each tag, overlapping ones joined: x0, y0, x1, y1, pixels."""
     boxes: list[tuple[int, int, int, int]] = []
     for corners in places:
         # 16: pixels

@@ -1,1 +1,1 @@
-"""Heavy work in processes of its own, so that it never stalls the event loop."""
+"""Heavy work in separate processes, so that it never stalls the event loop."""

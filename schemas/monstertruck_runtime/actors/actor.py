@@ -1,6 +1,6 @@
-"""Where a pure step runs: in the loop, in a worker process, or on another machine; one word changes it.
+"""Execution of a pure step: in the loop, in a worker process, or on another machine; one word changes it.
 
-Actors keep their state from step to step. A worker is a process of its own, with deadline, kill and restart.
+Actors keep their state from step to step. A worker is a separate process, with deadline, kill and restart.
 """
 
 import asyncio
@@ -42,14 +42,14 @@ class Actor(Protocol):
 
 
 class ResultDelivery(Protocol):
-    """When a worker's result counts on a virtual clock."""
+    """Delivery time of a worker's result on a virtual clock."""
 
     async def wait(self, clock: VirtualClock, due: int) -> None:
         """Return when a result that is due at ``due``, ns, may be delivered."""
 
 
 class VirtualDelivery:
-    """Delivers results at their instants; those due together in the order in which they were submitted."""
+    """Delivers results at their instants; results due together in the order of submission."""
 
     def __init__(self) -> None:
         self._sequence = itertools.count()
@@ -112,7 +112,7 @@ class LoopActor:
         self._step: Any = None
 
     async def start(self) -> None:
-        """Build what takes the steps."""
+        """Build the object that takes the steps."""
         if self._step is None:
             module, _, factory = self._target.partition(":")
             self._step = getattr(importlib.import_module(module), factory)()
@@ -151,13 +151,13 @@ class WorkerActor:
 
     Args:
         name: for error texts, and ``ActorFactory.worker_pids``.
-        target: ``module:factory``; what the factory returns has ``step(inputs) -> outputs``, both picklable.
+        target: ``module:factory``; the factory's object has ``step(inputs) -> outputs``, both picklable.
         clock: time.
         latency: declared seconds of a step on the reference computer.
-        deadline: seconds after which a step is given up.
+        deadline: time limit of a step, s.
         start_timeout: real seconds a start may take.
-        answer_timeout: real seconds without an answer, or without more of it, after which the worker is given up; on
-            the virtual clock from the result's instant on. As long as a start if not said.
+        answer_timeout: maximum real seconds without an answer, or more of it; on the virtual clock from the result's
+            instant on. Default: ``start_timeout``.
     """
 
     def __init__(
@@ -297,7 +297,7 @@ class WorkerActor:
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
     async def _blocking(self, function: Callable[[], T]) -> T:
-        """On the virtual clock no virtual time passes meanwhile, on the wall clock the loop goes on."""
+        """Wait; on the virtual clock no virtual time passes meanwhile, on the wall clock the loop continues."""
         return function() if self._virtual else await in_thread(function)
 
     async def __aenter__(self) -> Self:
@@ -334,7 +334,7 @@ class ActorFactory:
         deadline: float,
         start_timeout: float = 30.0,
     ) -> Actor:
-        """An actor; arguments as of ``WorkerActor``, those of no use to a placement are left out."""
+        """An actor; arguments as for ``WorkerActor``; a placement ignores arguments that it does not use."""
         match placement:
             case "loop":
                 return LoopActor(target, self._clock, latency)

@@ -33,15 +33,15 @@ class WorkerProcess:
 
     Args:
         name: for error texts.
-        target: ``module:factory``; what the factory returns has ``step(inputs) -> outputs``.
-        stall_timeout: seconds after which a process that stops in the middle of a message, either way, is given up.
+        target: ``module:factory``; the factory's object has ``step(inputs) -> outputs``.
+        stall_timeout: maximum pause in the middle of a message, either way, s.
     """
 
     def __init__(self, name: str, target: str, stall_timeout: float = 30.0) -> None:
         self._name = name
         self._killed = False
         self.used = 0.0
-        """Processor time of the newest step, s."""
+        """Processor time of the latest step (s)."""
         ours, theirs = socket.socketpair()
         limit = _TIMEVAL.pack(*divmod(round(stall_timeout * 1e6), 10**6))
         for direction in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
@@ -114,7 +114,7 @@ class WorkerProcess:
         if self._killed:
             return text
         try:
-            code = self._process.wait(1.0)  # seconds in which a process that has closed its connection ends
+            code = self._process.wait(1.0)  # seconds that a process may take to end after it has closed its connection
         except subprocess.TimeoutExpired:
             return f"{text}: it closed its connection"
         if code >= 0:
@@ -146,7 +146,7 @@ def main() -> int:
 
 
 def _processor_time() -> float:
-    """Of this thread, s; the clock's module would cost every worker the import of asyncio."""
+    """Processor time of this thread (s); the clock's module would cost every worker the import of asyncio."""
     usage = resource.getrusage(resource.RUSAGE_THREAD)
     return usage.ru_utime + usage.ru_stime
 

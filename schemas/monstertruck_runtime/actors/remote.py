@@ -1,7 +1,7 @@
-"""Steps taken on another machine: it calls the robot for work and brings the outputs back.
+"""Steps on another machine: it calls the robot for work and returns the outputs.
 
-So the robot listens as always, and any client that may call it may compute for it (``monstertruckd plan-server``). What
-travels is JSON of known classes, see ``StepCodec``; nothing that comes in is executed.
+So the robot listens as always, and any client that may call it may compute for it (``monstertruckd plan-server``).
+Messages are JSON of known classes, see ``StepCodec``; no received content is executed.
 """
 
 import asyncio
@@ -141,7 +141,7 @@ def _travels(cls: type[Any]) -> bool:
 
 
 def _annotations(cls: type[Any]) -> list[Any]:
-    """Of the fields of a dataclass or model."""
+    """Codec of the fields of a dataclass or model."""
     if issubclass(cls, Schema):
         return [part for field in cls.model_fields.values() for part in (field.annotation, *field.metadata)]
     hints = get_type_hints(cls, include_extras=True)
@@ -149,7 +149,7 @@ def _annotations(cls: type[Any]) -> list[Any]:
 
 
 class RemoteActor:
-    """One kind of steps, taken by a plan server that calls for them; the newest caller replaces the one before.
+    """One kind of steps, taken by a plan server that calls for them; the latest caller replaces the one before.
 
     Args:
         name: of the steps, for the caller.

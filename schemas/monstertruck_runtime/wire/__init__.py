@@ -55,7 +55,7 @@ def encode(topic: Topic[M], message: M) -> bytes:
 
 
 def _escaped(value: Any) -> Any:
-    r"""``value`` with what UTF-8 cannot carry escaped: bytes of a file's name that are no text as ``\xff``."""
+    r"""``value`` with characters outside UTF-8 escaped: undecodable bytes of a file's name as ``\xff``."""
     match value:
         case str():
             bytes_shown = _BYTE.sub(lambda byte: f"\\x{ord(byte[0]) - 0xDC00:02x}", value)

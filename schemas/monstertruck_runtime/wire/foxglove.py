@@ -1,8 +1,8 @@
 """Our messages as the well-known ``foxglove.*`` protobuf messages, so that stock viewers draw them.
 
-Foxglove's published descriptors are extended by the fields of ``foxglove_fields.proto``, in a descriptor pool of their
-own: the default pool holds the published ones under the same names. Bytes of version 0.1.0, which also has fields that
-are zero, and bytes of any other protobuf writer are read alike.
+Foxglove's published descriptors are extended by the fields of ``foxglove_fields.proto``, in a separate descriptor pool:
+the default pool holds the published ones under the same names. Bytes of version 0.1.0, which also has fields that are
+zero, and bytes of any other protobuf writer are read, too.
 """
 
 import itertools
@@ -36,7 +36,7 @@ M = TypeVar("M", bound=Message)
 
 
 def _files(file: FileDescriptor) -> dict[str, FileDescriptorProto]:
-    """``file`` and what it imports by name, imports first."""
+    """``file`` and its imports by name, imports first."""
     files: dict[str, FileDescriptorProto] = {}
     for dependency in file.dependencies:
         files |= _files(dependency)
@@ -102,7 +102,7 @@ def _planar(pose: Any) -> tuple[float, float, float]:
 _Numbers = Sequence[float] | bytes
 """A field of type ``repeated double``, or its packed bytes."""
 _Fields = dict[str, Any]
-"""Of one of our models, by name, not validated yet."""
+"""Values of one of our models, by name, not validated yet."""
 
 
 _DOUBLES: Final = {count: struct.Struct(f"<{count}d") for count in (1, 3)}

@@ -82,7 +82,7 @@ class Traffic:
     def _watch(self, now: int, nominal: float) -> None:
         silence = (now - self.last) / SECOND
         self.longest_silence = max(self.longest_silence, silence)
-        # 5: nominal periods without a message that count as a silence, if the topic names no staleness limit
+        # 5: minimum length of a silence, in nominal periods, if the topic names no staleness limit
         limit = BY_NAME[self.name].stale_after or 5 / nominal
         self.silences += silence > limit
         self.count_to(now)
@@ -119,7 +119,7 @@ class RunSummary:
     metadata: dict[str, str] = field(default_factory=dict)
     """Metadata of the run in the log."""
     offset: int | None = None
-    """Real minus daemon time, ns, by the newest message."""
+    """Real minus daemon time (ns), by the latest message."""
     traces: dict[Curve, Trace] = field(default_factory=dict)
     traffic: dict[str, Traffic] = field(default_factory=dict)
     states: StateTimeline = field(default_factory=StateTimeline)

@@ -257,7 +257,7 @@ def _mark(run: RunSummary, event: Event) -> str:
 
 
 def scene(run: RunSummary) -> str:
-    """The way over what the lidar saw; empty if the log has neither."""
+    """Path over the map of the lidar; empty if the log has neither."""
     picture = run.map.picture()
     planned = [] if run.path_plan is None else [(x, y) for x, y, _ in run.path_plan.poses.reshape(-1, 3).tolist()]
     driven = [(x, y) for _, x, y in run.way.points]

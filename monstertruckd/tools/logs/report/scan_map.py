@@ -1,4 +1,4 @@
-"""The map under the driven path: an occupancy grid of the log's scans, or the newest grid in the log."""
+"""The map under the driven path: an occupancy grid of the log's scans, or the latest grid in the log."""
 
 import io
 import math
@@ -43,11 +43,11 @@ class PlacedScans:
 
     @property
     def newest(self) -> tuple[int, float, float, float] | None:
-        """Stamp (ns) and newest pose (m, m, rad)."""
+        """Stamp (ns) and latest pose (m, m, rad)."""
         return self._poses[-1] if self._poses else None
 
     def pose(self, odometry: Odometry) -> None:
-        """The truck's newest pose in the map."""
+        """The truck's latest pose in the map."""
         pose = odometry.pose
         self._poses.append((odometry.stamp, pose.x, pose.y, pose.yaw))
 
@@ -110,7 +110,7 @@ class ScanMap:
         self._raster.add(*self.scans.place(scan))
 
     def picture(self) -> Picture | None:
-        """What was gathered; None without scans and grids."""
+        """Map of the collected data; None without scans and grids."""
         if self._grid is not None:
             return _grid_picture(self._grid)
         occupancy = self._raster.occupancy()
@@ -130,7 +130,7 @@ def _grid_picture(grid: Grid) -> Picture:
 
 
 def _picture(occupancy: Array, area: Area) -> Picture:
-    """From shares of hits, row 0 lowest, NaN unknown; cut to what is known."""
+    """Map from fractions of hits, row 0 lowest, NaN unknown; cropped to the known cells."""
     known = np.isfinite(occupancy)
     rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
     cell = (area.x1 - area.x0) / occupancy.shape[1]

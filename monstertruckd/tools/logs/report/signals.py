@@ -1,4 +1,4 @@
-"""Signals of the report: what is plotted, traces of any length in bounded memory, and the driven path."""
+"""Signals of the report: plots, traces of any length in bounded memory, and the driven path."""
 
 import math
 from collections.abc import Callable
@@ -71,12 +71,12 @@ class Trace:
 
     @property
     def low(self) -> float | None:
-        """Least value; None without samples."""
+        """Minimum; None without samples."""
         return min((bucket.low for bucket in self.buckets), default=None)
 
     @property
     def high(self) -> float | None:
-        """Greatest value; None without samples."""
+        """Maximum; None without samples."""
         return max((bucket.high for bucket in self.buckets), default=None)
 
     def pieces(self) -> list[list[Bucket]]:
@@ -84,7 +84,7 @@ class Trace:
         if not self.buckets:
             return []
         period = (self.buckets[-1].last - self.buckets[0].first) / max(self.count - 1, 1)
-        gap = max(_SHORTEST_GAP, 5 * period)  # mean periods without a sample that count as a gap
+        gap = max(_SHORTEST_GAP, 5 * period)  # minimum length of a gap, in mean periods
         pieces = [[self.buckets[0]]]
         for bucket in self.buckets[1:]:
             if bucket.first - pieces[-1][-1].last > gap:
@@ -249,11 +249,11 @@ FIGURES: Final = (
     Figure("Memory of the daemon", "MB", 20, (Curve("resident", t.HOST, _scaled("daemon_memory", 1e-6)),)),
     Figure("Network signal", "dBm", 20, (Curve("smoothed", t.LINK, _scaled("signal")),)),
 )
-"""In the order of the page."""
+"""Signals in the order of the page."""
 
 
 _LEAST_STEP: Final = 0.02
-"""Least distance between two positions, m; nearer ones are noise at standstill."""
+"""Minimum distance between two positions (m); smaller ones are noise at standstill."""
 
 
 @dataclass(slots=True)

@@ -59,7 +59,7 @@ class StateTrack:
         self.spans.append(StateSpan(time, time, text, tone, detail))
 
     def close(self, end: int) -> None:
-        """End the newest state at ``end``."""
+        """End the latest state at ``end``."""
         if self.spans:
             self.spans[-1] = replace(self.spans[-1], end=max(end, self.spans[-1].start))
 
@@ -135,7 +135,7 @@ class StateTimeline:
         self.battery = StateTrack("battery")
         self.services: dict[str, StateTrack] = {}
         self.health: dict[str, ServiceHealth] = {}
-        """Newest health of each service, except its ordinary stop."""
+        """Latest health of each service, except its ordinary stop."""
         self.usb: dict[str, StateTrack] = {}
 
     def handlers(self) -> Iterator[tuple[Topic[Any], Callable[[int, Any], None]]]:
