@@ -1,1 +1,1 @@
-"""Builds what a configuration describes and connects it to the bus."""
+"""Builds the services of a configuration and connects them to the bus."""

@@ -83,7 +83,7 @@ class Cabling:
         return self._given.get(role) or I2cPort(Path(self._ports[role].label))
 
     def camera(self, role: str) -> FrameSource:
-        """Where a camera's pictures come from."""
+        """Source of a camera's pictures."""
         port = self._ports[role]
         if role in self._given:
             return RenderedSource(self._given[role], self._machine.clock)
@@ -106,7 +106,7 @@ class Cabling:
             self._events(Reason.DEVICE_FAULT, Severity.ERROR, role, str(error))
 
     def waiting(self, role: str) -> str | None:
-        """What the device of ``role`` waits for before it may start; None if it does not wait."""
+        """Condition for the start of the device of ``role``, or None."""
         return self._hubs.waits_for(role)
 
 
@@ -129,7 +129,7 @@ class HubCamera:
         port = self._machine.serial(path, BAUD)
         if isinstance(port, SerialPort):
             return await PathSource(str(path), self._machine.clock).open(mode, buffers)
-        # Only what is emulated in this process leads from a camera's node to a port.
+        # Only emulated devices of this process lead from a camera's node to a port.
         return await RenderedSource(port, self._machine.clock).open(mode, buffers)
 
 
@@ -169,11 +169,11 @@ def build_drivers(
 
 
 def sensor_services(config: TruckConfig) -> dict[str, Reason]:
-    """Services that write what the gate needs, with the reason their loss gives."""
+    """Services that write the gate's inputs, with the reason of their loss."""
     return {
         role: STALE_TOPICS[topic]
         for role, device in config.devices.present().items()
-        for topic in reversed(_written(role, device, config))  # of several, its own topic's
+        for topic in reversed(_written(role, device, config))  # of several, for its own topic
         if topic in STALE_TOPICS
     }
 
@@ -196,7 +196,7 @@ def measures_battery(config: TruckConfig) -> bool:
 
 
 def of_duty(drivers: Mapping[str, Service], *duties: Duty) -> dict[str, Service]:
-    """Those of the drivers that are there for one of ``duties``."""
+    """Present drivers with one of ``duties``."""
     return {role: driver for role, driver in drivers.items() if DEVICES.roles[role].duty in duties}
 
 
@@ -211,7 +211,7 @@ def _publisher(
 
 
 def scan_publisher(config: TruckConfig, bus: Bus) -> Publisher[LaserScan]:
-    """Where scans go: with the tilt of their plane, as far as compass and stabiliser measure it."""
+    """Sink of scans: adds the tilt of their plane, as measured by compass and stabiliser."""
     out = bus.publisher(topics.SCAN, Writer.DRIVER)
     angles = scan_angles(config, bus, RECENT)
     return out if angles is None else TiltStamper(out, angles)

@@ -54,7 +54,7 @@ class Body:
     chassis: Chassis
     footprint: Footprint
     points: ScanPoints
-    """Of the newest scan."""
+    """Stamp of the latest scan."""
     sonars: Mapping[str, tuple[float, float, float]]
     """Pose in base of every sonar of a robot without a lidar, m, m, rad."""
     rear_sonars: Mapping[str, tuple[float, float, float]]
@@ -64,7 +64,7 @@ class Body:
 
     @classmethod
     def of(cls, config: TruckConfig) -> Self:
-        """Of a configured robot."""
+        """Estimators of a configured robot."""
         lidar = config.devices.lidar
         points = ScanPoints(lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0))
         sonar = config.devices.sonar
@@ -76,7 +76,7 @@ class Body:
 
 
 def sensor_mounts(config: TruckConfig) -> dict[str, Mount]:
-    """Where every sensor is fixed to the base, by its frame; of the stabiliser the point that its joints turn about."""
+    """Mounts of all sensors on the base, by frame; for the stabiliser, the point that its joints turn about."""
     devices = config.devices.present()
     mounts = {role: device.mount for role, device in devices.items() if DEVICES.roles[role].frame}
     for role, device in devices.items():
@@ -138,7 +138,7 @@ def _build_consistency(
     devices, chassis = config.devices, body.chassis
     scans = None
     if consistency.scans is not None and devices.lidar is not None and all(map(find_spec, SCAN_LIBRARIES)):
-        # On the virtual clock nothing runs meanwhile: a process of its own would only take time to start.
+        # On the virtual clock nothing runs meanwhile: a separate process would only take time to start.
         placement: Placement = "loop" if isinstance(clock, VirtualClock) else "worker"
         actor = actors.actor(
             placement,
@@ -176,7 +176,7 @@ def _build_consistency(
 
 
 def _build_ground(config: TruckConfig, bus: Bus, clock: Clock, run: str) -> GroundService | None:
-    """Where routes are planned by a robot that feels its tilt."""
+    """Route maps of a robot that measures its tilt."""
     devices, slam = config.devices, config.slam
     if config.ground is None or config.own_planner is None or devices.compass is None:
         return None
@@ -246,7 +246,7 @@ def _build_points(
 
 
 def build_slam(config: TruckConfig, bus: Bus, clock: Clock, run: str = "") -> SlamService | OutsideLocalisation | None:
-    """Build what makes a map, localises in one, or follows a client. ``run`` names this run in saved maps."""
+    """Build the service that maps, localises, or follows a client. ``run`` names this run in saved maps."""
     devices = config.devices
     if config.slam is not None and config.slam.mode == "ros2":
         planner, maps = config.own_planner, None

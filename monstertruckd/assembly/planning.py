@@ -67,7 +67,7 @@ def build_planners(
 ) -> Iterator[Service]:
     """Path source and tracker where one is configured; goals, exploration; the lidar's levelling; the map's picture.
 
-    ``save_map`` has the map saved as soon as possible, and returns whether it can be; None = there is none.
+    ``save_map`` has the map saved as soon as possible, and returns whether it can be; None without mapping.
     """
     wanted = (config.tracker or config.behaviours) and config.missing_actuators() is None
     requests = bus.publisher(topics.PLAN_DRIVE, Writer.PLANNER) if wanted else None
@@ -174,7 +174,7 @@ def _build_tracker(
         inputs["attitude"] = bus.subscribe(topics.COMPASS, latest())
     actor = None
     if placement != "loop":
-        # 5.0: seconds after which a tracker elsewhere is given up; the gate stops the truck long before
+        # 5.0: deadline of a remote tracker, s; the gate stops the truck long before
         actor = actors.actor(placement, TRACKING, STEPS[TRACKING], latency=0.0, deadline=5.0)
     return TrackerService(
         TrackSetup(
@@ -196,7 +196,7 @@ def _build_tracker(
 
 
 def with_response(tracker: TrackerConfig, devices: Devices) -> TrackerConfig:
-    """The tracker's settings; dead time and lag are those of the servos unless it has its own."""
+    """The tracker's settings; dead time and lag come from the servos unless it has its own."""
     steering = devices.steers()
     if steering is None or tracker.dead_time is not None or tracker.lag is not None:
         return tracker

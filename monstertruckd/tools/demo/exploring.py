@@ -26,7 +26,7 @@ from monstertruckd.tools.logs.report import report
 Report = Callable[[str, Grid | None, Pose2D | None], object]
 """Gets a line of progress, the newest map and the robot's pose in it; None before the first."""
 DONE: Final = frozenset({Reason.GOAL_REACHED, Reason.EXPLORED, Reason.POINTS_FOUND})
-"""Outcomes of a demo that did what it should."""
+"""Outcomes of a successful demo."""
 STARTING: Final = frozenset(
     {
         Reason.NO_MAP,

@@ -167,7 +167,7 @@ def seeks(config: SimulatedTruckConfig) -> bool:
 async def run_wall_exploration(
     clock: Clock, config_file: Path, folder: Path, seed: int | None, report: Report
 ) -> ExplorationSummary:
-    """Do the same over ptys, in real time; arguments and errors are those of ``run_fast_exploration``.
+    """Do the same over ptys, in real time; arguments and errors as in ``run_fast_exploration``.
 
     Raises:
         NoAnswerError: a process did not come up.
@@ -221,7 +221,7 @@ async def run_wall_demo(clock: Clock, config: Path, folder: Path, seed: int | No
 
 @asynccontextmanager
 async def _served(clock: Clock, config: Path, folder: Path, seed: int | None) -> AsyncIterator[TruckClient]:
-    """Emulated robot and daemon as processes of their own, and a client; the truth is written at the end."""
+    """Emulated robot and daemon as separate processes, and a client; the truth is written at the end."""
     endpoint = free_endpoint()
     overlay = write_overlay(config, folder, endpoint, seed)
     simulate = ("simulate", "--config", str(overlay), "--truth", str(folder / "truth.npz"))
@@ -236,7 +236,7 @@ async def _served(clock: Clock, config: Path, folder: Path, seed: int | None) ->
 
 @asynccontextmanager
 async def _ready(said: Callable[[], bytes], clock: Clock) -> AsyncIterator[None]:
-    """Enter once the simulator has said that its devices are plugged in."""
+    """Enter once the simulator has reported its devices."""
     try:
         async with clock.deadline(START_LIMIT):
             while b"ready" not in said():
@@ -249,7 +249,7 @@ async def _ready(said: Callable[[], bytes], clock: Clock) -> AsyncIterator[None]
 def write_overlay(config: Path, folder: Path, endpoint: str, seed: int | None = None) -> Path:
     """Write a configuration that includes ``config``, with its devices on ptys and all output in ``folder``.
 
-    Devices by hub and port are kept: their hubs are those of the emulated computer.
+    Devices by hub and port are kept: their hubs belong to the emulated computer.
     """
     given = load_tree(config).data
     here = folder.resolve()

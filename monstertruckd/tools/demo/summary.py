@@ -13,9 +13,9 @@ from monstertruckd.tools.logs.summary import info
 from monstertruckd.tools.simulation.operator import Lap
 
 LATE = 0.02
-"""Lateness from which on the computer counts as busy, s: one control tick."""
+"""Minimum lateness of a busy computer, s: one control tick."""
 GOAL_CLOSING = 0.3
-"""Greatest true closing error of the lap, m."""
+"""Maximum true closing error of the lap, m."""
 
 
 def log_figures(folder: Path) -> tuple[dict[str, int], int, tuple[Path, ...]]:
@@ -108,7 +108,7 @@ class Summary:
         return [("stopped on the way", text + again)] if text else []
 
     def _busy_row(self) -> list[tuple[str, str]]:
-        """What a lap with stops on a busy computer needs; nothing for others."""
+        """Advice for a lap with stops on a busy computer; empty for others."""
         if not (self.lap.stops and self.lateness_p99 > LATE):
             return []
         return [

@@ -28,9 +28,9 @@ from monstertruckd.tools.simulation.simulate import serve
 
 EXPLORING: Final = "configs/parts/exploring.yaml"
 PERSON: Final[Mapping[str, Any]] = {"speed": 0.5, "before": "turn"}
-"""A person, who walks where the seed says and turns aside before the robot."""
+"""A person who walks by the seed and turns aside before the robot."""
 STEERING: Final = ("4ws", "2ws")
-"""What routes may ask of the axles, the best first: not every body can do it."""
+"""Steering modes of routes, best first: not every body supports each."""
 
 
 def robot_file(name: Path) -> Path:
@@ -76,7 +76,7 @@ def _included(robot: Path, more: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _additions(own: SimulatedTruckConfig, folder: Path) -> Iterator[dict[str, Any]]:
-    """What is added to a robot, the most first: planner and mapping, mapping alone, nothing."""
+    """Additions to a robot, most complete first: planner and mapping, mapping alone, nothing."""
     if own.devices.lidar is not None:
         slam = {"slam": {"save": str(folder.resolve() / "explored")}}
         for steering in STEERING:

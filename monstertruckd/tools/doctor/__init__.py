@@ -1,4 +1,4 @@
-"""Checks of a truck's computer before it drives: what works, what does not, and the command that fixes it."""
+"""Checks of a truck's computer before it drives: faults, and the commands that fix them."""
 
 from monstertruckd.tools.doctor import computer, devices, history, software
 from monstertruckd.tools.doctor.context import Finding, HostContext

@@ -119,7 +119,7 @@ def wireless(context: HostContext) -> Iterator[Finding]:
 
 
 def _security(text: str, weak: str, keyed: str) -> str:
-    """What is wrong with a network's protection; empty: nothing."""
+    """Fault of a network's protection; empty if none."""
     plain = text.replace(" ", "")
     if weak in plain:
         return "WEP"
@@ -127,7 +127,7 @@ def _security(text: str, weak: str, keyed: str) -> str:
 
 
 def card(context: HostContext) -> Iterator[Finding]:
-    """Wear of eMMC storage, as far as it says so itself (JEDEC: tenths of its life; 2 and 3: end of life near)."""
+    """Wear of eMMC storage, if it reports it (JEDEC: tenths of its life; 2 and 3: end of life near)."""
     for folder in sorted((context.computer.root / "sys/block").glob("mmcblk*")):
         life = (text_of(folder / "device/life_time") or "").split()
         end = text_of(folder / "device/pre_eol_info") or ""
@@ -139,7 +139,7 @@ def card(context: HostContext) -> Iterator[Finding]:
         if not tenths:
             continue
         seen = f"{folder.name}: {10 * (tenths - 1)} to {10 * tenths} % of its life is used"
-        if tenths >= 8 or worn > 1:  # tenths of its life from which on a card is to be replaced
+        if tenths >= 8 or worn > 1:  # wear before a card should be replaced, tenths of its life
             yield warn("card", Reason.RECORDING_FAILED, f"{seen}: copy it to a new one")
         else:
             yield fine("card", seen)
@@ -216,7 +216,7 @@ def _not_checked(context: HostContext, file: Path) -> Finding:
 
 
 def _listening(context: HostContext) -> set[int]:
-    """Local TCP ports on which a process listens."""
+    """Local TCP ports with a listening process."""
     rows = [
         line.split()
         for name in ("tcp", "tcp6")

@@ -1,4 +1,4 @@
-"""What a check of the doctor gets, the computer and its configuration, and what it gives: findings."""
+"""Input of the doctor's checks, the computer and its configuration, and their output: findings."""
 
 import os
 import re
@@ -115,7 +115,7 @@ def fail(check: str, reason: Reason, seen: str, fix: str | None = None) -> Findi
 
 
 SAFE_PROGRAMS: Final = ("timedatectl", "chmod", "chown", "usermod", "modprobe")
-"""Programs whose calls in findings change what a finding names, and nothing else."""
+"""Programs whose calls in findings affect only the reported item."""
 
 
 def safe_fix(fix: str | None) -> list[str] | None:
@@ -154,17 +154,17 @@ class HostContext:
     """Its USB tree, device nodes and readings."""
     program: Program
     config_file: Path | None
-    """Configuration that was named, else the installed one, else None."""
+    """Given configuration, else the installed one, else None."""
     config: TruckConfig | None
     """None where there is none, or a refused one."""
     refusal: str | None
     """Why it was refused."""
     account: Account | None
-    """User of the daemon: the service's, else the caller."""
+    """User of the daemon: of the service, else the caller."""
     versions: Callable[[str], str | None] = version_of
 
     def at(self, path: Path) -> Path:
-        """Where an absolute path of that computer is."""
+        """Place of an absolute path of that computer."""
         return below(self.system, path)
 
     def logs(self) -> Path:

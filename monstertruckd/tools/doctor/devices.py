@@ -1,4 +1,4 @@
-"""Checks of the devices: plugged in where the configuration says, and answering."""
+"""Checks of the devices: plugged in as configured, and answering."""
 
 import asyncio
 import shutil

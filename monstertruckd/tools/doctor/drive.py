@@ -53,7 +53,7 @@ async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]
 
     Args:
         drives: moves the robot as an operator; raises where the gate refuses.
-        config: the daemon's.
+        config: of the daemon.
         command: of this installation.
     """
     chassis = config.chassis()
@@ -78,12 +78,12 @@ async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]
 
 
 def movement(record: MoveRecord, chassis: TruckChassis, lidar: Array | None) -> Movement:
-    """What a move was.
+    """Measures of a move.
 
     Args:
         record: with scans and IMU, where there are.
         chassis: of the robot.
-        lidar: its mount, m and rad; None = there is none.
+        lidar: its mount, m and rad, or None.
     """
     distance, turn = by_wheels(record, chassis)
     seen: dict[str, float] = {}
@@ -117,8 +117,8 @@ def by_wheels(record: MoveRecord, chassis: TruckChassis) -> tuple[float, float]:
 def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> Array | None:
     """Motion of the body by the scans at rest before and after, m and rad, (3,); None where they do not match.
 
-    What the wheels say is one guess; that they go the other way, or turn the other way, are others. Where the scans do
-    not determine the motion, as in a corridor that has no end in sight, x and y are not a number.
+    The wheels give one guess, reversed motion or turns the others. If the scans do not determine the motion, as in a
+    corridor without a visible end, x and y are NaN.
     """
     try:
         before, after = (resting_scan(found) for found in record.at_rest(topics.SCAN))
@@ -144,14 +144,14 @@ def by_lidar(record: MoveRecord, wheels: tuple[float, float], mount: Array) -> A
 def judged(moves: list[Movement], command: Callable[..., str]) -> Iterator[Finding]:
     """Findings of all moves together: turns and distances of a move back count with their signs."""
     turn = sum(abs(move.turn) for move in moves)
-    if turn < 0.1:  # least turn of all moves together, rad, by which a sign can be judged
+    if turn < 0.1:  # minimum turn of all moves together to judge a sign, rad
         text = f"motor and steering turned it by {math.degrees(turn):.0f} degrees in all: too little for a sign"
         yield warn("signs", Reason.STEERING_DEAD, text)
         return
     shares = shares_of_turn(moves)
     against = [name for name, share in shares.items() if share < -CLEAR]
     agree = [name for name, share in shares.items() if share > CLEAR]
-    # 0.05: least distance of a move by which a sign can be judged, m
+    # 0.05: minimum distance of a move to judge a sign, m
     along = sum(
         move.distance_seen * move.distance
         for move in moves
@@ -193,7 +193,7 @@ def shares_of_turn(moves: Sequence[Movement]) -> dict[str, float]:
 
 
 def _turns(shares: Mapping[str, float], against: Sequence[str], agree: Sequence[str]) -> Iterator[Finding]:
-    """Of sensors that turned as motor and steering say, against it, or hardly."""
+    """Findings about sensors that turned with motor and steering, against them, or hardly."""
     for name, share in shares.items():
         if name in against:
             seen = f"it turns against the steering and the {', '.join(agree)}: it is mounted upside down"

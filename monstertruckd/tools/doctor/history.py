@@ -1,4 +1,4 @@
-"""Checks of what the robot has written: its calibration, and its newest log."""
+"""Checks of the robot's own files: its calibration, and its latest log."""
 
 import math
 from collections import Counter
@@ -25,7 +25,7 @@ COUNTED: Final = {
     Reason.HOST_THROTTLED: ("throttled", "the processor was throttled: cool it, and measure its supply"),
     Reason.OVER_CURRENT: ("over-current", "a hub's port was overloaded: use a supplied hub"),
 }
-"""Events of a log that are findings, with their check and what they mean."""
+"""Events of a log that are findings, with their check and meaning."""
 
 
 def calibration(context: HostContext) -> Iterator[Finding]:
@@ -69,7 +69,7 @@ def calibration(context: HostContext) -> Iterator[Finding]:
 
 
 def newest_log(context: HostContext) -> Iterator[Finding]:
-    """What the newest log says of supply, clocks, steering and signs of sensors."""
+    """Findings of the latest log about supply, clocks, steering and signs of sensors."""
     newest = max(context.logs().glob("*.mcap"), key=lambda path: path.stat().st_mtime, default=None)
     if newest is None or newest.stat().st_size > 200_000_000:  # longer logs are left to `log report`
         return

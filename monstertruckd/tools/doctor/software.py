@@ -71,7 +71,7 @@ def configuration(context: HostContext) -> Iterator[Finding]:
 
 
 def motion(context: HostContext) -> Iterator[Finding]:
-    """Which independent sensors measure the robot's motion, and what is missing to find one that lies."""
+    """Which independent sensors measure the robot's motion, and which are missing to reveal a false one."""
     config = context.config
     if config is None or config.missing_actuators() is not None:
         return

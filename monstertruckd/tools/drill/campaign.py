@@ -122,7 +122,7 @@ class CampaignReport:
 
     @property
     def stuck(self) -> int:
-        """Trials after which the robot did not recover."""
+        """Trials without recovery of the robot."""
         return sum(bool(outcome.stuck) for outcome in self.outcomes)
 
     def figures(self) -> dict[str, Any]:
@@ -313,7 +313,7 @@ async def _turn(truck: DrillTruck, trial: Trial) -> None:
     assert judge is not None
     if not truck.by_hand or not isinstance(station, Wanderer):
         return
-    run_up_time = 6.0  # time after which the operator reverses without that run-up (s)
+    run_up_time = 6.0  # maximum wait of the operator for that run-up before reversing (s)
     if trial.backwards:
         station.run_up(run_up_time)
         begin = judge.place

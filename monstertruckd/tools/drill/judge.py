@@ -11,7 +11,7 @@ from monstertruck_sim.world.world import World
 from monstertruckd.tools.drill.observer import STANDING_SPEED, Violation
 
 MAY_MOVE: Final = 1.0
-"""Time for which a robot may still move once motion is no longer permitted (s)."""
+"""Maximum time that a robot still moves once motion is not permitted (s)."""
 
 
 class WorldJudge:

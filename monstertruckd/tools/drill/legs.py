@@ -22,7 +22,7 @@ Outcome = TypeVar("Outcome")
 
 
 def default_jobs() -> int:
-    """Processes of a drill: one core is left for whoever works on the computer."""
+    """Processes of a drill: one core is left for other work."""
     return max(len(os.sched_getaffinity(0)) - 1, 1)
 
 
@@ -40,12 +40,12 @@ class DrillLeg:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All that decides what the legs of a drill are, but for its seed."""
+        """All inputs of a drill's legs, except its seed."""
         return self.config | ({"faults": list(self.faults)} if self.faults else {})
 
 
 def truck_of_leg(config: SimulatedTruckConfig, seed: int, records: str | None) -> SimulatedTruckConfig:
-    """The robot of a leg, with its own seed and no drill of its own; it records to the folder ``records``, if any."""
+    """The robot of a leg, with its own seed and without a drill; it records to the folder ``records``, if any."""
     keeps = config.recorder is not None and records is not None
     recorder = config.recorder.model_copy(update={"directory": records}) if config.recorder and keeps else None
     blackbox = config.blackbox if keeps else None
@@ -54,7 +54,7 @@ def truck_of_leg(config: SimulatedTruckConfig, seed: int, records: str | None) -
 
 
 class LegFile(Generic[Outcome]):
-    """Outcomes of the finished legs of a drill, one JSON object a line, so that an interrupted drill goes on.
+    """Outcomes of the finished legs of a drill, one JSON object a line, so that an interrupted drill can continue.
 
     Args:
         path: the file; made where there is none.
@@ -94,7 +94,7 @@ class LegFile(Generic[Outcome]):
         self._found[leg] = outcomes
 
     def outcomes(self, leg: DrillLeg) -> list[Outcome] | None:
-        """Those of a finished leg; None if it has to be run."""
+        """Outcomes of a finished leg; None if it has to be run."""
         return self._found.get((leg.number, leg.count))
 
     def add(self, leg: DrillLeg, outcomes: list[Outcome]) -> None:
@@ -130,7 +130,7 @@ PACKAGES: Final = (
 
 
 def _digest(config: dict[str, Any]) -> str:
-    """Of everything that decides the outcome of a leg but seed and number: the configuration and our sources."""
+    """Hash of all inputs of a leg except seed and number: the configuration and our sources."""
     digest = hashlib.blake2b(repr(config).encode(), digest_size=12)
     for package in PACKAGES:
         spec = importlib.util.find_spec(package)

@@ -35,7 +35,7 @@ from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 TRUTH_PERIOD: Final = SECOND // 100
 STANDING_SPEED: Final = 0.01
-"""True speed up to which a truck stands (m/s)."""
+"""Maximum true speed of a standing truck (m/s)."""
 STOPS_WITHIN: Final = 0.6
 """Maximum time to standstill, from a fault that must stop the truck or from a disarm order (s)."""
 SPEED_MARGIN: Final = 1.05
@@ -43,7 +43,7 @@ SPEED_MARGIN: Final = 1.05
 FAN: Final = np.linspace(-1.2, 1.2, 49)
 """Directions of the range checks ahead (rad)."""
 ROOM: Final = np.linspace(0.0, 0.5, 26)
-"""Distances along the arc at which the path is checked (m)."""
+"""Distances of the path checks along the arc (m)."""
 REVERSES_BELOW: Final = 0.05
 """True speed above which no motor may be commanded to reverse (m/s)."""
 MOTORS: Final = (*SHAFTS, DeviceRole.WHEELS, DeviceRole.ACTUATORS)
@@ -325,7 +325,7 @@ Rule = Callable[[Observation], Broken]
 
 
 class Duration:
-    """Time for which a condition has held without a break."""
+    """Duration of a condition without a break."""
 
     def __init__(self) -> None:
         self._since: int | None = None
@@ -384,7 +384,7 @@ class _Standstill:
             return
         ordered = min((at for at in (self.disarmed, self.estopped) if at is not None), default=now)
         asked = max((abs(each) for *_, each in seen.targets), default=0.0)
-        # 0.1: time after a stop order from which no bytes may command a moving truck to a speed (s)
+        # 0.1: maximum delay of a stop order on the wire (s)
         if now > ordered + 0.1 * SECOND and asked > 0:
             yield "stopping bytes", f"{asked:.3f} m/s asked for at {speed:.3f} m/s though it was ordered to stop"
         limit = round(STOPS_WITHIN * SECOND)
@@ -452,7 +452,7 @@ class _Ramp:
                 self._newest[shaft] = None
                 continue
             acceleration = self._accelerations[shaft]
-            # 0.1: time by which the bytes on the wire may be ahead of the ramp (s): ticks and exchanges are not
+            # 0.1: maximum lead of the bytes on the wire over the ramp (s): ticks and exchanges are not
             # synchronised
             ramp = abs(speed) + acceleration * 0.1
             if (newest := self._newest[shaft]) is not None:
@@ -489,7 +489,7 @@ class _HeldShaft:
 
     def __call__(self, seen: Observation) -> Broken:
         held = [asked for shaft, asked in enumerate(seen.target) if asked and self._world.shaft_blocked(shaft)]
-        # 1.0: time for which a motor may be commanded to turn a held shaft (s)
+        # 1.0: maximum time that a motor is commanded to turn a held shaft (s)
         if self._held.update(seen.now, so=bool(held)) > 1.0:
             yield "held shaft", f"{held[0]:.3f} m/s asked for though the shaft is held"
 
@@ -547,8 +547,7 @@ class _Pulses:
 class _Turning:
     """The robot turns as the bytes command: by the pulses, and by the motors if it has several.
 
-    A held shaft turns a robot with several motors, whatever its bytes command. ``_HeldShaft`` limits the time for which
-    they may.
+    A held shaft turns a robot with several motors, whatever its bytes command. ``_HeldShaft`` limits this time.
 
     Args:
         steering: of the pulses.
@@ -673,7 +672,7 @@ class _Ahead:
         if room < 0.03:  # minimum distance to an obstacle ahead (m)
             yield "obstacle", f"{truth.v:.3f} m/s towards something {room:.3f} m ahead"
         room = self._room(truth.wz / truth.v, ahead, aside)
-        # 0.4: time for which a truck may be too fast for the free distance ahead (s): an obstacle may enter its path
+        # 0.4: maximum time that a truck is too fast for the free distance ahead (s): an obstacle may enter its path
         if self._fast.update(now, so=truth.v**2 / (2 * self._braking) > room) > 0.4:
             yield "braking", f"{truth.v:.3f} m/s with something on its way in {room:.3f} m"
 

@@ -32,7 +32,7 @@ from monstertruckd.tools.drill.truck import OPTIONAL, DrillTruck
 from monstertruckd.tools.simulation.config import DEADMAN_LINE, SimulatedTruckConfig, with_overlay
 
 RECOVERY_LIMIT: Final = 15.0
-"""Seconds after which a service that has not recovered is stuck."""
+"""Maximum recovery time before a service is stuck (s)."""
 QUIET: Final = frozenset(
     {
         Reason.OK,
@@ -81,7 +81,7 @@ def unguarded(config: SimulatedTruckConfig) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class FaultOutcome:
-    """What one fault led to. Seconds count from the fault, ``recovered_s`` from its end; None: it did not happen."""
+    """Outcome of one fault. Seconds count from the fault, ``recovered_s`` from its end; None: it did not happen."""
 
     fault: str
     kind: FaultKind
@@ -102,7 +102,7 @@ class FaultOutcome:
 
     @property
     def reaction(self) -> str:
-        """In one word."""
+        """Outcome in one word."""
         if self.violations:
             return "UNSAFE"
         if self.stuck:
@@ -136,7 +136,7 @@ class DrillReport:
 
     @property
     def stuck(self) -> int:
-        """Faults after which something did not recover."""
+        """Faults without recovery."""
         return sum(bool(outcome.stuck) for outcome in self.outcomes)
 
     @property
@@ -146,11 +146,11 @@ class DrillReport:
 
     @property
     def blocked(self) -> int:
-        """Faults after which the truck stood before an obstacle."""
+        """Faults that left the truck before an obstacle."""
         return sum(outcome.blocked for outcome in self.outcomes)
 
     def recovery(self, percent: float) -> float | None:
-        """Percentile of the recoveries, s, of those faults after which anything had to recover."""
+        """Percentile of the recovery times, s, of faults with a recovery."""
         times = [outcome.recovered_s for outcome in self.outcomes if outcome.recovered_s]
         return float(np.percentile(times, percent)) if times else None
 
@@ -179,7 +179,7 @@ def check_drivable(config: SimulatedTruckConfig) -> None:
     """Refuse a robot without motors.
 
     Raises:
-        InputError: its body lacks what drives or steers it.
+        InputError: its body lacks motors or steering.
     """
     if (lack := config.missing_actuators()) is not None:
         raise InputError(f"{config.robot} cannot drive: its body needs {lack}")

@@ -20,7 +20,7 @@ class FamilySummary:
     noticed: int
     """Trials with a reason, counted only for the first fault of a trial."""
     reason: Reason | None
-    """Most frequent reason."""
+    """Reason that occurred most often."""
     reason_p50_s: float | None
     reason_max_s: float | None
     """Maximum time from the fault to the reason (s); ``reason_p50_s`` is the median."""
@@ -38,7 +38,7 @@ def by_family(outcomes: Iterable[TrialOutcome]) -> list[FamilySummary]:
 
 
 def _summary(family: str, outcomes: list[TrialOutcome]) -> FamilySummary:
-    own = [o for o in outcomes if o.families[0] == family and o.reason is not None]  # of a pair it may be the other's
+    own = [o for o in outcomes if o.families[0] == family and o.reason is not None]  # maybe the other fault of a pair
     times = [o.reason_s for o in own if o.reason_s is not None]
     reasons = Counter(o.reason for o in own).most_common(1)
     return FamilySummary(
@@ -54,7 +54,7 @@ def _summary(family: str, outcomes: list[TrialOutcome]) -> FamilySummary:
 
 
 def without_reason(summaries: Iterable[FamilySummary]) -> Iterator[str]:
-    """Lines on the families that no reason followed: what limits those that nothing reveals, and the others by name."""
+    """Lines on the families without a reason: known ones with their limit, the others by name."""
     by_row, others = explained(summary.family for summary in summaries if not summary.noticed)
     for row, families in by_row.items():
         yield f"nothing reveals {', '.join(families)}: {row.why}; limit: {row.limit}"

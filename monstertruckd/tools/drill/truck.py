@@ -1,4 +1,4 @@
-"""The simulated truck of a drill: rig, operator and observer, and what the daemon reports."""
+"""The simulated truck of a drill: rig, operator, observer and reports of the daemon."""
 
 import asyncio
 import math
@@ -35,7 +35,7 @@ from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 OPTIONAL: Final = frozenset({"recorder"})
-"""Services that a fault may end for the rest of a run: driving goes on without."""
+"""Services that a fault may end for the rest of a run: driving continues without them."""
 
 RANGE_SENSORS: Final = frozenset({DeviceRole.LIDAR, DeviceRole.SONAR})
 """Roles of range sensors."""
@@ -109,8 +109,7 @@ STEERING: Final[Mapping[str, tuple[str, ...]]] = {
     "front": ("front",),
     "parallel": ("crab",),
 }
-"""Ways of a wanderer to steer, by a body's freedom: front axle alone, both against each other, both alike, each by
-itself."""
+"""Steering modes of a wanderer, by a body's freedom: front axle alone, both opposed, both parallel, each by itself."""
 
 
 def _can(chassis: Chassis, twist: Twist2) -> bool:
@@ -184,7 +183,7 @@ class Wanderer(DrivingStation):
             self.speed = self.front = self.rear = 0.0
             self.twist = RequestedTwist(vx=float(vx), vy=float(vy), wz=float(wz))
         self.unseen, self._refused_since = False, None
-        # (0.4, 2.0): seconds for which a wanderer keeps a speed and its angles
+        # (0.4, 2.0): time that a wanderer keeps a speed and its angles, s
         self._until = self._clock.now() + round(float(rng.uniform(0.4, 2.0)) * SECOND)
 
     def run_up(self, seconds: float) -> None:
@@ -204,7 +203,7 @@ class Wanderer(DrivingStation):
             self._refused_since = None
         elif self._refused_since is None:
             self._refused_since = now
-        # 0.5: seconds for which a wanderer that is refused unseen ground waits before it holds the second control
+        # 0.5: waiting time of a wanderer before unseen ground until it holds the second control, s
         elif now - self._refused_since >= 0.5 * SECOND:
             self.unseen = True
         if self.unseen and not self.silent:
@@ -281,7 +280,7 @@ class DrillTruck:
         self.judge = WorldJudge(rig.world, rig.clock) if judged else None
         self._observer = None if judged else Observer(rig.config, rig.world, rig.ports, rig.clock)
         self.station: DrivingStation | None = None
-        # 0.1: true speed of a truck that drives, m/s; of a slow one half of what it may
+        # 0.1: minimum true speed of a driving truck, m/s; half of its limit for a slow one
         self._cruise = min(0.1, rig.config.gate.speed / 2)
         self._heard: Daemon | None = None
         self.listen()
@@ -289,7 +288,7 @@ class DrillTruck:
             assert self.judge is not None
             self.station = Wanderer(rig.bus, rig.clock, rig.config, wander, self.judge.confirm, self._looks())
         elif by_station:
-            # 0.5: radius of the circle in which a station drives a robot without a tracker, m
+            # 0.5: radius of a station's circle with a robot without a tracker, m
             angle = min(math.atan(rig.config.geometry.wheelbase / 0.5), rig.config.gate.angle)
             # 0.8: speed that the station requests, as a share of the gate's limit
             self.station = DrivingStation(rig.bus, rig.clock, 0.8 * rig.config.gate.speed, angle)
@@ -312,7 +311,7 @@ class DrillTruck:
         return self.observer.speed if self.judge is None else self.judge.speed
 
     def listen(self) -> None:
-        """Listen to the rig's daemon where it is another one than before."""
+        """Listen to the rig's daemon if it is a new one."""
         rig = self.rig
         if self._heard is rig.daemon:
             return
@@ -340,7 +339,7 @@ class DrillTruck:
         """World, daemon and observer run while the context lasts; arguments as of the class.
 
         Raises:
-            BaseException: what ended the daemon early.
+            BaseException: error that ended the daemon early.
         """
         rig = VirtualRig(config, clock)
         truck = cls(rig, by_station=by_station, wander=wander, judged=judged, by_hand=by_hand)
@@ -362,11 +361,11 @@ class DrillTruck:
 
     @property
     def gate(self) -> GateState | None:
-        """Newest state of the gate."""
+        """Latest state of the gate."""
         return self._gate.latest
 
     def blockers(self) -> tuple[str, ...]:
-        """Services that are not ready, and reasons that keep the truck from being armed; empty = it can be driven."""
+        """Services that are not ready, and reasons that prevent arming; empty if the truck can be driven."""
         table, state = self._health.latest, self._gate.latest
         if table is None or state is None:
             return ("daemon",)

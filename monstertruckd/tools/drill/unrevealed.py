@@ -1,6 +1,7 @@
 """Families of faults that no second measure of the robots here reveals, and the limit that holds then.
 
-A drill prints the families that it tried without any reason: those of this table with their limit, the others by name.
+A drill prints the families that it tried without any reason: families of this table with their limit, the others by
+name.
 """
 
 from collections.abc import Iterable
@@ -9,14 +10,14 @@ from typing import Final, NamedTuple
 
 
 class Unrevealed(NamedTuple):
-    """Families that are alike."""
+    """Families with the same reason."""
 
     families: tuple[str, ...]
     """Patterns of their names."""
     why: str
-    """What a second measure lacks."""
+    """Reason without a second measure."""
     limit: str
-    """What bounds the effect."""
+    """Limit of the effect."""
 
     def holds(self, family: str) -> bool:
         """Whether it describes a family."""

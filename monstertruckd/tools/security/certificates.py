@@ -1,7 +1,7 @@
-"""X.509 certificates of P-256 keys (RFC 5280, RFC 5480): authorities, and what they issue.
+"""X.509 certificates of P-256 keys (RFC 5280, RFC 5480): authorities and issued certificates.
 
-Every station has an issuer of its own, certified by the authority. A robot that trusts the issuers of its stations,
-and not the authority, lets in nobody else at all: another certificate of the authority does not even open a link.
+Every station has its own issuer, certified by the authority. A robot that trusts the issuers of its stations,
+and not the authority, admits no other station: another certificate of the authority does not even open a link.
 """
 
 import ipaddress
@@ -43,7 +43,7 @@ class Certificate:
         )
 
     def save(self, certificate: Path, key: Path, *chain: bytes) -> None:
-        """Write both files, the certificate followed by those of its issuers.
+        """Write both files, the certificate followed by its issuers' certificates.
 
         Raises:
             OSError: one cannot be written.
@@ -104,7 +104,7 @@ def seconds_left(certificate: x509.Certificate, now: int) -> int:
 
 
 def began(certificate: x509.Certificate) -> int:
-    """Real time from which a certificate is good, s."""
+    """Start of a certificate's validity, real time, s."""
     return round(certificate.not_valid_before_utc.timestamp())
 
 
@@ -154,7 +154,7 @@ def issue(issuer: Certificate, name: str, now: int, seconds: int, *, server: Seq
 def _builder(
     subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: int, seconds: int
 ) -> x509.CertificateBuilder:
-    # 300: seconds by which a certificate begins before now: computers without a clock of their own run late
+    # 300: start of a certificate's validity before now, s: computers without a real-time clock run late
     return (
         x509.CertificateBuilder()
         .subject_name(subject)

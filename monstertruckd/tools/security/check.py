@@ -1,4 +1,4 @@
-"""Tries a running robot from outside: who is let in, what arrives, and what does not.
+"""Tests a running robot from outside: admitted clients, delivered and dropped messages.
 
 Nothing moves: the order that shows whether orders arrive carries no nonce, so that the gate refuses it.
 """
@@ -83,7 +83,7 @@ class _Attempt:
             raise NotFoundError(f"nothing listens at {self._endpoint}: {error}") from None
 
     async def cases(self) -> AsyncIterator[Case]:
-        """All of them, one after the other."""
+        """Run all cases in turn."""
         drivers = self._register.of_role(AccessRole.PILOT, AccessRole.ENGINEER)
         if not drivers:
             raise InputError("no pilot or engineer is certified: monstertruckd security add NAME --role pilot")
@@ -138,7 +138,7 @@ class _Attempt:
 
     async def _expiring(self, name: str) -> Case:
         who, expected = "a certificate that expires", "state until then, nothing afterwards"
-        short = 6  # seconds after which the certificate of the expiry case expires
+        short = 6  # lifetime of the certificate in the expiry case, s
         tls = self._files(self._made(name, short), self._folder.issuer(name).pem)
         try:
             async with self._client(tls) as client:
@@ -152,7 +152,7 @@ class _Attempt:
         found = expected if first is not None and later is None else "no state" if first is None else "still state"
         return Case(who, expected, found, met=found == expected)
 
-    # What a client finds; "" = as expected
+    # Finding of a client; "" as expected
 
     async def _may_all(self, client: TruckClient) -> str:
         if (problem := await self._sees(client)) or not await _arrives(client.call("versions")):
@@ -211,7 +211,7 @@ async def _arrives(call: Awaitable[object]) -> bool:
 
 
 async def _refusal(client: TruckClient) -> Reason | None:
-    """Why an order that nobody could take for a valid one is refused; None if it is answered otherwise."""
+    """Reason of the refusal of an obviously invalid order; None if it is answered otherwise."""
     now = 0
     header = {"stamp": now, "received": now, "seq": now, "source": client.source, "role": client.role, "lease": 0.1}
     try:

@@ -77,7 +77,7 @@ class TrustedRouter(Schema):
 
 
 class CertificateRegister(Schema):
-    """What an authority has certified."""
+    """Register of an authority."""
 
     robot: Name
     addresses: tuple[str, ...] = Field(min_length=1)
@@ -128,7 +128,7 @@ class Folder:
         self.robot = path / "robot"
 
     def register(self) -> CertificateRegister:
-        """What is certified.
+        """Certified names.
 
         Raises:
             NotFoundError: there is no authority here.
@@ -150,8 +150,8 @@ class Folder:
         """Make an authority, or renew the robot's certificate; True if there was none.
 
         Args:
-            robot: its name; None = as before, like all that is None, at first truck.
-            addresses: what stations dial; at first this computer's own.
+            robot: its name; None, here and below, keeps the value; at first truck.
+            addresses: of the robot, for stations; at first of this computer.
             place: where the robot keeps its files.
             now: real time, s.
             days: until the robot's certificate expires.
@@ -192,8 +192,8 @@ class Folder:
 
         Args:
             name: common name, and the source of its requests.
-            role: what it may do; None = as before, at first a pilot.
-            rank: highest priority it may claim; None = as before, at first a station.
+            role: its role; None keeps it, at first pilot.
+            rank: its maximum priority; None keeps it, at first station.
             now: real time, s.
             days: until its certificate expires.
 
@@ -239,7 +239,7 @@ class Folder:
             for file in self._files(f"issuers/{name}"):
                 remove_file(file)
             shutil.rmtree(self.path / "stations" / name, ignore_errors=True)
-            self._write(kept)  # last: what was broken off before can be requested again
+            self._write(kept)  # last, so that an interrupted request can be repeated
 
     def join(self, name: str, endpoint: str, authority: bytes) -> None:
         """Let the robot dial a router and its stations trust it.
@@ -304,11 +304,11 @@ class Folder:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Whoever else changes this folder waits, so that no change is lost."""
+        """Lock this folder against other writers, so that no change is lost."""
         try:
             handle = os.open(self.path, os.O_RDONLY)
         except FileNotFoundError:
-            self.register()  # says what is missing
+            self.register()  # reports the missing files
             raise
         try:
             fcntl.flock(handle, fcntl.LOCK_EX)
@@ -319,7 +319,7 @@ class Folder:
             os.close(handle)
 
     def _write(self, register: CertificateRegister) -> bool:
-        """What follows for the robot, then the register; True if the robot's files are others than before."""
+        """Update the robot's files, then the register; True if the robot's files have changed."""
         changed = self._write_robot(register)
         replace_file(self.path / "register.yaml", yaml_text(register.model_dump(mode="json")))
         return changed
@@ -348,7 +348,7 @@ class Folder:
         return file.read_bytes() if file.exists() else b""
 
     def _trusted(self) -> bytes:
-        """Whom a station trusts: the robot's authority, and the router's."""
+        """Authorities that a station trusts: the robot's and the router's authority."""
         return (self.path / "authority.pem").read_bytes() + self._router()
 
     def _files(self, name: str) -> tuple[Path, Path]:
@@ -382,7 +382,7 @@ def _zenoh(register: CertificateRegister) -> dict[str, Any]:
 
 
 def require_address(address: str) -> None:
-    """Refuse what no station can dial.
+    """Refuse an address that no station can dial.
 
     Raises:
         ValueError: it is neither an IP address nor a host name.
@@ -395,10 +395,10 @@ def require_address(address: str) -> None:
 
 
 def _require_time(authority: Certificate, now: int, days: int) -> None:
-    """Refuse what would not be good for so long.
+    """Refuse a lifetime beyond the authority's.
 
     Raises:
-        InputError: the authority has not begun, which a wrong clock makes it, or expires before.
+        InputError: the authority is not valid yet, as with a wrong clock, or expires earlier.
     """
     early = began(authority.certificate) - now
     if early > 0:

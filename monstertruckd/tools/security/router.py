@@ -23,7 +23,7 @@ from monstertruckd.tools.security.folder import AUTHORITY_DAYS, PORT, ROBOT_DAYS
 ROUTER: Final = "router"
 """Common name of its certificate."""
 PLACE: Final = Path("/etc/zenohd")
-"""Where the router keeps its files."""
+"""Folder of the router's files."""
 
 
 def make_router(
@@ -34,9 +34,9 @@ def make_router(
     Args:
         path: folder of the router's authority.
         robots: folders of the robots' authorities.
-        addresses: what robots and stations dial; robots dial the first one.
+        addresses: of the router, for robots and stations; robots dial the first one.
         now: real time, s.
-        place: where the router keeps its files.
+        place: folder of the router's files.
         port: where it listens.
 
     Raises:
@@ -59,7 +59,7 @@ def make_router(
         new_authority(f"Authority of {ROUTER}", now, AUTHORITY_DAYS).save(*files)
     authority = load(*files)
     issue(authority, ROUTER, now, ROBOT_DAYS * DAY, server=addresses).save(target / "router.pem", target / "router.key")
-    # One certificate that is behind the others is enough: stations send that of their issuer along.
+    # One certificate that is behind the others is enough: stations send their issuer's certificate along.
     replace_file(target / "ca.pem", b"".join(folder.authority().pem for folder in robots))
     fleet = {register.robot: tuple(register.stations) for register in registers}
     replace_file(target / "zenoh.json5", json.dumps(router_session(place, port, fleet), indent=2).encode() + b"\n")

@@ -20,7 +20,7 @@ from monstertruck_sim.world.world import World
 def claimed(*links: Path) -> Iterator[None]:
     """Keep the names of links for this program while the context lasts; their folders are made.
 
-    The folder of this user's own, where ports hang that no configuration names, lets nobody else in.
+    The user's folder, for ports without a configured name, is closed to others.
 
     Raises:
         NotPermittedError: this user may not make a link there, or others may in the folder of this user's own.
@@ -49,7 +49,7 @@ async def emulate_device(device: str, link: Path | tuple[str, int], clock: Clock
     """Serve ``device`` (kind or role) behind a symlink, or at an address and TCP port, while the context lasts.
 
     Raises:
-        InputError: unknown device, one without a port, or something that is no link has the name.
+        InputError: unknown device, one without a port, or the name exists and is not a link.
         NotPermittedError: this user may not make it there.
         BusyError: another program serves ``link``.
         OSError: it cannot be made.

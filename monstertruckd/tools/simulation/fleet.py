@@ -11,13 +11,13 @@ from monstertruck_sim.world.world import make_scene
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, needs_computer
 
 SHARED: Final = ("map", "engine", "rough", "ground", "height_image", "mjcf")
-"""What robots of one world have in common."""
+"""Common settings of robots in one world."""
 
 
 def as_fleet(configs: Sequence[SimulatedTruckConfig]) -> list[SimulatedTruckConfig]:
-    """The configurations of robots of one world, each with noise of its own.
+    """Configurations of robots of one world, each with its own noise.
 
-    Map, engine, ground, people and seed of the world are those of the first one.
+    Map, engine, ground, people and seed of the world come from the first one.
 
     Raises:
         InputError: two of them claim the same thing, or describe different worlds; the text names both.

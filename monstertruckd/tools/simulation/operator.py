@@ -26,11 +26,11 @@ M = TypeVar("M", bound=Message)
 
 
 GIVEN_UP: Final = frozenset({Reason.PATH_LOST, Reason.BAD_INPUT, Reason.NOT_FINITE, Reason.STUCK})
-"""Outcomes that arming again does not change, also before the path has begun."""
+"""Outcomes that arming again does not change, also before the start of the path."""
 
 
 class LocalOperator(Operator):
-    """An operator inside the daemon's process: for the virtual clock, on which nothing comes over Zenoh."""
+    """An operator inside the daemon's process: for the virtual clock, which has no Zenoh."""
 
     def __init__(self, daemon: Daemon, clock: Clock, source: str = "operator", role: Role = Role.STATION) -> None:
         self.source = source
@@ -81,13 +81,13 @@ class LocalOperator(Operator):
 
 @dataclass(frozen=True, slots=True)
 class Lap:
-    """What the tracker reported about one lap."""
+    """The tracker's report of one lap."""
 
     outcome: Reason
     start: int
-    """Daemon time at which the truck was armed, ns."""
+    """Daemon time of arming, ns."""
     end: int
-    """Daemon time at which the path was done or given up, ns."""
+    """Daemon time of the path's end, ns."""
     cross_track: Array
     """Every reported distance from the path, m."""
     stops: tuple[Reason, ...] = ()
@@ -118,7 +118,7 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
         limit: seconds the path may take.
 
     Raises:
-        NoAnswerError: the truck could not be armed, or the path took too long; the text says what held it.
+        NoAnswerError: the truck could not be armed, or the path took too long; the text gives the reason.
     """
     with (
         operator.subscribe(topics.GATE, latest()) as gate,
@@ -136,7 +136,7 @@ async def drive_lap(operator: Operator, clock: Clock, *, timeout: float = 30.0, 
                 while True:
                     report = await tracker.next()
                     driven |= report.outcome is Reason.DRIVING and report.received >= start
-                    # 1.0: seconds in which the tracker, once the truck is armed, begins a path whose end it reported
+                    # 1.0: maximum delay of the tracker before it starts a path again after arming, s
                     # before
                     if not driven and report.received < start + 1.0 * SECOND:
                         continue  # of the path's end before

@@ -13,7 +13,7 @@ async def program(output: Path | None, *arguments: str) -> AsyncIterator[asyncio
     """Run ``monstertruckd arguments`` while the context lasts; SIGTERM ends it.
 
     Args:
-        output: file of what it prints; None = where this program prints.
+        output: file for its output; None for this program's output.
         arguments: command and options.
     """
     with ExitStack() as stack:

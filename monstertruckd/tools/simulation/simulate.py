@@ -88,11 +88,11 @@ async def serve(
     Args:
         clock: time.
         configs: the robots; of several ``as_fleet`` has made sure that they can share a world.
-        say: gets a line for the terminal: answers to commands, contacts, what is ready.
-        truth: file of what really happened.
+        say: gets a line for the terminal: answers to commands, contacts, ready devices.
+        truth: file of the true motion.
         daemons_of: configurations of daemons that are run meanwhile: stopped before the devices go, and when all have
             ended by themselves the devices go, too.
-        beside: runs meanwhile with what takes the commands; its end ends everything.
+        beside: runs meanwhile, with the command handler; its end ends everything.
 
     Returns:
         The exit code of the first daemon that failed by itself, else 0.
@@ -195,7 +195,7 @@ class ServedRobot:
         self.console = CommandedGroup("device", emulated)
 
     def tasks(self, say: Say) -> Iterator[asyncio.Task[Any]]:
-        """Everything that runs as long as it is served; ``say`` gets a line, in which the robot need not be named."""
+        """Everything that runs as long as it is served; ``say`` gets lines without the robot's name."""
         config, world, clock = self.config, self._robot.world, self._clock
         yield asyncio.create_task(self._robot.run(), name=config.robot)
         if self._keeps_truth:

@@ -23,7 +23,7 @@ class EmulatedTape:
         world: with the robot.
         clock: time.
         body: length and width of the robot, m.
-        say: gets what was measured, a line.
+        say: gets measurements, a line each.
     """
 
     def __init__(self, world: World, clock: Clock, body: tuple[float, float], say: Callable[[str], None]) -> None:
@@ -31,7 +31,7 @@ class EmulatedTape:
         self._mark: TruthState | None = None
 
     def command(self, words: list[str]) -> None:
-        """``mark``, or nothing: measure from there; before there is a mark, what needs none.
+        """Execute ``mark``, or measure from the mark; without a mark, measure distances that need none.
 
         Raises:
             InputError: another word.
@@ -70,7 +70,7 @@ def _meter(now: TruthState) -> str:
 
 
 def _moved(mark: TruthState, now: TruthState, x: float, y: float) -> tuple[float, float]:
-    """By how much a place of the body has moved, ahead and left, m; x and y from the body's middle, m."""
+    """Displacement of a place of the body, ahead and left, m; x and y from the body's middle, m."""
     ahead, left = to_body(mark.yaw, now.x - mark.x, now.y - mark.y)
     now_x, now_y = to_world(now.yaw - mark.yaw, x, y)
     return ahead + now_x - x, left + now_y - y

@@ -26,7 +26,7 @@ from monstertruckd.daemon import Daemon
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.simulate import TruthLog
 
-IN_MEMORY: Final = "/dev/shm"  # noqa: S108 - a folder of its own is made in it
+IN_MEMORY: Final = "/dev/shm"  # noqa: S108 - a new folder is made in it
 """A disk would be waited for at every change of an emulated file."""
 
 
@@ -34,10 +34,10 @@ class VirtualRig:
     """A whole robot in one process; everything random comes from the configuration's seed.
 
     Args:
-        config: the simulated truck's.
+        config: of the simulated truck.
         clock: of the running virtual loop.
         tree: origins of the configuration's values.
-        scene: world that it shares with other rigs of the same clock; None = its own.
+        scene: world shared with other rigs of the same clock; None for its own.
     """
 
     def __init__(
@@ -80,12 +80,12 @@ class VirtualRig:
 
     @property
     def bus(self) -> Bus:
-        """Of the present daemon."""
+        """Bus of the current daemon."""
         return self.daemon.bus
 
     @property
     def context(self) -> SimContext:
-        """What faults act on."""
+        """Targets of faults."""
         config = self.config
         disk = self.daemon.recorder
         return SimContext(
@@ -97,7 +97,7 @@ class VirtualRig:
         """World, devices and daemon run while the context lasts; the daemon ends first, in order.
 
         Raises:
-            BaseException: what ended the daemon early.
+            BaseException: error that ended the daemon early.
         """
         around = [
             asyncio.create_task(self.robot.run(), name="robot"),

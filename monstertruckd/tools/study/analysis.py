@@ -1,6 +1,6 @@
-"""What a run of a skid-steer robot says: circle, drift of its centre, speed; line, spread, bend, turns at reversals.
+"""Analysis of a run of a skid-steer robot: circle, drift of its centre, speed; line, spread, bend, turns at reversals.
 
-Pure numpy on what a test stand saw: times (n,) s, poses (3, n) of x, y (m) and heading (rad, wrapped or not).
+Pure numpy on a test stand's poses: times (n,) s, poses (3, n) of x, y (m) and heading (rad, wrapped or not).
 """
 
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ class StraightPasses:
     length: float
     """Mean distance between the ends of a pass, m."""
     spread: float
-    """Greatest distance between the tracks of two passes, across the first one, as a share of ``length``."""
+    """Maximum distance between the tracks of two passes, across the first one, as a fraction of ``length``."""
     bend: float
     """Mean distance of a pass's middle from its chord, as a share of its length."""
     speed: float
@@ -122,7 +122,7 @@ def line(times: Array, poses: Array, directions: Array) -> StraightPasses:
     times, poses = _checked(times, poses)
     heading = np.unwrap(poses[2])
     cuts = np.flatnonzero(np.diff(directions)) + 1
-    # seconds at the beginning of a run, or of a pass, that do not count: ramps, and the turn at a reversal
+    # seconds skipped at the start of a run, or of a pass: ramps, and the turn at a reversal
     settled = 1.0
     passes = [
         part[times[part] - times[part[0]] > settled]

@@ -1,4 +1,4 @@
-"""Finds the open-loop runs of a log, with what the stand saw of each."""
+"""Finds the open-loop runs of a log, with the stand's poses."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ EQUAL: Final = 1e-6
 
 @dataclass(frozen=True)
 class Run:
-    """One run: what was requested, and where the robot was."""
+    """One run: requests and poses."""
 
     left: float
-    """Rate of the left wheels, rad/s; of a line that of the first pass."""
+    """Rate of the left wheels, rad/s; for a line, of the first pass."""
     right: float
     times: Array
     """Times of the poses since the run's begin, s; (n,)."""
@@ -54,7 +54,7 @@ def read_runs(log: Path | LogReader) -> tuple[list[Run], dict[str, Any]]:
 
     Raises:
         NotFoundError: no such file.
-        InputError: it is no log, or has no run by shaft speeds, or no poses of a stand, or an invalid one of either.
+        InputError: it is not a log, or has no run by shaft speeds, or no poses of a stand, or an invalid one of either.
     """
     reader = open_log(log)
     path = reader.path
@@ -73,7 +73,7 @@ def read_runs(log: Path | LogReader) -> tuple[list[Run], dict[str, Any]]:
 
 
 def _messages(reader: LogReader) -> Iterator[Message]:
-    """Requests and poses; those of another schema are skipped."""
+    """Requests and poses; other schemas are skipped."""
     for entry in reader:
         if entry.topic in (REQ_DRIVE.name, STAND_POSE.name):
             try:

@@ -64,11 +64,11 @@ FIGURES: Final[tuple[tuple[int, str, float | None, Draw], ...]] = (
     (14, "X and Y on the line", None, _places),
     (15, "Tracks of the passes to and fro", None, _passes),
 )
-"""Number, title, ratio of the circles in it (None = the line), what is drawn of each run."""
+"""Number, title, ratio of its circles (None for the line), and drawing of each run."""
 
 
 def draw(results: Sequence[Result], folder: Path) -> list[Path]:
-    """Draw the figures of which there are runs; returns the files, ``figure_06.png`` and so on.
+    """Draw the figures with runs; return the files, ``figure_06.png`` and so on.
 
     Raises:
         NotInstalledError: matplotlib is not installed.

@@ -1,4 +1,4 @@
-"""What the skid-steer paper prints of its seven circles and its line, and where it contradicts itself."""
+"""Printed results of the skid-steer paper, seven circles and a line, with its contradictions."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -14,7 +14,7 @@ class PublishedCircle:
     speed_deviation: float
     """Deviation from the ideal speed as printed, %."""
     recomputed_deviation: float | None
-    """Deviation from its own two speeds; None = it prints no sign."""
+    """Deviation from its own two speeds; None if printed without a sign."""
     radius_deviation: float
     """As printed, %."""
     drift: tuple[float, float] | None
@@ -24,7 +24,7 @@ class PublishedCircle:
     intercepts: tuple[float, float] | None
     """X and Y of the centre's fit at time 0, m."""
     slip: str = ""
-    """Where it contradicts itself."""
+    """Contradiction in the paper."""
 
 
 _ROWS: Final = (

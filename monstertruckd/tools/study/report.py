@@ -1,4 +1,4 @@
-"""The study's table: measured values next to those of the ideal robot and of the paper."""
+"""The study's table: measured values next to the ideal robot's and the paper's values."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -15,10 +15,10 @@ Result = tuple[Run, Circle | StraightPasses]
 
 
 def analyse(runs: Sequence[Run]) -> list[Result]:
-    """Every run with what it says.
+    """Every run with its result.
 
     Raises:
-        InputError: one of them says nothing; named, with the reason of ``analysis.circle`` or ``line``.
+        InputError: one of them has no result; names it, with the reason of ``analysis.circle`` or ``line``.
     """
     return [(run, _found(run)) for run in runs]
 

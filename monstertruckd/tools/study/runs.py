@@ -107,7 +107,7 @@ async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequen
     Raises:
         RequestRefusedError: arming was refused; or the robot stopped on the way, with the gate's reason.
         NoAnswerError: it has been silent for ``GONE`` s.
-        InputError: the body has no sides, or is too slow for what is asked.
+        InputError: the body has no sides, or is too slow for the requested rates.
     """
     plan = (*plan, Stretch(0.0, 0.0, REVERSAL_PAUSE))  # at rest before it is disarmed
     rates = [shaft_rates(config, stretch) for stretch in plan]
@@ -134,7 +134,7 @@ async def drive(robot: Operator, clock: Clock, config: TruckConfig, plan: Sequen
                     if clock.now() - heard > GONE * SECOND:
                         raise NoAnswerError(f"the robot has been silent for {GONE:g} s")
         except BaseException:
-            with suppress(TruckError):  # what ended the run is the cause to report
+            with suppress(TruckError):  # report the cause of the run's end
                 await robot.disarm()
             raise
         await robot.disarm()

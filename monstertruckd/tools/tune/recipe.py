@@ -10,17 +10,17 @@ from typing import Final, NamedTuple
 import numpy as np
 
 OVERSHOOTS: Final = 0.6
-"""Share of the first error by which the distance goes beyond the one wanted, from which on it overshoots."""
+"""Minimum overshoot, as a fraction of the first error."""
 CALM: Final = 0.5
-"""Share up to which it is calm."""
+"""Maximum overshoot of calm gains, as a fraction."""
 FIRST_D, RAISE_D = 0.5, 1.8
-"""First K_d, of K_p, and the factor by which it grows."""
+"""First K_d, as a fraction of K_p, and its growth factor."""
 MOST_RUNS: Final = 16
 """Runs."""
 
 
 class WallGains(NamedTuple):
-    """Of the control."""
+    """Gains of the control."""
 
     k_p: float
     """Rad/s/m."""
@@ -29,7 +29,7 @@ class WallGains(NamedTuple):
 
 
 class RunVerdict(NamedTuple):
-    """What one run shows."""
+    """Result of one run."""
 
     overshoot: float
     """Share of the first error."""
@@ -48,17 +48,17 @@ def judged(errors: Sequence[float]) -> RunVerdict:
         raise ValueError(f"{len(errors)} samples: expected at least {3 * smoothed + 1}")
     all_of = np.asarray(errors)
     smooth = np.convolve(all_of, np.ones(smoothed) / smoothed, "valid")
-    step = max(abs(float(smooth[0])), 0.03)  # first error that counts as one, m
+    step = max(abs(float(smooth[0])), 0.03)  # minimum first error, m
     beyond = -np.sign(smooth[0]) * smooth
     steady = all_of[-len(all_of) // 3 :]
     return RunVerdict(max(float(beyond.max()), 0.0) / step, float(np.sqrt(np.mean(steady**2))))
 
 
 def recipe(k_p: float) -> Generator[WallGains, RunVerdict, WallGains | None]:
-    """Gains to try, one after the other; is sent each run's verdict.
+    """Generate gains to try; receives each run's verdict.
 
     Returns:
-        Of the calm gains those with the least steady error; None if none was calm.
+        Calm gains with the smallest steady error; None if none was calm.
     """
     gains, runs = WallGains(k_p, 0.0), 1
     verdict = yield gains
@@ -71,7 +71,7 @@ def recipe(k_p: float) -> Generator[WallGains, RunVerdict, WallGains | None]:
         if verdict.overshoot <= CALM:
             if best is None or verdict.steady < best[0]:
                 best = verdict.steady, gains
-            if verdict.steady <= 0.006:  # steady error that is small, m: what the coursework had
+            if verdict.steady <= 0.006:  # maximum small steady error, m, as in the coursework
                 break
             gains = WallGains(gains.k_p * raise_p[1], gains.k_d)
         else:

@@ -22,7 +22,7 @@ from monstertruckd.tools.tune.recipe import RunVerdict, WallGains, judged, recip
 
 FOLLOWING: Final = "follow"
 LOST: Final = 0.12
-"""Distance error at which a run is broken off before the robot loses the wall, m; it counts as overshooting."""
+"""Maximum distance error before a run is aborted, m; the robot must not lose the wall. It means overshooting."""
 
 
 Samples = Sequence[tuple[float, float]]
@@ -39,7 +39,7 @@ class TuningRun(NamedTuple):
 
     @property
     def text(self) -> str:
-        """In one line."""
+        """Result in one line."""
         gains, (overshoot, steady) = self.gains, self.verdict
         stayed = math.isfinite(overshoot)
         found = f"{100 * overshoot:.0f} % beyond, steady {1000 * steady:.1f} mm" if stayed else "left the wall"
@@ -115,7 +115,7 @@ async def _tuned(
 
 def _calm(wanted: float, samples: Samples) -> bool:
     """Whether the robot keeps its distance."""
-    calm_for = 2.0  # seconds for which the error must be below 2 cm
+    calm_for = 2.0  # minimum time of the error below 2 cm, s
     newest = [measured for at, measured in samples if at >= samples[-1][0] - calm_for]
     # 0.02: distance error below which a robot is ready for a run, m
     return samples[-1][0] >= calm_for and max(abs(measured - wanted) for measured in newest) < 0.02
@@ -129,7 +129,7 @@ def _over(wanted: float, seconds: float, samples: Samples) -> bool:
 async def _run(
     client: Operator, name: str, settings: Mapping[str, Any], over: Callable[[Samples], bool], *, held: bool = False
 ) -> Samples:
-    """One start of the behaviour: the first stretch of following that is over; a corner begins another one.
+    """One start of the behaviour: the first stretch of following that is over; a corner begins a new one.
 
     A robot that is ``held`` may drive from then on.
     """
@@ -146,7 +146,7 @@ async def _run(
 
 async def _followed(states: Mailbox[BehaviourState], number: int, over: Callable[[Samples], bool]) -> Samples:
     begun, samples = 0.0, list[tuple[float, float]]()
-    limit = 120.0  # seconds in which a run must have been complete
+    limit = 120.0  # time limit of a run, s
     async for state in states:
         if state.number != number:
             continue

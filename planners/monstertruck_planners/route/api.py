@@ -35,11 +35,11 @@ class RouteCosts(NamedTuple):
 
     terrain: TerrainWeights
     clearance: float
-    """Distance from the footprint's side to obstacles at which a metre costs nothing more, m."""
+    """Distance from the footprint's side to obstacles without extra cost, m."""
     clearance_cost: float
     """Extra cost of a metre in contact, m."""
     closed: float
-    """Least distance of the vehicle's point to obstacles, m."""
+    """Minimum distance of the vehicle's point to obstacles, m."""
     side: float
     """Half the width of the footprint, m."""
     wide: float
@@ -47,7 +47,7 @@ class RouteCosts(NamedTuple):
 
     @classmethod
     def of(cls, vehicle: "Vehicle", config: DriveCosts) -> "RouteCosts":
-        """Of a vehicle, with the weights of a configuration."""
+        """Cost model of a vehicle, with the weights of a configuration."""
         footprint = vehicle.footprint.data()
         side = footprint.half_width or footprint.radius
         return cls(
@@ -95,7 +95,7 @@ class RouteMap:
     ) -> "RouteMap":  # fmt: skip
         """Map of cells (rows, columns), -1 unknown, 0 free to 100 occupied, row 0 at the lowest y.
 
-        ``previous`` is the map before: what was computed for it is kept where nothing differs. Nothing reverses onto
+        ``previous`` is the map before: unchanged parts reuse its results. Nothing reverses onto
         the cells ``unseen``.
         """
         occupied = cells >= OCCUPIED
@@ -177,11 +177,11 @@ class RouteMap:
 
 @dataclass(frozen=True)
 class Vehicle:
-    """Footprint and limits of what is driven.
+    """Footprint and limits of the vehicle.
 
     Args:
         footprint: relative to the reference point, as its ``offset`` or disc centres say.
-        radius: least turning radius of the reference point, m.
+        radius: minimum turning radius of the reference point, m.
         crab_angle: largest angle of a translation, rad; 0: cannot crab.
         steering: mode of arcs and lines.
         reference: x of the reference point in base, m.
@@ -286,7 +286,7 @@ class RoutePlanner(Protocol):
 
     @property
     def vehicle(self) -> Vehicle:
-        """What is driven."""
+        """Vehicle."""
         ...
 
     @property
@@ -400,6 +400,6 @@ def make_planner(vehicle: Vehicle, config: GoalConfig) -> RoutePlanner:
     """Route planner of a configuration.
 
     Raises:
-        InputError: settings without a kind of route planner, or what it needs is not installed.
+        InputError: settings without a kind of route planner, or a required package is not installed.
     """
     return cast("RoutePlanner", ROUTE_PLANNERS.implementation(config)(vehicle, config))

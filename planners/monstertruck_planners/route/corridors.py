@@ -1,8 +1,8 @@
-"""Corridors on the coarse grid: gaps too narrow for the footprint, and alternative ways. Loads numba.
+"""Corridors on the coarse grid: gaps too narrow for the footprint, and alternative paths. Loads numba.
 
 The cost to go treats the vehicle as a point with a radius, so it leads the search into gaps that a circle inside the
 footprint passes but the footprint does not. Checking every cell and heading of a map would take longer than the
-search: only cells on the ways in question are checked.
+search: only cells on the paths in question are checked.
 
 Alternatives to the shortest path (other homotopy classes) come from the sum of the cost to the goal and from the start,
 which is the cost of the shortest path over a cell: the cheapest cell far from all known paths leads to a new one.
@@ -25,7 +25,7 @@ def footprint_fits(field: FieldData, footprint: FootprintData, margin: float, x:
     headings = 72  # checked in half a turn
     count = (1 if symmetric else 2) * headings
     for k in range(count):
-        # 29: step between two headings tried in turn: neighbouring headings fit or do not fit alike
+        # 29: step between two headings tried in turn: neighbouring headings mostly give the same result
         if safe_distance(field, footprint, margin, x, y, (k * 29 % count) * pi / headings) >= 0.0:
             return True
     return False
@@ -65,7 +65,7 @@ def close_narrow_gaps(
     field: FieldData, footprint: FootprintData, margin: float, cell_cost: NDArray[np.int16], factor: int, wide: float,
     step: NDArray[np.int8], row: int, column: int, radius: float, checked: NDArray[np.bool_],
 ) -> int:  # fmt: skip
-    """Close the coarse cells round a path in which the footprint fits nowhere.
+    """Close the coarse cells round a path without room for the footprint.
 
     Args:
         field: the fine grid.
@@ -78,7 +78,7 @@ def close_narrow_gaps(
         row: of the cell where the path begins.
         column: the same.
         radius: cells this near to the path are checked, cells.
-        checked: those that have been; changed in place.
+        checked: cells already checked; changed in place.
 
     Returns:
         Number of cells closed.

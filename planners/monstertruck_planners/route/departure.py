@@ -110,7 +110,7 @@ def _drive_off(
 def _to_room(
     field: FieldData, footprint: FootprintData, start: Array, segments: Array, after: float, wanted: int
 ) -> tuple[float, int]:
-    """Where a path first has the wanted clearance again, and how far the clearance fell until then.
+    """First place of a path with the wanted clearance again, and the fall of the clearance until then.
 
     Args:
         field: the grid.
@@ -185,10 +185,10 @@ def departures(
 
     Args:
         route_map: obstacles.
-        vehicle: what is driven.
+        vehicle: the vehicle.
         start: pose of the reference point, shape (3,).
         config: margin, and cost of a metre backward.
-        budget: of the route; what is done here is counted.
+        budget: of the route; includes this work.
         reserve: share of it that is kept; of the rest half is kept for the route.
 
     Returns:
@@ -200,7 +200,7 @@ def departures(
     if level < 0:
         return Departures([], exhausted=True)
     straight, exhausted, end = list[Departure](), True, 0.5 * (budget.remaining() + reserve)
-    # (0.0, 0.125, 0.5, 1.0): shares by which the clearance may fall again during a departure, tried in turn, each with
+    # (0.0, 0.125, 0.5, 1.0): permitted relative falls of the clearance during a departure, tried in turn, each with
     # half of the budget left
     dips = list(dict.fromkeys(math.ceil(level * share) for share in (0.0, 0.125, 0.5, 1.0)))
     for dip in dips:
@@ -283,7 +283,7 @@ def _sets_off(field: FieldData, footprint: FootprintData, arcs: list[Array], pos
     """Whether a search with that margin may begin with one of some arcs."""
     x, y, yaw = pose.tolist()
     keep = margin + CHECK_MARGIN
-    # 0.15: length for which one of the arcs from the end of a departure must be free, m: else a search would end there
+    # 0.15: minimum free length of an arc from the end of a departure, m: else a search would end there
     return any(
         segment_free(field, footprint, keep, CHECK_STEP, x, y, yaw, 0.15 * sign, curvature, sideslip)
         for sign, curvature, sideslip in (arc.tolist() for arc in arcs)
@@ -314,7 +314,7 @@ def plan_between(
         goal: the same.
         search: route between two poses that keep the margin; ``statistics["exhausted"]`` is not 0 if no budget would
             help it.
-        budget: that of the search, for the departure too.
+        budget: of the search, for the departure too.
         reserve: share of it that is kept, see ``departures``.
         departs: else there are no departures, and the start has to keep the margin.
     """
@@ -373,7 +373,7 @@ class Leaving:
     """Departure of a path from a place nearer to an obstacle than the margin."""
 
     length: float
-    """Distance from the start after which the path keeps the margin up to its end (m)."""
+    """Distance from the start before the path keeps the margin up to its end (m)."""
     fall: float
     """Drop of the clearance below its previous maximum (m)."""
 
@@ -427,4 +427,4 @@ def _best(
     for departure in sorted(found, key=lambda departure: (not departure.turns, total(departure))):
         if all((np.abs(departure.end - other.end) > 2 * PLACE).any() for other in chosen):
             chosen.append(departure)
-    return chosen[:3]  # departures from which a route is looked for
+    return chosen[:3]  # maximum number of departures tried for a route

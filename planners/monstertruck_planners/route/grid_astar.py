@@ -2,8 +2,8 @@
 
 Costs as on the author's robot: neutral 50 for every cell, plus three times the costmap's value; cells from 200 up are
 closed; the value falls with distance beyond the inscribed circle as exp(-10 d), to 0.3 m. Headings point along the
-path. The result is no drivable motion: turning radius and footprint are not regarded. So a start need only be free:
-whoever drives along the path has to leave what is too near.
+path. The result is not a drivable motion: turning radius and footprint are ignored. So a start need only be free: the
+tracker has to leave obstacles that are too near.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Heuristics of the searches: cost to go on a coarse grid, and length of the obstacle-free motion. Loads numba.
+"""Heuristics of the searches: cost-to-go on a coarse grid, and length of the obstacle-free motion. Loads numba.
 
 The first is the shortest path around the obstacles for a point. A coarse cell is open if any cell inside it may hold
 the centre of the footprint; distance near obstacles costs more, because the vehicle is not a point. Every cell stores
@@ -162,7 +162,7 @@ def cost_to_go(
 
 @njit(cache=True)
 def _estimate(to_go: CostToGo, row: int, column: int) -> int:
-    """Least cost from a cell to the start, no obstacles regarded."""
+    """Minimum cost from a cell to the start, without obstacles."""
     across, along = abs(column - to_go.start[1]), abs(row - to_go.start[0])
     few, many = min(across, along), max(across, along)
     return to_go.least * (many - few) + to_go.least * 141 // 100 * few
@@ -189,7 +189,7 @@ def complete(to_go: CostToGo) -> None:
 
 @njit(cache=True)
 def _settle_level(to_go: CostToGo) -> None:
-    """Follow all ways whose estimate is the present one, then go on to the next."""
+    """Expand all paths with the current estimate, then continue with the next."""
     rows, columns = to_go.cell_cost.shape
     cost, step, cell_cost, state = to_go.cost, to_go.step, to_go.cell_cost, to_go.state
     level = state[LEVEL]
@@ -240,7 +240,7 @@ def cell_at(field: FieldData, cell: float, x: float, y: float) -> tuple[int, int
 
 @njit(cache=True)
 def cell_ahead(step: NDArray[np.int8], row: int, column: int, length: float) -> tuple[int, int]:
-    """Cell reached after ``length`` cells along the path to the goal, or the goal's."""
+    """Cell reached after ``length`` cells along the path to the goal, or the goal cell."""
     while length > 0.0:
         k = step[row, column]
         if k < 0:

@@ -78,7 +78,7 @@ MAX_NODES = 400_000
 """Nodes of one search at most."""
 
 MAX_TABLE_CELLS = 1 << 26
-"""Cells of one search: a table of 256 MB, of which only what is visited takes memory."""
+"""Cells of one search: a table of 256 MB; only visited parts take memory."""
 
 
 FIRST_NODES = 512
@@ -110,7 +110,7 @@ class Nodes(NamedTuple):
     items: IntArray
     """The heap of open nodes."""
     table: NDArray[np.int32]
-    """Shape (rows, columns, headings): number of the node in each cell plus one, 0 = none."""
+    """Shape (rows, columns, headings): number of the node in each cell plus one, 0 for none."""
     cell: float
     counts: IntArray
     """Used nodes, open nodes, nodes expanded so far."""
@@ -178,7 +178,7 @@ def expand(
         field: the grid.
         footprint: of the vehicle.
         layer: extra costs.
-        to_go: ways to the goal.
+        to_go: cost-to-go.
         table: see ``reeds_shepp_table``.
         model: limits, costs and primitives of the vehicle.
         goal: shape (3,).
@@ -260,7 +260,7 @@ def _write_primitive(
 def _trace(
     field: FieldData, footprint: FootprintData, model: VehicleMotions, goal: Array, nodes: Nodes, last_node: int
 ) -> Array:
-    """Segments from the start over a node, from which the goal is reached directly, to the goal."""
+    """Segments from the start over a node to the goal, with a direct motion from the node."""
     segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.empty(8), np.empty((4, 3))
     depth, n = 1, last_node
     while nodes.parent[n] >= 0:
@@ -317,7 +317,7 @@ RESOLUTIONS = (Resolution(0.35, 0.55), Resolution(0.15, 0.25), Resolution(0.06, 
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """What is searched for."""
+    """Search problem."""
 
     field: FieldData
     footprint: FootprintData
@@ -336,9 +336,9 @@ class SearchRun:
     """One search, which can be interrupted and continued.
 
     Args:
-        problem: what is searched for.
+        problem: search problem.
         model: limits and costs of the vehicle, with primitives of the resolution.
-        to_go: ways to the goal.
+        to_go: cost-to-go.
         resolution: of the search.
         goal_range: expansions to the goal are tried from this near, m.
     """
@@ -378,7 +378,7 @@ class SearchRun:
 
 
 def _allocate(field: FieldData, cell: float, headings: int, start: Array) -> Nodes:
-    """Memory for the nodes of a search, of which the start is the first."""
+    """Memory for the nodes of a search; the start is the first."""
     n = MAX_NODES
     rows, columns = (int(count * field.resolution / cell) + 1 for count in field.occupied.shape)
     nodes = Nodes(
@@ -454,7 +454,7 @@ class HybridPlanner:
 
     @property
     def tolerance(self) -> float:
-        """Greatest deviation of a route's end from the goal, m and rad."""
+        """Maximum deviation of a route's end from the goal, m and rad."""
         return max(self.config.position_tolerance, self.config.yaw_tolerance)
 
     def free(self, route_map: RouteMap, path: MotionPath) -> bool:
@@ -500,7 +500,7 @@ def holds_translations(segments: Array) -> bool:
 
 
 def narrower_configs(config: HybridConfig) -> list[HybridConfig]:
-    """Settings with the margins that are tried after that of ``config``."""
+    """Settings with the margins to try after ``config``'s margin."""
     spare = config.margin - config.narrow_margin
     if spare <= 0.0:
         return []
@@ -564,7 +564,7 @@ class _PlanningRun:
         return cost_to_go(cell_cost, self.cell, self._cell_of(self.goal), self._cell_of(self.start), overrun=overrun)
 
     def _first_route(self, crabs: tuple[float, ...], reserve: float) -> tuple[Array | None, Reason, str]:
-        """The direct motion without translations, or what the searches find with these crab angles."""
+        """The direct motion without translations, or the result of the searches with these crab angles."""
         segments = self._direct(0.0)
         return self._search(self._cost_to_go(), crabs, reserve) if segments is None else (segments, Reason.OK, "")
 
@@ -588,7 +588,7 @@ class _PlanningRun:
         """First route: a short coarse search, then gaps are measured, and fine and coarse ones take turns.
 
         Args:
-            to_go: ways to the goal.
+            to_go: cost-to-go.
             crabs: greatest angles of translations that are searched with, in this order.
             reserve: share of the budget that is kept.
         """
@@ -677,10 +677,10 @@ class _PlanningRun:
         return any_closed
 
     def _improve(self, first: Array) -> Array:
-        """The best route found in the budget that is left.
+        """Best route within the remaining budget.
 
         Motions without translations are found in half the time: they come first, as for a vehicle that has no others,
-        and what they give is kept unless translations make it shorter and no dearer. So these make no route longer.
+        and their result is kept unless translations make it shorter at no higher cost. So these make no route longer.
         """
         segments = first
         if holds_translations(first):
@@ -732,11 +732,11 @@ class _PlanningRun:
         best, cost = self._smoothed(segments, NO_SEGMENTS, np.inf)
         idle = 0
         # 0.2: share of the budget for the final smoothing without and then with translations
-        # 12: rounds of improvement without gain after which smoothing ends
+        # 12: maximum rounds of smoothing without gain
         while self.budget.remaining() > 0.2 and idle < 12:
             segments = next(others)
             mate = best if len(segments) else NO_SEGMENTS
-            # 1.1: factor on the cost of the best route up to which another route is smoothed further
+            # 1.1: maximum cost of another route that is smoothed further, as a factor of the best cost
             segments, other = self._smoothed(segments if len(segments) else best, mate, 1.1 * cost)
             idle = 0 if other < 0.9995 * cost else idle + 1
             if other < cost:
@@ -758,7 +758,7 @@ class _PlanningRun:
     def _polished(self, segments: Array) -> Array:
         """The route smoothed in ever smaller steps."""
         path = editable(self.start, segments)
-        for shift in (0.25, 0.1, 0.03, 0.01):  # shares of a stretch by which poses move in the final smoothing
+        for shift in (0.25, 0.1, 0.03, 0.01):  # shifts of poses in the final smoothing, as fractions of a stretch
             self._shortcut(path, 1e-4, shift)
         return current_segments(path).copy()
 
@@ -798,7 +798,7 @@ class _PlanningRun:
         samples = [path.sample(spacing) for path in paths]
         poses = np.vstack([sample.poses for sample in samples])
         travelled = np.concatenate([length / path.length * s.travelled for path, s in zip(paths, samples, strict=True)])
-        # The first route's start and end are those of the chain.
+        # The first route's start and end are the chain's.
         last = len(samples[0].poses) - 1
         by_travelled = np.argsort(travelled, kind="stable")
         inner = by_travelled[(travelled[by_travelled] > 1e-6) & (travelled[by_travelled] < length - 1e-6)]
@@ -819,7 +819,7 @@ class _PlanningRun:
         known = np.zeros(self.cell_cost.shape, np.bool_)
         # 2.5: least distance of an alternative from all known routes, at one place at least, turning radii
         width = 2.5 * self.vehicle.radius / self.cell
-        # 1.15: factor on the length of the shortest path up to which alternatives are tried
+        # 1.15: maximum length of alternatives, as a factor of the shortest path
         limit = int(1.15 * to_go.cost[start])
         while (cell := cheapest_unmarked(to_go.cost, from_start.cost, known, limit)) >= 0:
             corridor = np.zeros(self.cell_cost.shape, np.bool_)

@@ -1,9 +1,9 @@
 """State-lattice planner: A* over cells and headings, repeated with a smaller heuristic weight while there is time.
 
-Cells and headings are exact; the goal is reached by one obstacle-free motion. There are 16 headings, those of the
-grid's short vectors. A turn to the next heading is line, arc, line with the largest radius that fits, and of all cells
-it could end at that with the shortest turn is taken. The primitives are computed for each vehicle: stored sets that
-keep their cells when the cell size changes turn tighter than the car.
+Cells and headings are exact; the goal is reached by one obstacle-free motion. There are 16 headings, along the grid's
+short vectors. A turn to the next heading is line, arc, line with the largest radius that fits, and of all cells it
+could end at that with the shortest turn is taken. The primitives are computed for each vehicle: stored sets that keep
+their cells when the cell size changes turn tighter than the car.
 
 Loads numba.
 """
@@ -339,7 +339,7 @@ class LatticePlanner:
     """Routes for one vehicle.
 
     Args:
-        vehicle: what is driven; its primitives are computed here.
+        vehicle: the vehicle; its primitives are computed here.
         config: costs, cell, budget.
     """
 

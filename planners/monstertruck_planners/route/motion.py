@@ -2,7 +2,7 @@
 
 A segment is (signed length m, curvature 1/m, sideslip rad): a reference point of the vehicle travels ``length`` metres
 (negative: backward) along an arc or line of constant curvature, at ``sideslip`` from the heading. With front steering
-the reference point is the middle of the rear axle, otherwise it is that of the base.
+the reference point is the middle of the rear axle, otherwise it is the base point.
 """
 
 from collections.abc import Sequence
@@ -81,7 +81,7 @@ def _sample_poses(start: Array, segments: Array, step: float) -> tuple[Array, ND
 
 @dataclass(frozen=True, slots=True)
 class MotionSamples:
-    """Points along a path; a value is that of the segment leading to the point (to the first: the first segment)."""
+    """Points along a path; a value belongs to the segment leading to the point (to the first: the first segment)."""
 
     poses: Array
     """Shape (m, 3): x, y, yaw of the reference point, yaw continuous."""
@@ -103,12 +103,12 @@ class MotionPath:
 
     Args:
         start: pose (x, y, yaw) of the reference point, shape (3,).
-        segments: shape (n, 3): signed length m, curvature 1/m, sideslip rad; those of length 0 are dropped.
+        segments: shape (n, 3): signed length m, curvature 1/m, sideslip rad; segments of length 0 are dropped.
         steering: how each segment is steered, n of them, or one for all (those with sideslip become "crab").
         reference: x of the reference point in base, m: minus half a wheelbase for the rear axle.
 
     Raises:
-        InputError: shapes or numbers that are no path.
+        InputError: shapes or numbers that do not form a path.
     """
 
     start: Array
@@ -194,7 +194,7 @@ class MotionPath:
         return moved(self.sample(step).poses, -self.reference)
 
     def then(self, other: "MotionPath") -> "MotionPath":
-        """This path and then the other one, which has to start where this one ends.
+        """This path followed by ``other``, which has to start where this one ends.
 
         Raises:
             InputError: another reference point, or a gap of more than a millimetre or milliradian.
@@ -239,7 +239,7 @@ class MotionPath:
 
 
 def cusps_of(segments: Array) -> int:
-    """Changes between forward and backward in segments, shape (n, 3), none of which has no length."""
+    """Changes between forward and backward in segments, shape (n, 3), all with a length."""
     return int(np.count_nonzero(np.diff(np.sign(segments[:, 0]))))
 
 

@@ -17,7 +17,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
 
 PASSING = 0.1
-"""Maximum distance at which a route passes a waypoint (m)."""
+"""Maximum distance of a route from a waypoint that it passes (m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class KeepPolicy:
     gain: float = 0.1
     """Minimum cost reduction of a new route, as a fraction of the old cost."""
     fall: float = 0.005
-    """Distance by which a kept route may be nearer to an obstacle than a new route before it keeps the margin (m)."""
+    """Maximum difference in clearance between a kept and a new route before the margin is kept (m)."""
 
 
 def replan(
@@ -148,7 +148,7 @@ def replan(
 def _fall_allowed(
     keeper: HybridPlanner, route_map: RouteMap, fresh: RouteResult, pose: ArrayLike, policy: KeepPolicy
 ) -> float | None:
-    """See ``remaining_route``: about as much as that of a new route, if that begins with a departure."""
+    """See ``remaining_route``: about as much as for a new route, if that begins with a departure."""
     if not needs_departure(route_map, keeper.vehicle, np.asarray(pose, dtype=np.float64), keeper.config.margin):
         return None
     if fresh.path is None:
@@ -158,7 +158,7 @@ def _fall_allowed(
 
 
 def _judge(planner: RoutePlanner) -> HybridPlanner:
-    """Says which paths are free, and what they cost by the settings that the planner shares with hybrid A*."""
+    """Judges which paths are free, and their cost by the settings that the planner shares with hybrid A*."""
     if isinstance(planner, HybridPlanner):
         return planner
     shared = (set(type(planner.config).model_fields) & set(HybridConfig.model_fields)) - {"kind"}
@@ -176,12 +176,12 @@ def remaining_route(
 
     Args:
         planner: of the path.
-        route_map: the newest map.
+        route_map: the latest map.
         path: the route so far.
         pose: of the reference point.
         goal: where the path has to end.
         reach: greatest distance of the pose from the path, m.
-        fall: by which the clearance may fall on a departure, m; None: the path has to keep the margin all the way.
+        fall: maximum fall of the clearance on a departure, m; None: the path has to keep the margin all the way.
     """
     here, there = np.asarray(pose, dtype=np.float64), np.asarray(goal, dtype=np.float64)
     # 1e-3: goals nearer than this are the same, m and rad

@@ -1,4 +1,4 @@
-"""What the searches share: binary heap, cost layer, cost and collision check of motions. Loads numba."""
+"""Common parts of the searches: binary heap, cost layer, cost and collision check of motions. Loads numba."""
 
 from math import ceil
 from typing import NamedTuple
@@ -76,9 +76,9 @@ class CostLayer(NamedTuple):
     terrain: NDArray[np.float32]
     """Cost of the ground in each cell; an empty array: none."""
     contact: float
-    """Distance to an obstacle's centre at which the footprint's side touches it, m."""
+    """Distance to an obstacle's centre when the footprint's side touches it, m."""
     clearance: float
-    """Distance beyond that at which it costs nothing more, above 0 m."""
+    """Further distance without cost, above 0 m."""
     clearance_cost: float
     """Cost of a metre in contact."""
 
@@ -123,13 +123,13 @@ class VehicleMotions(NamedTuple):
     """Limits, costs and motion primitives of the vehicle."""
 
     radius: float
-    """Least turning radius, m."""
+    """Minimum turning radius, m."""
     crab: float
     """Largest angle of a translation, rad; 0: none."""
     weights: Array
     """Shape (3,): per metre backward, of a cusp in turning radii, per metre of translation."""
     steering_change_cost: float
-    """Of every segment, at whose beginning the wheels turn, m."""
+    """Cost of every segment, because the wheels turn at its start, m."""
     primitives: Array
     """Shape (p, 3): the motion primitives, one segment each."""
     expansion_lengths: Array
@@ -208,7 +208,7 @@ def route_cost(field: FieldData, layer: CostLayer, model: VehicleMotions, start:
 def free_length(
     field: FieldData, footprint: FootprintData, model: VehicleMotions, pose: Array, segment: Array, longest: float
 ) -> float:
-    """Length (m, not signed) up to which a segment driven on and on is free of collisions; 0 beyond ``longest``."""
+    """Collision-free length (m, unsigned) of an extended segment; 0 beyond ``longest``."""
     sign = 1.0 if segment[0] > 0.0 else -1.0
     pace = 1.0 + abs(segment[1]) * footprint.reach
     step = model.check_step if segment[2] == 0.0 else 0.25 * model.check_step

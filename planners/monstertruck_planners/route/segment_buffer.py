@@ -17,7 +17,7 @@ class SegmentBuffer(NamedTuple):
     """Segments of a ``MotionPath`` while they are changed in place, with room for more and where they lead."""
 
     segments: Array
-    """Shape (n, 3), of which ``used[0]`` are in use."""
+    """Shape (n, 3); the first ``used[0]`` rows are in use."""
     poses: Array
     """Shape (n + 1, 3), before each segment and after the last."""
     travelled: Array

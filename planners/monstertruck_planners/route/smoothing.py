@@ -2,11 +2,11 @@
 
 Two kinds of shortcut trial, both on a random stretch of the path: replace it by the best motion between its ends; or by
 the two best motions over a pose in its middle, moved a little. A trial is kept if it costs less and is free, so the
-path stays drivable after every trial and its curvature never exceeds that of its arcs.
+path stays drivable after every trial and its curvature never exceeds its arcs' curvature.
 
 Shortcuts find the nearest optimum only: they never turn a truck around that drives a long way forward where backward is
-shorter. Dynamic programming over places along the path decides at which of them the truck faces ahead and where it
-changes direction.
+shorter. Dynamic programming over places along the path decides where the truck faces ahead and where it changes
+direction.
 """
 
 from math import inf, pi, sqrt
@@ -142,7 +142,7 @@ def shortcut(
         cost += many_cusps_cost(model, others, new_cusps)
         if cost >= present - 1e-6 or not segments_free(field, footprint, model, a, new, many):
             continue
-        # Costs are summed at places along each segment, so those of a stretch are not quite its share of the route's.
+        # Costs are summed at places along each segment, so a stretch's cost is not quite its share of the route.
         used = path.used[0]
         before_trial[:used] = path.segments[:used]
         splice(path, begin, i, end, j, new, many, spare)

@@ -1,1 +1,1 @@
-"""Trackers: from a path and the present pose to speed and axle angles."""
+"""Trackers: from a path and the current pose to speed and axle angles."""

@@ -36,7 +36,7 @@ BELIEVED: Final = 5.0
 FADE: Final = 1.0 - 1.0 / 150.0
 """Fraction of the residual sums that remains after each interval."""
 FORGET: Final = 200.0
-"""Distance after which older knowledge weighs a third (m): parts wear."""
+"""Distance that reduces the weight of older knowledge to a third (m): parts wear."""
 NOISE: Final = (0.003, 0.002)
 """Standard deviation of a turn (rad) and of a sideways motion (m) before any comparison."""
 

@@ -58,7 +58,7 @@ class _Finding(NamedTuple):
     trim: _Estimate
     """Trim (rad), left positive."""
     speed: float
-    """Speed at which ``share`` is known best (m/s)."""
+    """Speed with the best knowledge of ``share`` (m/s)."""
 
     def sentence(self) -> str:
         """Return the differences as text; empty if there are none."""

@@ -46,7 +46,7 @@ class TrackerConfig(Schema):
     lateral_acceleration: Positive = 0.5
     """Maximum speed squared times curvature, m/s^2."""
     goal_tolerance: Positive = 0.02
-    """Maximum distance from the path end at which a stopped truck has completed the path, m."""
+    """Maximum distance of a stopped truck from the end of a completed path, m."""
     goal_yaw_tolerance: Annotated[float, Field(gt=0, le=math.pi)] = 0.2
     """Maximum heading error at the end of a completed path, rad."""
     lost_distance: Positive = 0.5
@@ -66,7 +66,7 @@ class TrackerConfig(Schema):
     """Maximum turning rate of the axles, rad/s."""
 
     steering_distance: Positive = 0.05
-    """Distance in which the axles can reach the path's steering angles at the chosen speed, m."""
+    """Distance for the axles to reach the path's steering angles at the chosen speed, m."""
 
     @property
     def reach(self) -> float:

@@ -6,7 +6,7 @@ the forward speed (negative backwards), to first order
     de/dt = v (p + slip - slip_ref)      slip = (1 - c) tan_f + c tan_r      (eq. 2.34)
     dp/dt = v (turn - turn_ref)          turn = (tan_f - tan_r) / L          (eq. 2.37)
 
-and both axles follow what is asked with a first-order lag. A way of steering is a basis of (tan_f, tan_r).
+and both axles follow requests with a first-order lag. A way of steering is a basis of (tan_f, tan_r).
 """
 
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ def discretise(geometry: FourWheelSteering, steering: Steering, speed: float, la
     """The model over one period with inputs and reference held, exactly.
 
     Args:
-        geometry: the truck's.
+        geometry: of the truck.
         steering: way of steering; its inputs are one or two.
         speed: forward, m/s.
         lag: of the axles, s.

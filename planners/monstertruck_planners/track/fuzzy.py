@@ -64,7 +64,7 @@ class FuzzyInputs:
     distance: float
     """M."""
     aside: float
-    """To the left, m."""
+    """Distance to the left, m."""
     direction: float
     """+1 forward, -1 backward."""
 
@@ -158,7 +158,7 @@ class Fuzzy(PathTracker[FuzzyConfig]):
         self._front = self._sideways = 0.0
 
     def steer(self, state: TrackingState) -> Angles:
-        """Axle angles; what no rule speaks of stays as it was."""
+        """Axle angles; values without a rule stay as they were."""
         outputs = self._infer(state)[0]
         self._front = self._front if outputs.front is None else outputs.front
         self._sideways = self._sideways if outputs.sideways is None else outputs.sideways
@@ -182,7 +182,7 @@ class Fuzzy(PathTracker[FuzzyConfig]):
         return direction * min(abs(state.target_speed), max(most, self.config.min_speed))
 
     def _infer(self, state: TrackingState) -> tuple[FuzzyOutputs, float]:
-        """What the rules say, and the direction."""
+        """Result of the rules, and the direction."""
         run, (x, y, yaw) = state.run, state.pose
         s = min(state.s + self.config.sub_goal, run.end)
         goal = run.at(s).point

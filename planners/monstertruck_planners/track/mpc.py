@@ -47,7 +47,7 @@ class Layout:
     effect: Array
     """Map from the plan to the axle angles in the middle of each fine step, shape (f, 2, k m)."""
     weights: Array
-    """Of the squared errors, shape (2 f,)."""
+    """Weights of the squared errors, shape (2 f,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +120,7 @@ class Mpc(PathTracker[MpcConfig]):
     def _layout(self, modes: tuple[Steering, ...]) -> Layout:
         known = self._layouts.get(modes)
         if known is None:
-            if len(self._layouts) >= 64:  # sequences of ways of steering kept
+            if len(self._layouts) >= 64:  # number of kept sequences of steering modes
                 self._layouts.clear()
             m = max(BASES[mode].shape[1] for mode in modes)
             padded = {mode: np.pad(BASES[mode], ((0, 0), (0, m - BASES[mode].shape[1]))) for mode in set(modes)}
@@ -184,7 +184,7 @@ class Mpc(PathTracker[MpcConfig]):
         return np.array(sides + yaws)
 
     def _weights(self, modes: tuple[Steering, ...]) -> Array:
-        """Of the squared errors, shape (2 f,)."""
+        """Weights of the squared errors, shape (2 f,)."""
         config = self.config
         free = np.repeat([mode == "crab" for mode in modes], self._fine // self._periods)
         heading = np.where(free, 0.0, self._h / config.heading_scale**2)

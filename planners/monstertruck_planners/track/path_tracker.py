@@ -40,7 +40,7 @@ Angles = tuple[float, float]
 EXACT: Final = AxleErrors()
 """Errors of perfectly calibrated axles."""
 FORGET: Final = 1.0
-"""Pause after which the axle state is unknown (s); older requests no longer act."""
+"""Maximum pause before the axle state is unknown (s); older requests no longer act."""
 
 
 class AxleModel:
@@ -174,7 +174,7 @@ class AxleModel:
 
 
 class TruckState(NamedTuple):
-    """What a tracker knows of the truck."""
+    """A tracker's knowledge of the truck."""
 
     pose: tuple[float, float, float]
     """x, y (m), yaw (rad) in the path's frame."""
@@ -187,7 +187,7 @@ class TruckState(NamedTuple):
     roughness: float = 0.0
     """Standard deviation of the tilt over the last seconds, rad."""
     obeyed: bool = True
-    """Whether the axles do what the tracker requests."""
+    """Whether the axles follow the tracker's requests."""
     heading: tuple[float, float] | None = None
     """Instant (s) and yaw (rad, in any frame) of a measurement that does not depend on the requests; None: there is no
     compass, and the pose's yaw shows how the truck turns."""
@@ -200,14 +200,14 @@ class Command:
     """What to do now, and how the tracking goes."""
 
     speed: float
-    """Of the base point along its direction of travel, m/s; negative backwards."""
+    """Speed of the base point along its direction of travel, m/s; negative backwards."""
     front: float
     rear: float
     progress: PathProgress
     cross_track: float
     """Distance of the base point from the path, m; positive left of it, seen in the direction of travel."""
     heading_error: float
-    """Yaw less the path's, rad."""
+    """Yaw relative to the path, rad."""
     outcome: Reason
     """DRIVING, GOAL_REACHED, GOAL_MISSED, CUSP_MISSED, PATH_LOST, NOT_FINITE, or of the service STUCK."""
 
@@ -265,7 +265,7 @@ C = TypeVar("C", bound=TrackerConfig)
 REST: Final = 0.01
 """Maximum speed of a truck at rest (m/s)."""
 STEEPEST: Final = 1.4
-"""Limit to which angles are clipped before their curvature is kept (rad)."""
+"""Clipping limit of the angles before their curvature is kept (rad)."""
 
 
 class TrackingState(NamedTuple):
@@ -555,7 +555,7 @@ class PathTracker(ABC, Generic[C]):
         )
 
     def _slip_besides(self, steering: Steering, angles: Angles) -> float:
-        """Return the sideslip of axle angles beyond that of the steering mode (rad)."""
+        """Return the sideslip of axle angles beyond the steering mode's sideslip (rad)."""
         front, rear = as_steered(steering, angles)
         return float(self.geometry.tan_sideslip(angles[0] - front, angles[1] - rear))
 
@@ -564,5 +564,5 @@ class PathTracker(ABC, Generic[C]):
         if abs(truck.speed) > REST:
             return False
         now = self.axles.angles
-        # 0.03: axles this near to what is requested count as turned, rad
+        # 0.03: maximum difference between turned axles and their request, rad
         return max(abs(angles[0] - now[0]), abs(angles[1] - now[1])) > 0.03

@@ -23,7 +23,7 @@ def load_path(file: FilePath, *, closed: bool, frame: str = "odom", columns: Seq
     """Read a path that can be tracked; see ``path_from``.
 
     Raises:
-        InputError: naming file and line, and what was expected.
+        InputError: naming file, line and expectation.
     """
     path = path_from(text_of(file, EXPECTED, LARGEST), file, closed=closed, frame=frame, columns=columns)
     try:
@@ -36,8 +36,8 @@ def load_path(file: FilePath, *, closed: bool, frame: str = "odom", columns: Seq
 class PathService:
     """Publishes the configured path, and replaces it by any that an operator sends while the truck stands.
 
-    A request for the present path that ``halts`` withdraws it, whether the truck stands or not. Started by name, the
-    configured path is driven once: a truck that was disarmed on the way does not go on when it is armed again.
+    A request for the current path that ``halts`` withdraws it, whether the truck stands or not. Started by name, the
+    configured path is driven once: a truck that was disarmed on the way does not continue when it is armed again.
 
     Args:
         drawn: the configured path.
@@ -115,7 +115,7 @@ class PathService:
         return name
 
     def _withdrawn(self, request: PathRequest) -> Path:
-        """The present path, to be followed no longer than until the truck is disarmed.
+        """The current path, to be followed until the truck is disarmed at most.
 
         Raises:
             RequestRefusedError: the sender may not, or the path has been replaced.

@@ -2,8 +2,8 @@
 
 Candidates are all pairs of a dead time and a lag. Each candidate predicts the turn between two poses from the requests
 and the speed. Measured turns are regressed on it with a gain (the linkage may turn less than it should) and a trim (the
-axles may be off centre), with priors near 1 and 0. The residuals give each candidate its probability. Turns for which
-all candidates agree carry no information: they are left out, so the estimate does not fade on a straight.
+axles may be off centre), with priors near 1 and 0. The residuals give each candidate its probability. Turns that all
+candidates predict equally carry no information: they are left out, so the estimate does not fade on a straight.
 """
 
 import math
@@ -215,7 +215,7 @@ def choose(used: Response, configured: Response | None, estimate: ResponseEstima
     """
     found = estimate.response
     if configured is not None:
-        # 3.0: difference at which the estimate contradicts the configured response, in standard deviations
+        # 3.0: minimum difference of a contradiction to the configured response, in standard deviations
         # 1.0: difference below which the configured response is used again, in standard deviations
         sure, share = (3.0, 1.0) if used == configured else (1.0, 0.5)
         # 0.03: minimum difference from the configured delay, s: effects that are not modelled look like a delay of this

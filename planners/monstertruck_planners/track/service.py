@@ -38,9 +38,9 @@ SOURCE: Final = ServiceName.TRACKER.value
 
 
 UNSEEN_AFTER: Final = SECOND
-"""Waiting time before unseen ground after which the path is abandoned (ns): waiting cannot reveal that ground."""
+"""Maximum waiting time before unseen ground (ns), then the path is abandoned: waiting cannot reveal that ground."""
 STUCK_AFTER: Final = 1.0
-"""Distance commanded without progress after which the truck is stuck (m)."""
+"""Commanded distance without progress of a stuck truck (m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ class _ProgressChecker:
         """Whether the truck is stuck (latched); ``gate`` is None while the tracker does not drive."""
         if self.asked >= STUCK_AFTER:
             return True
-        progress = 0.2  # motion, in space or along the path, that counts as progress, m
+        progress = 0.2  # minimum motion of progress, in space or along the path, m
         if along - self.along > progress or math.dist(place, self.place) > progress:
             self.place, self.along, self.asked = place, along, 0.0
         elif gate is not None and gate.twist is not None:
@@ -158,7 +158,7 @@ class TrackingStep:
         self._path: SegmentedPath | None = None
         self._progress = PathProgress()
         self._begun: tuple[float, float, float] | None = None
-        """Pose at which the truck joined the path; None if it must join again."""
+        """Pose when the truck joined the path; None if it must join again."""
         self._outcome = Reason.DRIVING
         self._progress_checker = _ProgressChecker()
         self._unseen: int | None = None
@@ -170,7 +170,7 @@ class TrackingStep:
         """Whether the response differed from the configured one at the last step."""
         self._steering_report = SteeringReport("", agrees=True, axles=())
         self._compared = 0.0
-        """Distance on which the report is based (m)."""
+        """Distance covered by the report (m)."""
         self._differs: Severity | None = None
         """Severity of the reported steering difference; None if none was reported."""
         self._events: list[StepEvent] = []
@@ -284,7 +284,7 @@ class TrackingStep:
         return axles
 
     def _steering(self) -> SteeringReport:
-        """Compare the steering with its calibration; report when a difference begins or ends, and in which part."""
+        """Compare the steering with its calibration; report the start and end of a difference, and its part."""
         estimator = self._path_tracker.axle_errors
         if estimator.metres == self._compared:
             return self._steering_report
@@ -333,7 +333,7 @@ class TrackingStep:
         return True
 
     def _to_begin(self) -> bool:
-        """Whether the path has ended or has not begun yet."""
+        """Whether the path has ended or has not started yet."""
         return self._outcome is not Reason.DRIVING or (self._path is not None and self._progress == self._path.start)
 
     def _moved(self, here: tuple[float, float, float]) -> bool:
