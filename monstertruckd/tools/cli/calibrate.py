@@ -129,7 +129,7 @@ for _kind in WIZARDS.values():
 @app.command("all")
 def all_(
     *,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print what is still to be done.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print the remaining wizards.")] = False,
     yes: YesOption = False,
     answer: AnswerOption = None,
     robot: RobotOption = "truck",
@@ -154,9 +154,7 @@ def all_(
                 print(f"still to be calibrated: {names}" if names else "everything is calibrated, nothing expired")
                 return
             if waiting:
-                remark(
-                    "restart the daemon, so that what was measured counts; this command goes on then (Ctrl-C ends it)"
-                )
+                remark("restart the daemon, to apply the measurement; this command then continues (Ctrl-C ends it)")
                 run_wall(lambda clock: _until_restarted(call, clock))
                 continue
             _run(wizard_of(steps[0]), call, panel)
@@ -256,7 +254,7 @@ def accept(
         print_json({"result": result, "file": file})
     else:
         _print(result)
-    remark(f"saved in {file}; it counts from the next start of the daemon")
+    remark(f"saved in {file}; it applies from the next start of the daemon")
 
 
 def _run(wizard: "Wizard", call: _Call, panel: "Panel") -> None:
@@ -267,7 +265,7 @@ def _run(wizard: "Wizard", call: _Call, panel: "Panel") -> None:
         print_json({"result": result, "file": file})
     else:
         _print(result)
-    remark(f"saved in {file}; it counts from the next start of the daemon")
+    remark(f"saved in {file}; it applies from the next start of the daemon")
     if result.again is not None:
         remark(f"next: {result.again}")
 
@@ -300,7 +298,7 @@ def _undo(name: str, call: _Call) -> None:
         )["file"]
     if call.json_output:
         print_json({"file": file})
-    remark(f"{name}: as before, in {file}; it counts from the next start of the daemon")
+    remark(f"{name}: as before, in {file}; it applies from the next start of the daemon")
 
 
 def _client(robot: str, endpoint: str, clock: "Clock") -> "TruckClient":

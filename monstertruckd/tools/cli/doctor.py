@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from monstertruck_runtime.clock import Clock
     from monstertruckd.tools.doctor.context import Finding
 
-CLEAR = "The robot is about to drive 20 cm ahead and back. Is half a metre free all around, and somebody at the switch?"
+CLEAR = "The robot is about to drive 20 cm ahead and back. Is half a metre free all around, and a person at the switch?"
 STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
 

@@ -40,7 +40,7 @@ def explore(
         ),
     ] = None,
     budget: Annotated[
-        str | None, typer.Option(help="Time after which it ends, such as 20min; else as configured.", metavar="TIME")
+        str | None, typer.Option(help="Time limit, such as 20min; else as configured.", metavar="TIME")
     ] = None,
     find: Annotated[
         int | None,

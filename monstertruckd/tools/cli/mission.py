@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from monstertruck_schemas.mission import Mission
     from monstertruckd.tools.cli.runs import RunEnd
 
-app = command_group("Missions: steps that the robot does one after the other.")
+app = command_group("Missions: sequences of steps for the robot.")
 
 WITHOUT = "does no missions"
 MISSIONS = shipped("configs/missions")

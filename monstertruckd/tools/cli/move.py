@@ -44,8 +44,8 @@ def move(
     profile: Annotated[
         MoveProfile | None, typer.Option(help="Default: that of the configuration's behaviour `move`.")
     ] = None,
-    speed: Annotated[float | None, typer.Option(help="Greatest speed, m/s; on the spot rad/s.")] = None,
-    acceleration: Annotated[float | None, typer.Option(help="Greatest acceleration, m/s^2 or rad/s^2.")] = None,
+    speed: Annotated[float | None, typer.Option(help="Maximum speed, m/s; on the spot rad/s.")] = None,
+    acceleration: Annotated[float | None, typer.Option(help="Maximum acceleration, m/s^2 or rad/s^2.")] = None,
     arm: Annotated[bool, typer.Option("--arm", help="Arm the robot first; it drives off at once.")] = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,

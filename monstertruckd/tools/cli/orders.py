@@ -90,7 +90,7 @@ async def _announce(client: "TruckClient", *, hold: bool) -> None:
         if row.expired:
             remark(f"calibration of {row.wizard} has expired ({row.expired}): monstertruckd calibrate {row.wizard}")
     if not hold and (names := await _set_off(client, await client.get_retained(GATE))):
-        print(f"sets off at once: {', '.join(names)}; --hold arms without", file=sys.stderr)
+        print(f"will start at once: {', '.join(names)}; --hold arms without", file=sys.stderr)
 
 
 async def _set_off(client: "TruckClient", gate: "GateState | None") -> list[str]:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from monstertruckd.tools.replay_check.result import CheckedReplay
 
 CHECK = "Compute the log's outputs again from its sensors and compare them."
-CONFIG = "With --check: compute with this configuration and show what it changes."
+CONFIG = "With --check: compute with this configuration and show the differences."
 TOLERANCE = "With --check: greatest difference that agrees, in m, rad and so on; 0 = equal bit for bit."
 
 ROUNDED = "the last digits differ, as between processors whose maths routines round otherwise"

@@ -38,7 +38,7 @@ class Distribution(StrEnum):
 def ros2(
     robot: Annotated[
         str | None,
-        typer.Option("--robot", "-r", metavar="NAME@ENDPOINT", help="The robot. Default: that of this computer."),
+        typer.Option("--robot", "-r", metavar="NAME@ENDPOINT", help="The robot. Default: the robot of this computer."),
     ] = None,
     face: Annotated[
         Face,

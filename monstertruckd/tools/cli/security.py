@@ -49,7 +49,7 @@ def init(
 @app.command("add")
 def add(
     name: NameArgument,
-    role: Annotated[AccessRole | None, typer.Option(help="What it may do; a new one: pilot.")] = None,
+    role: Annotated[AccessRole | None, typer.Option(help="Its role; a new one: pilot.")] = None,
     rank: Annotated[
         Literal["gamepad", "keyboard", "station"] | None,
         typer.Option(help="Highest priority it may claim; a new one: station."),
@@ -180,5 +180,5 @@ def _say_robot(folder: "Folder") -> None:
     if register.router is not None:
         remark("The router keeps to its old rules until `security router` is run again and it is restarted.")
     if not register.of_role(AccessRole.PILOT, AccessRole.ENGINEER):
-        remark("With these files it does not start: nobody could drive.")
+        remark("With these files it does not start: no station could drive.")
         remark("Next: monstertruckd security add NAME --role pilot")

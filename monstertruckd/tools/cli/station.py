@@ -27,7 +27,7 @@ def station(
             "--robot",
             "-r",
             metavar="NAME@ENDPOINT",
-            help="Robot to show; may be repeated. Default: that of this computer.",
+            help="Robot to show; may be repeated. Default: the robot of this computer.",
         ),
     ] = None,
     routers: Annotated[

@@ -161,7 +161,7 @@ def test_arming_says_who_drives_or_waits(monkeypatch: pytest.MonkeyPatch, capsys
 def test_who_sets_off_is_said_before_arming(capsys: pytest.CaptureFixture[str]):
     waiting = state(GateMode.DISARMED).model_copy(update={"waiting": ("tracker",)})
     asyncio.run(orders._announce(Robot(waiting, waiting), hold=False))  # type: ignore[arg-type]
-    assert capsys.readouterr().err == "sets off at once: tracker; --hold arms without\n"
+    assert capsys.readouterr().err == "will start at once: tracker; --hold arms without\n"
     for newest in (state(GateMode.DISARMED), None):
         asyncio.run(orders._announce(Robot(waiting, newest), hold=False))  # type: ignore[arg-type]
     assert capsys.readouterr().err == ""
@@ -174,9 +174,9 @@ def test_who_sets_off_is_said_before_arming(capsys: pytest.CaptureFixture[str]):
             GateMode.DISARMED,
             False,
             "lap",
-            "sets off at once: tracker, along path 'lap' of 14.0 m; --hold arms without\n",
+            "will start at once: tracker, along path 'lap' of 14.0 m; --hold arms without\n",
         ),
-        (GateMode.DISARMED, False, "", "sets off at once: tracker, along its path of 14.0 m; --hold arms without\n"),
+        (GateMode.DISARMED, False, "", "will start at once: tracker, along its path of 14.0 m; --hold arms without\n"),
         (GateMode.DISARMED, True, "lap", ""),
         (GateMode.ARMED, False, "lap", ""),
     ],
