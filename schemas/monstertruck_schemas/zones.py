@@ -10,9 +10,9 @@ from monstertruck_schemas.base import Message, Name, Nanoseconds, Positive, Sche
 from monstertruck_schemas.req import Request
 
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000)]
-Corners = Annotated[
-    tuple[Annotated[tuple[Coordinate, Coordinate], Field(strict=False)], ...], Field(strict=False, max_length=200)
-]
+Corner = Annotated[tuple[Coordinate, ...], Field(strict=False, min_length=2, max_length=2)]
+"""x and y (m). Of any length to the type checker, because log viewers read no JSON schema of a pair."""
+Corners = Annotated[tuple[Corner, ...], Field(strict=False, max_length=200)]
 Whole = Annotated[int, Field(ge=0, lt=2**31)]
 
 LONGEST_OFF: Final = 86_400.0
