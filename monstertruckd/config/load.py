@@ -31,7 +31,7 @@ from monstertruck_runtime.outside import reading
 from monstertruck_runtime.plugins import models_in
 from monstertruck_runtime.small_files import make_folder, replace_file, require_file
 from monstertruck_runtime.yaml_files import DEEPEST, LARGEST_YAML, bounded_yaml
-from monstertruck_schemas.base import LiveValue, Schema, field_docs, first_mistake, live_settings
+from monstertruck_schemas.base import LiveValue, Schema, field_docs, live_settings
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values, unused
 from monstertruckd.config.real_ports import mixed
 from monstertruckd.config.renamed import RENAMED
@@ -156,7 +156,7 @@ def calibrated(config: T, tree: Tree, without: Collection[Path] = ()) -> tuple[T
         refused = saved.path
         if path is not None and (not settings or not _is_valid(config, results.values(), path)):
             refused = path
-        raise UnusableFileError(refused, f"{' with '.join(sources)}: {first_mistake(error)}") from error
+        raise UnusableFileError(refused, f"{' with '.join(sources)}: {_first_mistake(data, error)}") from error
     return changed, replace(tree, origins=origins, calibration=path, unused=left)
 
 
@@ -729,6 +729,12 @@ def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError
         yield f"{origin}: {dotted}: {_sentence(detail, model, key)}"
     if (more := len(mistakes) - most_mistakes) > 0:
         yield f"{path}: {more} more mistakes"
+
+
+def _first_mistake(data: Any, error: ValidationError) -> str:
+    detail = error.errors(include_url=False)[0]
+    key = ".".join(map(str, _data_key(data, detail["loc"])))
+    return f"{key}: {detail['msg'].removeprefix('Value error, ')}"
 
 
 def _sentence(detail: ErrorDetails, model: type[Schema], key: Key) -> str:

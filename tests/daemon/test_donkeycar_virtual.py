@@ -19,6 +19,7 @@ pytestmark = [pytest.mark.virtual, pytest.mark.timeout(600)]
 CAR = Path(__file__).resolve().parents[2] / "configs" / "robots" / "donkeycar.yaml"
 
 
+@pytest.mark.long
 def test_it_drives_its_bend_and_shows_pictures_without_a_map():
     config = load_config(CAR, SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
     assert config.devices.lidar is config.slam is None

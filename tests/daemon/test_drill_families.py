@@ -321,6 +321,7 @@ def test_an_operator_takes_over_where_something_is_in_the_way_of_a_tracker() -> 
     run_virtual(main)
 
 
+@pytest.mark.long
 def test_an_operator_gives_the_planner_one_goal_after_another() -> None:
     config = load_config(CONFIGS / "goals.yaml", SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
 
@@ -340,6 +341,7 @@ def test_an_operator_gives_the_planner_one_goal_after_another() -> None:
     run_virtual(main)
 
 
+@pytest.mark.long
 def test_a_robot_with_a_planner_is_driven_by_hand_in_most_legs_and_to_goals_in_every_fourth() -> None:
     config = load_config(CONFIGS / "goals.yaml", SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
     legs = Campaign(3, 4 * LEG, config).legs()
@@ -347,6 +349,7 @@ def test_a_robot_with_a_planner_is_driven_by_hand_in_most_legs_and_to_goals_in_e
     assert followed == [False, True]
 
 
+@pytest.mark.long
 def test_a_pack_that_seemed_critical_keeps_a_robot_waiting_and_is_not_stuck(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("monstertruckd.tools.drill.campaign.RECOVERY_LIMIT", 5.0)
     config = load_config(CONFIGS / "full.yaml", SimulatedTruckConfig)[0].model_copy(update={"recorder": None})
@@ -440,6 +443,7 @@ def test_a_beginning_inside_a_leg_is_refused() -> None:
         campaign(first=LEG - 1)
 
 
+@pytest.mark.long
 def test_trials_have_pairs_both_directions_and_families_of_every_device() -> None:
     outcomes = run_trials(Campaign(3, 6, demo()).legs()[0])
     assert [outcome.number for outcome in outcomes] == list(range(6))

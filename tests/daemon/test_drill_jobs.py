@@ -10,6 +10,7 @@ from tests.daemon.wall_kit import ROOT
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(180)]
 
 
+@pytest.mark.long
 def test_the_number_of_processes_and_the_order_do_not_matter():
     config = load_config(ROOT / "configs" / "demo.yaml", SimulatedTruckConfig)[0]
     drill = Drill(7, 2, with_overlay(config, {"recorder": None}), leg=1)  # legs of one fault each

@@ -131,6 +131,7 @@ def resumable() -> Drill:
     return Drill(7, 2, with_overlay(demo(), {"recorder": None}), leg=1)
 
 
+@pytest.mark.long
 def test_an_interrupted_drill_goes_on_where_it_ended_and_gives_the_same_report(tmp_path: Path):
     class InterruptedDrillError(Exception): ...
 

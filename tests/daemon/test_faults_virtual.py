@@ -117,6 +117,7 @@ def test_one_seed_is_one_log_and_another_seed_another(tmp_path: Path):
     assert short_demo(tmp_path / "c", 8) != first
 
 
+@pytest.mark.long
 def test_a_lap_of_the_demo_closes(tmp_path: Path):
     summary = run_fast_demo(DEMO, tmp_path, None)
     assert summary.lap.outcome is Reason.GOAL_REACHED

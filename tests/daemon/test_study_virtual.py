@@ -42,6 +42,7 @@ def stand(folder: Path) -> SimulatedTruckConfig:
     )
 
 
+@pytest.mark.long
 def test_a_circle_and_a_line_are_found_in_the_log(tmp_path: Path):
     config = stand(tmp_path)
 

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.robots import CROSS_TRACK, MAP_ERROR, ROBOTS, configured, lap_of
 from monstertruck_schemas.reasons import Reason
 
-pytestmark = [pytest.mark.virtual, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.virtual, pytest.mark.long, pytest.mark.timeout(600)]
 
 SPEEDS = {"turtle": 0.8, "truck_today": 1.5, "f1tenth": 3.0}
 

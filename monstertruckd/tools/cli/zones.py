@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
-from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NoAnswerError
 from monstertruckd.tools.cli.connection import not_ready, require_section, with_robot
@@ -149,6 +148,8 @@ def area_of(corners: list[str], limit: float | None, inside: Literal["stop", "le
 
 def row_of(zone: "Zone", *, inside: bool, now: int) -> tuple[str, ...]:
     """Row of a table; ``now`` is the robot's time, ns."""
+    from monstertruck_runtime.clock import SECOND
+
     if zone.mask is None:
         ground = f"{len(zone.corners)} corners"
     else:

@@ -249,7 +249,8 @@ def named(topic: str) -> str:
     if topic in BY_NAME:
         return topic
     found = [name for name in BY_NAME if name.rpartition("/")[2] == topic]
-    found = [name for name in found if not name.startswith("health/")] or found  # a service and its output share names
+    # A service, a request and an output may share a name: the output is meant.
+    found = [name for name in found if not name.startswith(("health/", "req/"))] or found
     if len(found) > 1:
         raise NotFoundError(f"topic {topic}: expected one of {', '.join(found)}")
     if not found:

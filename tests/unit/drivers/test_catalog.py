@@ -5,7 +5,7 @@ import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import get_type_hints
+from typing import get_args, get_type_hints
 
 import pytest
 from pydantic import ValidationError
@@ -34,6 +34,8 @@ def test_every_role_of_the_enum_has_its_row_a_kind_and_a_key():
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 def test_a_driver_takes_the_ends_of_its_roles_topics(kind: DeviceKind):
     hints = get_type_hints(kind.implementation_class().__init__)
+    for ends in get_args(hints.get("ends")):  # the keyword arguments of a shared base
+        hints |= get_type_hints(ends)
     for role in kind.roles:
         for ends, end in ((role.writes, Publisher), (kind.also, Publisher), (role.reads, Subscription)):
             for name, topic in ends.items():

@@ -31,6 +31,10 @@ LINES = {
     "points goto": "points goto door",
     "points mark": "points mark door",
     "points remove": "points remove door",
+    "zone add": "zone add stairs 0,0 1,0 1,1",
+    "zone off": "zone off stairs",
+    "zone on": "zone on stairs",
+    "zone remove": "zone remove stairs",
 }
 """A line of each."""
 OTHERWISE = {"arm", "disarm", "estop", "reset", "drive", "calibrate all"}
@@ -46,6 +50,7 @@ READ = {
     "map save",
     "points list",
     "points export",
+    "zone list",
 }
 """They change nothing."""
 SERVE = {"plan-server", "replay", "stand run", "security check"}

@@ -345,7 +345,7 @@ def test_an_end_says_its_reason_once_and_breaks_no_word(
     monkeypatch.setattr("monstertruckd.tools.cli.output.on_terminal", lambda _: True)
     monkeypatch.setenv("COLUMNS", "40")
     print_end(Reason.BEHAVIOUR_DONE, "turned 1.563 rad", {}, json_output=False)
-    assert capsys.readouterr().out == "a behaviour is complete:\nturned 1.563 rad (89.6°)\n"
+    assert capsys.readouterr().out == "a behaviour is complete: turned 1.563\nrad (89.6°)\n"
 
 
 def test_the_end_of_a_drive_says_angles_in_degrees_too(capsys: pytest.CaptureFixture[str]):

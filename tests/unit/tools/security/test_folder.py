@@ -209,5 +209,5 @@ def test_who_revokes_the_last_pilot_hears_what_follows(folder: Folder):
     make_router(folder.path / "router", [folder], ["10.0.0.1"], NOW)
     revoked = CliRunner().invoke(app, ["security", "revoke", "ann", "--folder", str(folder.path)])
     assert revoked.exit_code == 0
-    assert "it does not start: nobody could drive" in revoked.output
+    assert "it does not start: no station could drive" in revoked.output
     assert "security router" in revoked.output
