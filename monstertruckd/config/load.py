@@ -734,7 +734,8 @@ def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError
 def _first_mistake(data: Any, error: ValidationError) -> str:
     detail = error.errors(include_url=False)[0]
     key = ".".join(map(str, _data_key(data, detail["loc"])))
-    return f"{key}: {detail['msg'].removeprefix('Value error, ')}"
+    text = detail["msg"].removeprefix("Value error, ")
+    return f"{key}: {text}" if key else text
 
 
 def _sentence(detail: ErrorDetails, model: type[Schema], key: Key) -> str:

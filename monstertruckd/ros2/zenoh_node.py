@@ -5,6 +5,7 @@ import json
 import socket
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Self
 
@@ -227,6 +228,16 @@ class ZenohNode:
         """By publisher; filled by the thread that reads the network, emptied by the loop."""
         lock = threading.Lock()
 
+        publishers = 64  # publishers of the topic whose newest message may wait; further ones are lost
+        discovery = 1.0  # time for which a latched message may come before the token of its publisher, s
+        early: dict[bytes, RosArrival] = {}
+        """By publisher; a latched message is sent once, so that it waits for the token."""
+
+        def discovered(arrival: RosArrival) -> None:
+            if early.get(arrival.publisher) is arrival:
+                del early[arrival.publisher]
+                take(replace(arrival, sender=self._sender(arrival.publisher, name, interface, EntityKind.PUBLISHER)))
+
         def receive(sample: zenoh.Sample) -> None:
             try:
                 attachment = Attachment.parse(None if sample.attachment is None else sample.attachment.to_bytes())
@@ -236,8 +247,6 @@ class ZenohNode:
             with lock:
                 scheduled = bool(newest)
                 waiting = newest.get(attachment.gid)
-                # Publishers of a topic whose newest message may wait for the event loop; further ones are lost.
-                publishers = 64
                 if waiting is None and len(newest) >= publishers:
                     self.malformed += 1
                 elif waiting is None or attachment.sequence > waiting[0].sequence:
@@ -256,7 +265,13 @@ class ZenohNode:
                     self.malformed += 1
                     continue
                 sender = self._sender(attachment.gid, name, interface, EntityKind.PUBLISHER)
-                take(RosArrival(message, sender, attachment.gid, attachment.sequence, attachment.stamp))
+                arrival = RosArrival(message, sender, attachment.gid, attachment.sequence, attachment.stamp)
+                early.pop(attachment.gid, None)
+                if sender is None and qos.latched and len(early) < publishers:
+                    early[attachment.gid] = arrival
+                    self._loop.call_later(discovery, discovered, arrival)
+                else:
+                    take(arrival)
 
         self._token(EntityKind.SUBSCRIPTION, name, interface, qos)
         key, handler = self._key(name, interface), in_network_thread(receive)
