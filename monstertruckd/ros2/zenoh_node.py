@@ -4,10 +4,10 @@ import asyncio
 import json
 import socket
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import zenoh
 from zenoh import ext
@@ -35,6 +35,9 @@ from monstertruckd.ros2.rmw import (
     parsed_token,
     token_key,
 )
+
+PUBLISHERS: Final = 64
+"""Maximum number of a topic's publishers whose newest message waits; messages of further ones are lost."""
 
 
 def session_settings(connect: str | None, listen: str) -> dict[str, Any]:
@@ -72,6 +75,37 @@ def free_endpoint(listen: str) -> str:
                 continue
             return endpoint_of(protocol, host, probe.getsockname()[1])
     raise BusyError(f"ports {first} to {first + ports - 1} of {host} are taken: expected a free one (--listen)")
+
+
+class _Discovery:
+    """Hold a message that arrives before the token of its publisher: latched messages are sent only once.
+
+    Args:
+        loop: event loop.
+        sender_of: publisher with an identity; None if the graph has none.
+        deliver: takes the message, after at most a second.
+    """
+
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, sender_of: Callable[[bytes], RosSender | None], deliver: Take
+    ) -> None:
+        self._loop, self._sender_of, self._deliver = loop, sender_of, deliver
+        self._early: dict[bytes, RosArrival] = {}
+        """By publisher."""
+
+    def take(self, arrival: RosArrival) -> None:
+        """Deliver a message now or later; a newer one of its publisher replaces it."""
+        self._early.pop(arrival.publisher, None)
+        if arrival.sender is None and len(self._early) < PUBLISHERS:
+            self._early[arrival.publisher] = arrival
+            self._loop.call_later(1.0, self._discovered, arrival)
+        else:
+            self._deliver(arrival)
+
+    def _discovered(self, arrival: RosArrival) -> None:
+        if self._early.get(arrival.publisher) is arrival:
+            del self._early[arrival.publisher]
+            self._deliver(replace(arrival, sender=self._sender_of(arrival.publisher)))
 
 
 class ZenohNode:
@@ -227,16 +261,9 @@ class ZenohNode:
         newest: dict[bytes, tuple[Attachment, bytes]] = {}
         """By publisher; filled by the thread that reads the network, emptied by the loop."""
         lock = threading.Lock()
-
-        publishers = 64  # publishers of the topic whose newest message may wait; further ones are lost
-        discovery = 1.0  # time for which a latched message may come before the token of its publisher, s
-        early: dict[bytes, RosArrival] = {}
-        """By publisher; a latched message is sent once, so that it waits for the token."""
-
-        def discovered(arrival: RosArrival) -> None:
-            if early.get(arrival.publisher) is arrival:
-                del early[arrival.publisher]
-                take(replace(arrival, sender=self._sender(arrival.publisher, name, interface, EntityKind.PUBLISHER)))
+        sender_of = partial(self._sender, topic=name, interface=interface, kind=EntityKind.PUBLISHER)
+        if qos.latched:
+            take = _Discovery(self._loop, sender_of, take).take
 
         def receive(sample: zenoh.Sample) -> None:
             try:
@@ -247,7 +274,7 @@ class ZenohNode:
             with lock:
                 scheduled = bool(newest)
                 waiting = newest.get(attachment.gid)
-                if waiting is None and len(newest) >= publishers:
+                if waiting is None and len(newest) >= PUBLISHERS:
                     self.malformed += 1
                 elif waiting is None or attachment.sequence > waiting[0].sequence:
                     newest[attachment.gid] = attachment, sample.payload.to_bytes()
@@ -264,14 +291,8 @@ class ZenohNode:
                 except InputError:
                     self.malformed += 1
                     continue
-                sender = self._sender(attachment.gid, name, interface, EntityKind.PUBLISHER)
-                arrival = RosArrival(message, sender, attachment.gid, attachment.sequence, attachment.stamp)
-                early.pop(attachment.gid, None)
-                if sender is None and qos.latched and len(early) < publishers:
-                    early[attachment.gid] = arrival
-                    self._loop.call_later(discovery, discovered, arrival)
-                else:
-                    take(arrival)
+                sender = sender_of(attachment.gid)
+                take(RosArrival(message, sender, attachment.gid, attachment.sequence, attachment.stamp))
 
         self._token(EntityKind.SUBSCRIPTION, name, interface, qos)
         key, handler = self._key(name, interface), in_network_thread(receive)
