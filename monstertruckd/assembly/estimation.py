@@ -230,9 +230,11 @@ def _build_points(
             slam=None if slam is None else bus.subscribe(topics.SLAM, latest()),
             attitude=None if config.devices.compass is None else bus.subscribe(topics.COMPASS, latest()),
             gate=bus.subscribe(topics.GATE, latest()),
+            behaviour=bus.subscribe(topics.BEHAVIOUR, latest()),
         ),
         ask=None if mapper is None else mapper.bases_at,
         out=bus.publisher(topics.POINTS, Writer.ESTIMATION),
+        tags=bus.publisher(topics.TAGS, Writer.ESTIMATION),
         events=bus.event_sink(),
         folders=PointFolders(
             load=None if mapping else folder,

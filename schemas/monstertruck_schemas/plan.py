@@ -181,6 +181,10 @@ class GoalState(Message):
         return f"goal {self.number} of {self.source} is pursued"
 
 
+DOCK: Final = "dock"
+"""Kind of the behaviour that docks: while it runs, every image is searched for tags."""
+
+
 class BehaviourState(Message):
     """Progress of a behaviour, in the ``frame`` of odometry."""
 

@@ -57,6 +57,28 @@ class PointOfInterest(Schema):
         return Pose2D(x=x, y=y, yaw=math.remainder(self.yaw + math.pi, math.tau))
 
 
+class TagPose(Schema):
+    """Pose of a tag in the ``frame`` of the message."""
+
+    tag: Annotated[int, Field(ge=0)]
+    """Number of the tag."""
+    x: float
+    """Centre (m)."""
+    y: float
+    z: float
+    """Height above base (m)."""
+    yaw: float
+    """Direction that it faces (rad)."""
+    covariance: Covariance
+    """Shape (9,), row-major, of (x, y, yaw): m^2, m rad, rad^2."""
+
+
+class TagPoses(Message):
+    """Tags in one image, in base at the stamp of the image."""
+
+    tags: tuple[TagPose, ...] = ()
+
+
 class PointsOfInterest(Message):
     """All known points, in the order of discovery."""
 

@@ -37,7 +37,7 @@ from monstertruck_schemas.plan import (
     StabiliserCommand,
     TrackerState,
 )
-from monstertruck_schemas.points import PointsOfInterest
+from monstertruck_schemas.points import PointsOfInterest, TagPoses
 from monstertruck_schemas.req import (
     ControlRequest,
     DriveRequest,
@@ -237,6 +237,10 @@ POINTS: Final = Topic(
     "Points of interest in map: tags that the camera found, places that were marked",
     retained=True,
 )
+TAGS: Final = Topic(
+    "state/tags", TagPoses, W.ESTIMATION, "Poses of the tags in an image, in base; of every image that was read", 5,
+    stale_after=1.0,
+)  # fmt: skip
 ZONES: Final = Topic(
     "state/zones",
     Zones,

@@ -53,6 +53,8 @@ class TagReading:
     """Contrast of the worst cell."""
     angle: float
     """Angle from the tag's normal to the camera (rad)."""
+    spread: tuple[float, ...]
+    """Covariance of centre and normal, row-major (6, 6), by the corners alone."""
     picture: bytes = b""
     """JPEG of the tag and its surroundings."""
 

@@ -2,8 +2,12 @@
 
 The pose of a tag is its square's (Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014;
 in OpenCV ``SOLVEPNP_IPPE_SQUARE``). It has two solutions: from afar, a small square turned to either side looks the
-same.
+same. Both are refined to the minimum of the reprojection error before they are compared: unrefined, the slant of a tag
+seen from its front scatters about nine times as much.
 """
+
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -61,33 +65,74 @@ def decode_margin(grey: Picture, sighting: Sighting, family: TagFamily = "36h11"
     return float(np.where(white, share, -share).min())
 
 
+CORNER_DEVIATION: Final = 0.25
+"""Standard deviation of a corner (pixels)."""
+
+
+class _Fit(NamedTuple):
+    """A pose of a tag that fits its corners."""
+
+    turn: Array
+    """Rotation vector (3,)."""
+    place: Array
+    """Centre (3,), m."""
+    error: float
+    """Root mean square of the reprojection error (pixels)."""
+    jacobian: Array
+    """Derivatives (8, 6) of the corners by rotation vector and place."""
+
+
 def placed(sighting: Sighting, size: float, lens: Lens, margin: float) -> TagReading | None:
     """Return a tag relative to the camera; None if no pose fits."""
     half = size / 2
     square = np.array(((-half, half, 0), (half, half, 0), (half, -half, 0), (-half, -half, 0)))
-    count, rotations, places, errors = cv2.solvePnPGeneric(
+    count, turns, places, _ = cv2.solvePnPGeneric(
         square, sighting.corners.reshape(4, 1, 2), lens.matrix, lens.distortion, flags=cv2.SOLVEPNP_IPPE_SQUARE
     )
-    if not count:
+    found = [
+        _refined(square, sighting.corners, lens, *pose) for pose in zip(turns[:count], places[:count], strict=True)
+    ]
+    fits = sorted(
+        (fit for fit in found if np.isfinite(fit.place).all() and fit.place[2] > 0), key=lambda fit: fit.error
+    )
+    if not fits:
         return None
-    middle = np.asarray(places[0], dtype=np.float64).ravel()
-    if not np.isfinite(middle).all() or middle[2] <= 0:
-        return None
-    normals = [np.asarray(cv2.Rodrigues(turn)[0])[:, 2] for turn in rotations[:count]]
-    fits = [float(np.ravel(error)[0]) for error in errors[:count]]
-    pixel = 0.25  # standard deviation of a corner, pixels
-    doubt = 0.0 if count < 2 else min(1.0, (fits[0] + pixel) / (fits[1] + pixel))
-    away = middle / np.linalg.norm(middle)
+    best, other = fits[0], fits[-1]
+    alone = bool(np.allclose(best.turn, other.turn, atol=1e-3))  # both were refined to the same pose
+    doubt = 0.0 if alone else (best.error + CORNER_DEVIATION) / (other.error + CORNER_DEVIATION)
+    normal, spread = _normal(best)
+    away = best.place / np.linalg.norm(best.place)
     return TagReading(
         sighting.tag,
-        _triple(middle),
-        _triple(normals[0]),
-        _triple(normals[-1]),
+        _triple(best.place),
+        _triple(normal),
+        _triple(_normal(other)[0]),
         doubt,
         sighting.size,
         margin,
-        float(np.arccos(np.clip(-away @ normals[0], -1.0, 1.0))),
+        float(np.arccos(np.clip(-away @ normal, -1.0, 1.0))),
+        tuple(spread.ravel().tolist()),
     )
+
+
+def _refined(square: Array, corners: Array, lens: Lens, turn: Array, place: Array) -> _Fit:
+    """Return the pose with the minimum reprojection error near a pose."""
+    turn, place = cv2.solvePnPRefineLM(
+        square, corners.reshape(4, 1, 2), lens.matrix, lens.distortion, turn.copy(), place.copy()
+    )
+    points, jacobian = cv2.projectPoints(square, turn, place, lens.matrix, lens.distortion)
+    error = float(np.sqrt(((points.reshape(4, 2) - corners) ** 2).sum(axis=1).mean()))
+    return _Fit(np.ravel(turn).astype(np.float64), np.ravel(place).astype(np.float64), error, jacobian[:, :6])
+
+
+def _normal(fit: _Fit) -> tuple[Array, Array]:
+    """Return the normal (3,) of a tag, and the covariance (6, 6) of its centre and normal."""
+    turned, slopes = cv2.Rodrigues(fit.turn)
+    by_pose = np.zeros((6, 6))
+    by_pose[:3, 3:] = np.eye(3)
+    by_pose[3:, :3] = slopes.T.reshape(3, 3, 3)[:, 2]  # OpenCV: row i is the derivative by the vector's part i
+    pose = np.linalg.pinv(fit.jacobian.T @ fit.jacobian) * CORNER_DEVIATION**2
+    return np.asarray(turned)[:, 2], by_pose @ pose @ by_pose.T
 
 
 def _with_picture(reading: TagReading, colour: Array, sighting: Sighting) -> TagReading:
@@ -100,10 +145,7 @@ def _with_picture(reading: TagReading, colour: Array, sighting: Sighting) -> Tag
     if scale < 1.0:
         part = np.asarray(cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
     _, data = cv2.imencode(".jpg", part, (cv2.IMWRITE_JPEG_QUALITY, 80))
-    return TagReading(
-        reading.tag, reading.middle, reading.normal, reading.other_normal, reading.doubt, reading.pixels,
-        reading.margin, reading.angle, data.tobytes(),
-    )  # fmt: skip
+    return replace(reading, picture=data.tobytes())
 
 
 def _triple(values: Array) -> Triple:

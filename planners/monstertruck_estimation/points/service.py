@@ -1,4 +1,8 @@
-"""Points of interest service: passes images to the reading worker, and turns readings into objects of the map."""
+"""Points of interest service: passes images to the reading worker, and turns readings into objects of the map.
+
+The poses of the tags in each image are published, too. While the robot docks, every image is read, also of a robot that
+stands or does not know its pose in the map.
+"""
 
 import asyncio
 import base64
@@ -14,6 +18,7 @@ import numpy as np
 from monstertruck_estimation.points import files
 from monstertruck_estimation.points.config import PointsConfig
 from monstertruck_estimation.points.exchange import ReadAnswer, ReadTask
+from monstertruck_estimation.points.poses import tag_pose
 from monstertruck_estimation.points.tracking import Bases, PointMap, PoseAsker, nearest
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, between, compose
@@ -28,7 +33,8 @@ from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.body import LensConfig, Mount
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import NO_PLACE, SlamHealth
-from monstertruck_schemas.points import PointOrder, PointRequest, PointsOfInterest
+from monstertruck_schemas.plan import DOCK, BehaviourState
+from monstertruck_schemas.points import PointOrder, PointRequest, PointsOfInterest, TagPoses
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole, ServiceName
 from monstertruck_schemas.sensor import Attitude, CompressedImage
@@ -57,6 +63,7 @@ class PointInputs:
     slam: Subscription[SlamHealth] | None
     attitude: Subscription[Attitude] | None
     gate: Subscription[GateState]
+    behaviour: Subscription[BehaviourState] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +96,7 @@ class PointService:
         inputs: topics read.
         ask: returns the robot's past poses; None if the map does not move.
         out: ``state/points``.
+        tags: ``state/tags``.
         events: receives finds and failures.
         folders: folders of the map.
         save_map: requests that this run's map is saved as soon as possible; None if the map is known.
@@ -108,6 +116,7 @@ class PointService:
         inputs: PointInputs,
         ask: PoseAsker | None,
         out: Publisher[PointsOfInterest],
+        tags: Publisher[TagPoses],
         events: EventSink,
         folders: PointFolders,
         save_map: Callable[[], object] | None,
@@ -115,7 +124,8 @@ class PointService:
         max_age: float,
     ) -> None:
         self._config, self._clock, self._actor, self._in = config, clock, actor, inputs
-        mount, self._lens = (Mount(), LensConfig()) if camera is None else camera
+        mount, self._lens = self._mount, _ = (Mount(), LensConfig()) if camera is None else camera
+        self._tags = tags
         self._ask, self._out, self._events, self._folders = ask, out, events, folders
         self._save_map, self._offload = save_map, offload
         self._map_saved = False
@@ -160,7 +170,8 @@ class PointService:
                 continue
             newest = picture.stamp
             placed = await self._placed(picture.stamp)
-            if placed is None or not self._is_level() or not self._worth(placed.pose):
+            useful = placed is not None and self._is_level() and self._worth(placed.pose)
+            if not (useful or self._docks()):
                 continue
             try:
                 answer: ReadAnswer = await actor.step(ReadTask.of(picture.data, self._lens, self._config))
@@ -168,7 +179,18 @@ class PointService:
                 self._events(error.reason, Severity.ERROR, self.name, str(error))
                 await self._clock.sleep(2.0)  # seconds after which a failed worker is retried
                 continue
-            self._take(answer, placed)
+            self._publish_tags(answer, picture)
+            if useful and placed is not None:
+                self._take(answer, placed)
+
+    def _docks(self) -> bool:
+        behaviour = None if self._in.behaviour is None else self._in.behaviour.latest
+        return behaviour is not None and behaviour.running and behaviour.kind == DOCK
+
+    def _publish_tags(self, answer: ReadAnswer, picture: CompressedImage) -> None:
+        tags = tuple(tag_pose(reading, self._mount) for reading in answer.readings)
+        seq = self._tags.next_seq()
+        self._tags.put(TagPoses(stamp=picture.stamp, received=self._clock.now(), seq=seq, frame="base", tags=tags))
 
     def _take(self, answer: ReadAnswer, placed: _Placed) -> None:
         if answer.unreadable and not self._unreadable:

@@ -58,6 +58,7 @@ class Rig:
 
     def __init__(self, clock, folder, ask=None, load=None, standing=None, run=None, save_map=None) -> None:
         self.clock, self.out, self.events, self.seq, self.speed = clock, Kept(), [], 0, 0.05
+        self.tags, self.behaviour = Kept(), SimpleNamespace(latest=None)
         self.camera, self.pose, self.felt = Mailbox(latest()), Mailbox(fifo(256)), Mailbox(latest())
         self.gate = SimpleNamespace(latest=SimpleNamespace(nonce="n", stamp=0))
         self.calls = Calls()
@@ -65,7 +66,8 @@ class Rig:
         self.service = PointService(
             PointsConfig(), (Mount(x=0.18, z=0.25), LensConfig(k1=-0.15, k2=0.03)), clock,
             LoopActor(TARGET, clock, 0.05),
-            inputs=PointInputs(self.camera, self.pose, slam, self.felt, self.gate), ask=ask, out=self.out,
+            inputs=PointInputs(self.camera, self.pose, slam, self.felt, self.gate, self.behaviour), ask=ask,
+            out=self.out, tags=self.tags,
             events=lambda reason, *args, **_: self.events.append((reason, args[-1])),
             folders=PointFolders(load=load, save=folder, run=run), save_map=save_map, offload=inline, max_age=5.0,
         )  # fmt: skip
@@ -312,3 +314,24 @@ def test_a_robot_that_is_lost_marks_no_place_of_its_own_and_reads_no_tags(tmp_pa
 
     rig = run_scenario(story, tmp_path, standing=LocalisationStatus.LOST)
     assert [point.name for point in rig.out[-1].points] == ["there"]
+
+
+def test_a_robot_that_docks_reads_every_image_and_publishes_the_poses_of_its_tags(tmp_path):
+    """Standing, tilted: no place for a point of the map."""
+
+    async def story(rig: Rig) -> None:
+        rig.speed = 0.0
+        await rig.drive(2.0, tilt=0.5)
+        assert not rig.tags
+        rig.behaviour.latest = SimpleNamespace(running=True, kind="dock")
+        await rig.drive(2.0, tilt=0.5)
+
+    rig = run_scenario(story, tmp_path)
+    assert len(rig.tags) > 7
+    assert not [message for message in rig.out if message.points]
+    for message in rig.tags:
+        (tag,) = message.tags
+        assert message.frame == "base"
+        assert message.received > message.stamp
+        assert (tag.tag, tag.x, tag.y, tag.z) == pytest.approx((3, 1.18, 0.1, 0.3), abs=0.03)
+        assert tag.covariance.reshape(3, 3)[0, 0] < 0.03**2

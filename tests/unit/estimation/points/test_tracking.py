@@ -39,6 +39,7 @@ def reading(base, tag=TAG, number=7, **more) -> TagReading:
         "pixels": 40.0,
         "margin": 0.8,
         "angle": 0.2,
+        "spread": (0.0,) * 36,
         "picture": b"\xff\xd8x",
     }
     return TagReading(number, tuple(turned @ place), normal, **(values | more))
