@@ -323,7 +323,7 @@ WAYS: Final[dict[str, Callable[[], list[str]]]] = {
 
 
 def main() -> None:
-    """Print the table of ``docs/architecture.md``."""
+    """Print the number of files on each path as a table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--files", action="store_true", help="list the files of each way")
     arguments = parser.parse_args()

@@ -1,7 +1,7 @@
-"""ROS 2 nodes as operators of the robot: what each may ask, under a name of its own.
+"""ROS 2 nodes as operators of the robot, each under its own name.
 
-ROS 2 has neither leases nor priorities nor nonces: a face that only forwarded would take away what the gate protects.
-So every node is a source of its own, with its own session; a message that could be old, a repetition or from an unknown
+ROS 2 has neither leases nor priorities nor nonces: a plain forwarder would bypass the protections of the gate.
+So every node is a separate source, with its own session; a message that could be old, a repetition or from an unknown
 publisher is refused here, and all that passes is judged by the gate as any operator's request is.
 """
 
@@ -19,7 +19,7 @@ from monstertruckd.ros2.cdr import RosMessage
 from monstertruckd.ros2.node import RosArrival, RosSender
 
 LEASE: Final = 0.25
-"""Seconds for which a message that drives stands; nothing repeats it."""
+"""Validity of a drive message, s; the face never repeats it."""
 
 RosOrder = Callable[[TruckClient], Awaitable[Any]]
 """Asks the robot for something."""
@@ -30,7 +30,7 @@ def source_of(node: str, owner: str | None = None) -> str:
 
     Args:
         node: qualified name.
-        owner: common name of the certificate, to which the robot binds sources.
+        owner: common name of the certificate; the robot binds sources to it.
     """
     name = re.sub(r"[^A-Za-z0-9_.-]", ".", node.strip("/")) or "node"
     before = "ros2" if owner is None else f"{owner}:ros2"
@@ -44,7 +44,7 @@ def stamp_of(time: RosMessage) -> int:
 
 def _require_recent(what: str, stamp: int, now: int) -> None:
     difference = (now - stamp) / SECOND
-    max_age = 0.5  # seconds by which a stamp may differ from this clock: as old as a request may be for the gate
+    max_age = 0.5  # maximum difference of a stamp from this clock, s: the gate's limit for the age of a request
     if abs(difference) > max_age:
         side = "behind" if difference > 0.0 else "ahead of"
         raise InputError(
@@ -59,7 +59,7 @@ def check_arrival(arrival: RosArrival, now: int, newest: dict[bytes, int]) -> No
     Args:
         arrival: of a known publisher.
         now: real time, ns.
-        newest: sequence numbers by publisher; gets that of the message.
+        newest: latest sequence numbers by publisher; updated with the message.
 
     Raises:
         InputError: why it is refused.
@@ -72,10 +72,10 @@ def check_arrival(arrival: RosArrival, now: int, newest: dict[bytes, int]) -> No
 
 
 def check_age(what: str, header: RosMessage, now: int) -> None:
-    """Accept the stamp of a header; 0 says nothing.
+    """Accept the stamp of a header; 0 means no stamp.
 
     Args:
-        what: what it is in the refusal.
+        what: name of the message in the refusal.
         header: ``std_msgs/msg/Header``.
         now: real time, ns.
 
@@ -126,7 +126,7 @@ class RosOperator:
     client: TruckClient
     exit: AsyncExitStack
     waiting: RosOrder | None = None
-    """Newest request to drive that is not sent yet."""
+    """Latest request to drive that is not sent yet."""
     task: asyncio.Task[None] | None = None
 
 
@@ -154,7 +154,7 @@ class Operators:
         self._operators: dict[RosSender, RosOperator] = {}
         self._opening: dict[RosSender, asyncio.Task[RosOperator]] = {}
         self._sequences: dict[RosSender, dict[bytes, int]] = {}
-        """Newest sequence number of every publisher."""
+        """Latest sequence number of every publisher."""
         self._asking: set[asyncio.Task[None]] = set()
         self.refused = 0
         """Messages and requests that were refused here."""
@@ -172,7 +172,7 @@ class Operators:
         self._report(node, self.last_refusal)
 
     def accepted(self, what: str, arrival: RosArrival, check: Callable[[int], None]) -> RosSender | None:
-        """Sender of a message that may be carried out; None = it is refused, which is reported.
+        """Return the sender of an accepted message; None after a reported refusal.
 
         Args:
             what: name of the topic.
@@ -193,7 +193,7 @@ class Operators:
         return sender
 
     def drive(self, sender: RosSender, what: str, order: RosOrder) -> None:
-        """Have a node's request to drive sent; of several that wait only the newest is.
+        """Have a node's request to drive sent; if several wait, only the latest is sent.
 
         Requests that come while the node's session is opened are not sent: they would be old by then.
         """
@@ -223,7 +223,7 @@ class Operators:
         self.run(sender.node, what, carry_out())
 
     def run(self, node: str, what: str, work: Coroutine[Any, Any, Any]) -> None:
-        """Have ``work`` done; a refusal is reported as that of the node."""
+        """Have ``work`` done; a refusal is reported under the node's name."""
 
         async def reported() -> None:
             try:

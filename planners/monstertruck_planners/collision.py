@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 OCCUPIED = 50
-"""Occupancy, percent, from which a grid cell is an obstacle."""
+"""Minimum occupancy of an obstacle cell, percent."""
 
 
 UnitTwist = tuple[float, float, float]
@@ -101,7 +101,7 @@ class Footprint:
         return centres, math.hypot(half, self.half_width)
 
     def data(self) -> "FootprintData":
-        """What the numba functions take."""
+        """Arguments of the numba functions."""
         from monstertruck_planners.collision_kernels import FootprintData  # noqa: PLC0415 - workers only
 
         discs, radius = self.covering_discs()
@@ -143,7 +143,7 @@ class DiscFootprint:
         return max(self.radius - min(map(abs, self.centres)), 0.0)
 
     def data(self) -> "FootprintData":
-        """What the numba functions take."""
+        """Arguments of the numba functions."""
         from monstertruck_planners.collision_kernels import FootprintData  # noqa: PLC0415 - workers only
 
         reach = max(map(abs, self.centres))
@@ -229,7 +229,7 @@ def on_body(body: Footprint, points: Array, margin: float) -> NDArray[np.bool_]:
 def first_contact(
     footprint: Footprint, poses: Array, points: Array, margin: float = 0.0, leaving: Array | None = None
 ) -> int | None:
-    """Index of the first pose at which the moving footprint comes within ``margin`` of a point.
+    """Return the index of the first pose whose footprint comes within ``margin`` of a point.
 
     A point that is no nearer than it was at the first pose is no obstacle to this motion: a truck that stands at a
     wall may leave it. Sideways it still comes nearer to points of the wall that it had ahead: with ``leaving`` these
@@ -238,7 +238,7 @@ def first_contact(
 
     Args:
         footprint: the rectangle.
-        poses: shape (m, 3), in the order driven, the first one being the present pose.
+        poses: shape (m, 3), in the order driven, the first one being the current pose.
         points: shape (n, 2), same frame.
         margin: m.
         leaving: shape (m,), m; None: the margin counts for all points that come nearer.
@@ -347,7 +347,7 @@ def scan_points_at(
 
 
 class ScanPoints:
-    """``scan_points`` of the newest scan, computed once and shared; read-only.
+    """``scan_points`` of the latest scan, computed once and shared; read-only.
 
     Args:
         mount: pose (x, y, yaw) of the lidar in base, m, m, rad.
@@ -367,7 +367,7 @@ class ScanPoints:
 def boxes_of(mask: NDArray[np.bool_]) -> "list[Box]":
     """Boxes that hold all marked cells of a grid (rows, columns), one for each square of 64 by 64 cells with any."""
     boxes = []
-    tile = 64  # edge of the squares by which changes of a grid are found, cells
+    tile = 64  # edge of the compared squares of a grid, cells
     for row in np.flatnonzero(np.logical_or.reduceat(mask.any(axis=1), np.arange(0, len(mask), tile))) * tile:
         strip = mask[row : row + tile]
         columns = np.arange(0, mask.shape[1], tile)
@@ -415,7 +415,7 @@ class DistanceField:
         self._occupied: NDArray[np.bool_] = np.pad(occupied, 1, constant_values=True)
         self._distance: NDArray[np.float32]
         self.changes: list[Box] | None = None
-        """Parts of the grid with its ring in which the field may differ from ``previous``; None: everywhere."""
+        """Parts of the grid with its ring whose field may differ from ``previous``; None: everywhere."""
         if previous is not None and previous.same_place(self._occupied.shape, resolution, origin):
             self._update(previous)
         else:
@@ -467,7 +467,7 @@ class DistanceField:
         return cls(occupied, grid.resolution, (grid.origin.x, grid.origin.y, grid.origin.yaw))
 
     def data(self) -> "FieldData":
-        """What the numba functions take: the grid with its ring."""
+        """Arguments of the numba functions: the grid with its ring."""
         from monstertruck_planners.collision_kernels import FieldData  # noqa: PLC0415 - workers only
 
         x, y, yaw = self.origin
@@ -515,7 +515,7 @@ class DistanceField:
         Args:
             footprint: the truck.
             poses: shape (m, 3), in the grid's parent frame.
-            most: what is looked for, m.
+            most: maximum distance of the search, m.
             step: m.
 
         Returns:

@@ -1,6 +1,6 @@
-"""Missions: steps that a robot does one after the other, and steps that decide which of others are done.
+"""Missions: steps that a robot executes in sequence, and steps that choose among others.
 
-The steps that contain others, and conditions, are named like the nodes of behaviour trees (BehaviorTree.CPP, py_trees).
+Steps that contain others, and conditions, have the names of the nodes of behaviour trees (BehaviorTree.CPP, py_trees).
 """
 
 from typing import Annotated, Final, Literal, Self
@@ -27,7 +27,7 @@ DEEPEST: Final = 8
 
 
 class Condition(Schema):
-    """A state of the robot; it holds if all its keys do. What the robot does not know does not hold."""
+    """A state of the robot; it holds if all its keys do. An unknown value does not hold."""
 
     battery_below: Percent | None = None
     """Charge of the battery below this value, %"""
@@ -60,9 +60,9 @@ class MissionStep(Schema):
     retries: Annotated[int, Field(ge=0, le=20)] = 0
     """How often it is tried again before it has failed"""
     on_failure: Policy | None = None
-    """What follows then; null = as the mission says, or abort within another step"""
+    """Reaction to the failure; null: that of the mission, or abort within another step"""
     limit: Seconds | None = None
-    """Seconds after which an attempt has failed; null = none but its own"""
+    """Timeout of an attempt, s; null: only the step's own"""
 
 
 class GoToStep(MissionStep):
@@ -166,7 +166,7 @@ class WaitUntilStep(MissionStep):
 
 
 class SequenceOfSteps(MissionStep):
-    """Do steps one after the other; fails with the first that fails."""
+    """Do steps in sequence; fails with the first that fails."""
 
     do: Literal["sequence"]
     steps: "Steps"
@@ -208,7 +208,7 @@ class BranchStep(MissionStep):
 
 
 class MissionWatch(Schema):
-    """What interrupts a parallel step as soon as a condition holds."""
+    """Interruption of a parallel step as soon as a condition holds."""
 
     when: Condition
     then: "Steps"
@@ -256,7 +256,7 @@ class Mission(Schema):
     version: Literal[2]
     name: Name
     on_failure: Policy = "abort"
-    """What follows a step that failed, unless it is within another step"""
+    """Reaction to a failed step that is not within another step"""
     steps: Steps
 
     @model_validator(mode="after")

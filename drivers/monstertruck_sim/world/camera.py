@@ -1,6 +1,6 @@
-"""What the truck's camera sees in the plane: walls as columns, tags and people as flat panels, through a lens.
+"""View of the truck's camera in the plane: walls as columns, tags and people as flat panels, through a lens.
 
-A pixel's ray is that of the camera's true lens (radial distortion as of Brown) and mount; the ground is level. A panel
+A pixel's ray follows the camera's true lens (radial distortion as of Brown) and mount; the ground is level. A panel
 is sampled by several rays in each pixel, so that a far tag blurs as it does on a real sensor.
 """
 
@@ -38,7 +38,7 @@ _GRAIN: Final = 64
 
 
 class CameraPlace(NamedTuple):
-    """Where the camera is at an instant."""
+    """Pose of the camera at an instant."""
 
     centre: Array
     """(3,): of the lens, in the map and over the ground, m."""
@@ -65,7 +65,7 @@ class FlatPanel(NamedTuple):
 
 
 class Holder(Protocol):
-    """Somebody who holds a board before a camera."""
+    """Person who holds a board before a camera."""
 
     def panel_at(self, time_ns: int, place: CameraPlace, /) -> FlatPanel:
         """The board at an instant, before a camera at ``place``."""
@@ -89,14 +89,14 @@ class SimulatedView:
     """``ViewSource``: the scene around a camera that is fixed to the robot.
 
     Args:
-        plant: what carries it.
+        plant: carrier of the camera.
         cast: ranges to walls, things, people and robots.
         config: lens, mount and noise.
         tags: on the walls.
         crowd: who walks around.
         holder: holds a board before it.
         wall_height: m.
-        seed: of the noise; None = none.
+        seed: of the noise; None: no noise.
 
     Raises:
         NotInstalledError: tags need the extra ``vision``.
@@ -144,7 +144,7 @@ class SimulatedView:
         return lambda: grain(painter.picture(ranges, panels, place))
 
     def board_at(self, time_ns: int) -> FlatPanel | None:
-        """The board that somebody holds before it; None = nobody does."""
+        """The board that a person holds before it, or None."""
         return None if self._holder is None else self._holder.panel_at(time_ns, self._place(time_ns))
 
     def _place(self, time_ns: int) -> CameraPlace:
@@ -170,7 +170,7 @@ class SimulatedView:
         for panel in self._panels:
             away = panel.corner + (panel.right + panel.down) / 2 - place.centre
             front = np.cross(panel.down, panel.right)
-            # 12.0: panels farther away are not drawn, m: a tag of 10 cm is 4 pixels there
+            # 12.0: panels further away are not drawn, m: a tag of 10 cm is 4 pixels there
             if away @ place.axes[2] > 0.05 and away @ front < 0 and (far := float(np.linalg.norm(away))) < 12.0:
                 found.append((far, panel))
         return [panel for _, panel in sorted(found, key=lambda row: -row[0])]
@@ -211,14 +211,14 @@ class Painter:
             self._along = np.cos(fan).astype(np.float32)
         self._fan = fan
         self.azimuths: Array = fan + config.yaw
-        """Directions in which ranges are needed, from the robot's axis, rad; falling."""
+        """Directions of the needed ranges, from the robot's axis, rad; falling."""
         depth = np.minimum(np.abs(slope) * self._focal / (height / 2), 1.0) * 63
         ground = (np.where(slope > 0, FLOOR, SKY) + depth).astype(np.uint8)
         self._column, self._slope, self._ground = (
             np.array(np.broadcast_to(part, (height, width)), order="C")
             for part in (column.astype(np.int32), slope, ground)
         )
-        """Of every pixel: its azimuth's place in the fan, how far it looks down, its shade where no wall is."""
+        """Map of every pixel: place of its azimuth in the fan, slope, and shade where no wall is."""
 
     def picture(self, ranges: Array, panels: Sequence[FlatPanel], place: CameraPlace) -> Picture:
         """Draw.
@@ -229,7 +229,7 @@ class Painter:
             place: of the camera.
         """
         depth = np.maximum(ranges * self._along, 0.05).astype(np.float32)
-        shade = (WALLS + 127 / (1 + depth / 4.0)).astype(np.uint8)  # metres at which a wall is half as bright
+        shade = (WALLS + 127 / (1 + depth / 4.0)).astype(np.uint8)  # distance of half brightness, m
         edges = -self._above / depth, self._below / depth
         picture: Picture = _painted(self._slope, self._column, *edges, shade, self._ground, _palette())
         for panel in panels:
@@ -284,7 +284,7 @@ class Painter:
         azimuths = np.angle(np.exp(1j * (np.arctan2(points[..., 1], points[..., 0]) - ahead)))
         fan = self._fan
         at = np.clip(np.searchsorted(-fan, -azimuths), 0, len(fan) - 1)
-        # 0.08: a panel this far behind what the rays meet is still before it: it hangs on it, m
+        # 0.08: a panel up to this far behind a wall hangs on it, so it is drawn before it, m
         found: NDArray[np.bool_] = np.hypot(points[..., 0], points[..., 1]) < ranges[at] + 0.08
         return found
 
@@ -301,7 +301,7 @@ class Painter:
         return wider, np.stack((right / wider + (width - 1) / 2, down / wider + (height - 1) / 2), axis=-1)
 
     def _bent(self, right: Array, down: Array) -> Array:
-        """Where the lens puts directions, in focal lengths, (n, 2)."""
+        """Return the image points of directions, in focal lengths, (n, 2)."""
         square = right**2 + down**2
         factor = 1 + self._config.k1 * square + self._config.k2 * square**2
         return np.stack((right * factor, down * factor), axis=-1)
@@ -319,7 +319,7 @@ class Painter:
 
 
 def compile_kernels() -> None:
-    """Compile what draws, where that is not done yet: a second in which nothing else runs in this process."""
+    """Compile the drawing functions unless done before; blocks the process for about a second."""
     config = CameraConfig()
     picture = Painter(config, (2, 2), 0.6).picture(np.ones(2), (), mounted((0.0, 0.0, 0.0), config))
     _grainy(picture, 0, 1.0, 0, 0)
@@ -380,7 +380,7 @@ def tag_axes(yaw: float, *, lies: bool) -> tuple[Array, Array]:
 
 
 def person_panel(x: float, y: float, radius: float, place: CameraPlace) -> FlatPanel:
-    """Somebody, turned to the camera."""
+    """Person, turned to the camera."""
     texture, opaque = _person()
     toward = place.centre[:2] - (x, y)
     toward = toward / max(hypot(*toward), 1e-6)
@@ -392,7 +392,7 @@ def person_panel(x: float, y: float, radius: float, place: CameraPlace) -> FlatP
 
 @cache
 def _person() -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Texture and outline of somebody: 2 cm a pixel at a radius of 0.2 m."""
+    """Texture and outline of a person: 2 cm a pixel at a radius of 0.2 m."""
     rows, columns = np.mgrid[0:85, 0:20]
     head = ((rows - 7) / 7.5) ** 2 + ((columns - 9.5) / 5.5) ** 2 < 1
     trunk = (rows >= 15) & (rows < 46) & (np.abs(columns - 9.5) < 9.6 - np.maximum(0, 18 - rows))
@@ -420,7 +420,7 @@ def _grainy(picture: Picture, seed: int, noise: float, row: int, column: int) ->
 
 @njit(cache=True)
 def _added(picture: Picture, grain: NDArray[np.int16], row: int, column: int) -> Picture:
-    """With the part of the grain that begins at (row, column), the same in all colours."""
+    """Add the part of the grain that begins at (row, column), the same in all colours."""
     height, width, colours = picture.shape
     noisy = np.empty_like(picture)
     for i in range(height):
@@ -441,7 +441,7 @@ def _painted(
     ground: NDArray[np.uint8],
     palette: NDArray[np.uint8],
 ) -> Picture:
-    """Colours of pixels (height, width): of the wall in their column of the fan between its slopes, or the ground's."""
+    """Colours of pixels (height, width): wall in their column of the fan between its slopes, or ground."""
     height, width = slope.shape
     picture = np.empty((height, width, 3), np.uint8)
     for i in range(height):

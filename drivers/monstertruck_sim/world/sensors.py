@@ -1,4 +1,4 @@
-"""What the devices' sensing elements feel: the physics behind the emulators."""
+"""Physics of the devices' sensing elements, behind the emulators."""
 
 from collections.abc import Callable
 from math import atan2, degrees, hypot, pi, radians
@@ -78,7 +78,7 @@ class UnevenGround(Protocol):
         """Metres at points in the map frame; all of one shape."""
 
     def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
-        """Horizontal distances at which beams from points meet it; inf = not within ``reach``; all (n,)."""
+        """Horizontal distances along beams from points; inf beyond ``reach``; all (n,)."""
 
 
 class PlaneSweep:
@@ -97,7 +97,7 @@ class PlaneSweep:
         self._cast, self._terrain, self._config = cast, terrain, config
 
     def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64], reach: float) -> Array:
-        """As ``Sweep``."""
+        """Implements ``Sweep``."""
         x, y, yaw, pitch, roll, _ = poses
         xs, ys = self._places(x, y, yaw)
         # 1e-4: tilt of a level robot at most, rad
@@ -109,7 +109,7 @@ class PlaneSweep:
         return self._over(self._terrain, poses, beams, times_ns, reach)
 
     def _places(self, x: Array, y: Array, yaw: Array) -> tuple[Array, Array]:
-        """Of the mount in the map frame where the body is at (x, y, yaw)."""
+        """Pose of the mount in the map frame for a body at (x, y, yaw)."""
         ahead, aside, c, s = self._config.x, self._config.y, np.cos(yaw), np.sin(yaw)
         return x + ahead * c - aside * s, y + ahead * s + aside * c
 
@@ -177,16 +177,16 @@ class SimulatedLidar:
     readings. Joints of a mount turn it about its own centre.
 
     Args:
-        plant: what carries it.
+        plant: carrier of the sensor.
         sweep: ranges along the beams.
         config: true parameters.
-        seed: of the noise; None = none.
+        seed: of the noise; None: no noise.
     """
 
     def __init__(self, plant: Plant, sweep: Sweep, config: LidarConfig, seed: int | None) -> None:
         self.joints: JointSource | None = None
         self.board_at: Callable[[int], FlatPanel | None] = lambda _: None
-        """What somebody holds before the robot."""
+        """Board that a person holds before the robot."""
         self._plant, self._sweep, self._config, self._seed = plant, sweep, config, seed
         self._lost = (np.arange(SWEEP_STEPS) < config.first_step) | (np.arange(SWEEP_STEPS) > config.last_step)
         """Steps that never measure."""
@@ -204,7 +204,7 @@ class SimulatedLidar:
         return self._measure(ranges, time_ns, sheet)
 
     def beams(self, bearings: Array, times_ns: NDArray[np.int64], sheet: RangeSheet) -> Array:
-        """As ``BeamSource``."""
+        """Implements ``BeamSource``."""
         first = int(times_ns[0])
         self._plant.advance(int(times_ns[-1]))
         sheet = self._sheet(sheet)
@@ -224,7 +224,7 @@ class SimulatedLidar:
         return sheet._replace(least=least, greatest=config.max_range or sheet.greatest)
 
     def _cast(self, mounted: Beams | None, level: Beams, times: NDArray[np.int64], reach: float) -> Array:
-        """True ranges, (n,), m, of beams in the frame of what carries the lidar; ``mounted`` None: ``LEVEL_BEAMS``."""
+        """True ranges, (n,), m, of beams in the frame of the lidar's carrier; ``mounted`` None: ``LEVEL_BEAMS``."""
         poses, beams = self._plant.poses(times), mounted
         if self.joints is not None:
             beams = turned(level if beams is None else beams, *self.joints.angles(times))
@@ -269,7 +269,7 @@ class SimulatedMotor:
         self._sign = -1.0 if config.inverted else 1.0
 
     def command(self, time_ns: int, target_rpm: float | None, accel_rpm_s: float) -> None:
-        """From ``time_ns`` on ramp towards ``target_rpm``; None = power stage off, coasting."""
+        """Ramp towards ``target_rpm`` from ``time_ns`` on; None: power stage off, coasting."""
         self._plant.advance(time_ns)
         self._plant.shafts[self._shaft].command(None if target_rpm is None else self._sign * target_rpm, accel_rpm_s)
 
@@ -309,7 +309,7 @@ class SimulatedServos:
         self._plant.advance(time_ns)
 
     def analog_volts(self, channel: int, time_ns: int) -> float:
-        """Voltage at an analog input; 0 at all but the battery's."""
+        """Voltage at an analog input; 0 at all but the battery input."""
         if channel != self._config.channel:
             return 0.0
         self._plant.advance(time_ns)
@@ -423,7 +423,7 @@ class SimulatedRearWheels:
     """``WheelSource``: the wheels on the rear axle roll as the ground passes, whatever the driven wheel does.
 
     Args:
-        plant: what moves the robot.
+        plant: moves the robot.
         config: track and radius.
     """
 
@@ -444,7 +444,7 @@ class SimulatedRearWheels:
         return self._rolled[0] / self._radius, self._rolled[1] / self._radius
 
     def _roll(self, before: Pose2, now: Pose2, dt: int) -> None:
-        """Along an arc; nothing where the robot was carried."""
+        """Add the motion along an arc; nothing where the robot was carried."""
         way = hypot(now[0] - before[0], now[1] - before[1])
         if way > 5.0 * dt / SECOND:  # a robot that was faster than this between two looks was carried, m/s
             return
@@ -456,14 +456,14 @@ class SimulatedRearWheels:
 
 
 def turned(vector: tuple[Real, Real, Real], pitch: Real, roll: Real) -> tuple[Real, Real, Real]:
-    """Inverse of ``_to_body``, for one vector or for many, each turned by angles of its own."""
+    """Inverse of ``_to_body``, for one vector or for many, each with its own angles."""
     x, y, z = vector
     y, z = cos(roll) * y - sin(roll) * z, sin(roll) * y + cos(roll) * z
     return cos(pitch) * x + sin(pitch) * z, y, cos(pitch) * z - sin(pitch) * x
 
 
 def _mounted(config: LidarConfig, level: Beams) -> Beams | None:
-    """Beams of a lidar that is not mounted straight, in the frame of what carries it; None: of one that is.
+    """Beams of a lidar that is not mounted straight, in the frame of its carrier; None if it is mounted straight.
 
     Args:
         config: its mount.

@@ -34,7 +34,7 @@ _UNSTABLE: Final = (
     mujoco.mjtWarning.mjWARN_BADQVEL,
     mujoco.mjtWarning.mjWARN_BADQACC,
 )
-"""Warnings after which MuJoCo silently resets the state to the model's initial state."""
+"""Warnings that make MuJoCo silently reset the state to the model's initial state."""
 
 Ground = Callable[[float, float], float]
 """Return the ground height at a point of the map (m)."""
@@ -46,11 +46,11 @@ class _Tyres(NamedTuple):
     """The give of all tyres."""
 
     joints: tuple[tuple[int, int, int], ...]
-    """Of each its place and its speed among those of all joints, and the speed of its wheel."""
+    """Index of the position, of the speed, and of the wheel speed of each among all joints."""
     spring: float
     """Spring rate (N/m)."""
     share: float
-    """Of the relaxation that a wheel rolls in one step, for each rad/s."""
+    """Share of the relaxation length that a wheel rolls in one step, per rad/s."""
 
 
 def _tyres(model: mujoco.MjModel, parts: Mechanics, radius: float) -> _Tyres | None:
@@ -72,9 +72,9 @@ class RigidPlant(Plant):
         config: true parameters.
         battery: the pack.
         start: pose of the geometric centre.
-        model: MuJoCo's, of robot and surroundings.
+        model: MuJoCo model of robot and surroundings.
         drive: its drive line.
-        steering: servo angles to those of the steered wheels.
+        steering: converts servo angles to wheel angles.
         ground: height under a point of the map, m.
         parts: its mechanics.
     """
@@ -102,12 +102,12 @@ class RigidPlant(Plant):
         count = len(self.shafts)
         self._first_shaft = model.nu - count
         self._wound = [0.0] * count
-        """Angle to which each shaft has wound its wheels up, rad, mean of its wheels."""
+        """Wind-up of each shaft, rad, mean of its wheels."""
         self._head = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in HEAD_JOINTS]
         self._head_shafts = np.zeros(len(self._head))
         """Angles of the stabiliser's shafts at the latest step (rad)."""
         self._rolling = [model.jnt_qposadr[i] for i in range(model.njnt) if model.joint(i).name.endswith("_rollers")]
-        """Of balls that stand for wheels with rollers: whose axis across the rollers' stays level."""
+        """Balls that stand for wheels with rollers; their axis across the rollers stays level."""
         self._tyres = _tyres(model, parts, config.wheel_radius)
         self._deflection = [0.0] * (0 if self._tyres is None else len(self._tyres.joints))
         """Longitudinal and lateral deflection of the tyres (m)."""
@@ -171,7 +171,7 @@ class RigidPlant(Plant):
         before, self._on_blocks = self._on_blocks, (pitch, roll)
         try:
             self.carry(self._pose)
-            # 0.1: greatest difference between the tilt of a robot and that of its blocks that its springs explain, rad
+            # 0.1: maximum difference between the tilts of robot and blocks that its springs explain, rad
             if hypot(self._attitude[0] - pitch, self._attitude[1] - roll) > 0.1:
                 wanted = f"pitch {degrees(pitch):.0f} deg and roll {degrees(roll):.0f} deg"
                 raise InputError(f"tilt: the robot falls off blocks that give it {wanted}")
@@ -232,8 +232,8 @@ class RigidPlant(Plant):
                 break
             data.qpos[:2] = x, y
             data.qvel[:2] *= 0.5
-        inside = data.ncon > 0 and data.contact.dist.min() < -0.03  # depth to which nothing gives way under it, m
-        # 0.5: speed upwards or downwards that one which came to rest cannot have, m/s
+        inside = data.ncon > 0 and data.contact.dist.min() < -0.03  # maximum plausible depth of a contact, m
+        # 0.5: vertical speed that a robot at rest cannot have, m/s
         if self._unstable() or inside or not abs(data.qvel[2]) < 0.5:
             raise InputError(f"the robot does not come to rest at ({x:.2f}, {y:.2f}): something is in its place there")
         data.qvel[:] = 0.0
@@ -336,7 +336,7 @@ class RigidPlant(Plant):
         pitch, roll = asin(max(-1.0, min(1.0, -down))), atan2(left_up, up_up)
         vx, vy, vz, wx, wy, wz = speeds[:6]
         c, s = cos(yaw), sin(yaw)
-        # Of the body's own axes to those of its level frame, by pitch and roll.
+        # From the body's axes to its level frame, by pitch and roll.
         cr, sr, cp, sp = cos(roll), sin(roll), cos(pitch), sin(pitch)
         up = sr * wy + cr * wz
         self._turning = cp * wx + sp * up, cr * wy - sr * wz, cp * up - sp * wx
@@ -348,7 +348,7 @@ class RigidPlant(Plant):
         """The acceleration of a step, from the velocity before it, through the sensor's filter."""
         ax, ay, az = ((now - then) / TIMESTEP for now, then in zip(self._velocity, before, strict=True))
         c, s = cos(self._pose[2]), sin(self._pose[2])
-        # 0.05: time constant with which an accelerometer feels the body's acceleration, s: its mount and filter
+        # 0.05: time constant of an accelerometer's mount and filter, s
         share = 1.0 - exp(-TIMESTEP / 0.05)
         forward, left, up = self._felt
         self._felt = (
@@ -358,15 +358,15 @@ class RigidPlant(Plant):
         )
 
     def _touch(self) -> None:
-        """Walls and what stands or moves around stop the robot; ground and blocks carry it."""
+        """Walls, objects and people stop the robot; ground and blocks carry it."""
         solid = self._solid
         if self.data.ncon and any(solid[a] or solid[b] for a, b in self.data.contact.geom.tolist()):
-            # 0.01: slower than this, m/s, it has not run into what it touches
+            # 0.01: slower than this, m/s, a touch is not a collision
             if self._stuck_at is None and hypot(*self._twist[:2]) > 0.01:
                 self.on_blocked(self._pose, self._twist)
             self._stuck_at = self._pose
         elif self._stuck_at is not None:
             x, y, _ = self._stuck_at
-            # 0.005: distance from the place of contact at which the robot is free again, m
+            # 0.005: the robot is free again at this distance from the place of contact, m
             if hypot(self._pose[0] - x, self._pose[1] - y) > 0.005:
                 self._stuck_at = None

@@ -1,10 +1,9 @@
 """Loop closure: candidates, their verification by scan matching, and their consistency with the pose graph.
 
 Candidates are keyframes that may be near within the bound of the drift: the likeliest by position, and the most similar
-by descriptor. The surroundings of the newest keyframe (not one scan: a corridor looks alike everywhere) are matched to
-those of the candidate by branch and bound, then by ICP. A match in a small window is accepted at once; in a wide one it
-waits until others, from different places, agree with it (pairwise consistency: Mangelson
-et al. 2018). A closure that the optimised graph rejects is removed.
+by descriptor. The surroundings of the latest keyframe (not one scan, which looks the same all along a corridor) are
+matched to those of the candidate by branch and bound, then by ICP. A match in a small window is accepted at once; in a wide
+one it waits until others, from different places, agree with it (pairwise consistency: Mangelson et al. 2018). A closure that the optimised graph rejects is removed.
 
 A place seen again from the other side overlaps little. At the end of a run (``review``), where the drift is small, a
 match is also accepted if the part that must have been in view of the place fits, and neither side looked through the
@@ -54,7 +53,7 @@ QUERY_KEYS: Final = 12
 MIN_OVERLAP: Final = 0.55
 """Share of the query's points that must fit."""
 CONTRADICTION: Final = 0.15
-"""Share of the points looked through by the scans of the other side from which on a match is wrong."""
+"""Maximum share of points that scans of the other side look through; above it a match is wrong."""
 PART_CONTRADICTION: Final = 0.05
 """Partial match: share of the points that may be looked through."""
 FLOOR: Final = (0.03, 0.03, 0.01)
@@ -62,7 +61,7 @@ FLOOR: Final = (0.03, 0.03, 0.01)
 MIN_SUPPORT: Final = 3
 """Matches that must agree before one of a wide search is accepted, and as many more for each that contradicts."""
 BASELINE: Final = 1.0
-"""Least length of the trajectory between the first and the last of these, m."""
+"""Minimum length of the trajectory between the first and the last of these, m."""
 MOST_WAITING: Final = 20
 """Keyframes that wait for their search, at most."""
 
@@ -76,7 +75,7 @@ class LoopMatch:
     measured: Array
     information: Array
     made: int
-    """Number of the newest keyframe when it was found."""
+    """Number of the latest keyframe when it was found."""
 
 
 class LoopCloser:
@@ -120,7 +119,7 @@ class LoopCloser:
         own, query = surroundings(keyframes, at)
         self._fingerprints[at] = describe(query.points)
         covariances, far = keyframes.drift(at)
-        max_age = 60  # keyframes after which a match without support is dropped
+        max_age = 60  # maximum age of a match without support, keyframes
         self._hits = [hit for hit in self._hits if at - hit.made < max_age]
         search_interval = 4  # keyframes between two searches in the same place
         self._tried = {place: when for place, when in self._tried.items() if at - when < search_interval}
@@ -167,14 +166,14 @@ class LoopCloser:
         return True
 
     def review(self, keyframes: KeyframeMap) -> bool:
-        """Search from all keyframes (seconds of work) for places of which only a part was seen before.
+        """Search from all keyframes (seconds of work) for places that were only partly seen before.
 
         For the end of a run, when the surroundings of a place include what came later. True if a closure has moved the
         poses.
         """
         self._tried.clear()
         count = len(keyframes)
-        reviewed = 250  # keyframes from which the review searches, at most
+        reviewed = 250  # maximum number of keyframes that the review searches
         places = np.unique(np.linspace(0, count - 1, min(count, reviewed)).astype(np.intp)).tolist()
         hits = [hit for at in places if (hit := self._partial_match(keyframes, at)) is not None]
         closed = False
@@ -202,7 +201,7 @@ class LoopCloser:
         if place > SMALL_WINDOW[0] or turn > SMALL_WINDOW[1]:
             return None
         own, query = surroundings(keyframes, at)
-        # Partial match: added to the half width of the search, m and rad: scans drift more than their covariance says.
+        # Partial match: added to the half width of the search, m and rad, as scans drift beyond their covariance.
         part_wider = (1.0, 2.0)
         tries = (
             finished(self._search(keyframes, query, own, at, int(numbers[0]), (place * wider, turn * wider), part=True))
@@ -211,7 +210,7 @@ class LoopCloser:
         return next((hit for hit in tries if hit is not None), None)
 
     def _candidates(self, keyframes: KeyframeMap, newest: int, covariances: Array, far: Array) -> list[int]:
-        """At most two candidates: the likeliest by position, and the most similar one elsewhere."""
+        """Return up to two candidates: the likeliest by position, and the most similar one elsewhere."""
         numbers = self._possible(keyframes, newest, covariances, far)
         if not len(numbers):
             return []
@@ -220,10 +219,10 @@ class LoopCloser:
         elsewhere = elsewhere[[int(k) in self._fingerprints for k in elsewhere]]
         if not len(elsewhere):
             return [first]
-        alike = likeness(self._fingerprints[newest], np.array([self._fingerprints[k] for k in elsewhere]))
-        best = int(np.argmax(alike))
+        similarity = likeness(self._fingerprints[newest], np.array([self._fingerprints[k] for k in elsewhere]))
+        best = int(np.argmax(similarity))
         min_likeness = 0.8  # least similarity of the descriptors of a candidate
-        return [first, int(elsewhere[best])] if alike[best] > min_likeness else [first]
+        return [first, int(elsewhere[best])] if similarity[best] > min_likeness else [first]
 
     def _possible(self, keyframes: KeyframeMap, at: int, covariances: Array, far: Array) -> NDArray[np.intp]:
         """Keyframes before ``at`` that may be near it within the drift, the likeliest first."""
@@ -274,7 +273,7 @@ class LoopCloser:
         score = part_score if part else min_score
         yield look_ups(query.points, window, levels)
         work = 40_000  # blocks evaluated in one search below the coarsest level, at most
-        min_separation = 1.0  # distance at which places are different, m
+        min_separation = 1.0  # minimum distance of two different places, m
         peak = correlate(grid, query.points, guess, window, deviation, score, min_separation, work)
         max_rival = 0.9  # a match is ambiguous if another place scores more than this share of it
         if peak is None or peak.rival > max_rival * peak.score:
@@ -409,7 +408,7 @@ def _overlap_in_view(keyframes: KeyframeMap, near: NDArray[np.intp], query: Scan
 
 
 def crossings(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.intp]) -> Pieces[Array]:
-    """Compare the newest of ``own`` with the keyframes ``others`` around them.
+    """Compare the latest of ``own`` with the keyframes ``others`` around them.
 
     Returns:
         Shape (k, 2), a row for each in their order: points that the opposite side looked through, and those in its
@@ -418,7 +417,7 @@ def crossings(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.
     """
     off = keyframes.poses[own, None, :2] - keyframes.poses[others, :2]
     far = np.hypot(off[..., 0], off[..., 1])
-    crossed_keys = 24  # newest keyframes of a submap that are compared with another submap
+    crossed_keys = 24  # latest keyframes of a submap that are compared with another submap
     crossed_reach = 5.0  # distance of these at most, m
     met = np.flatnonzero(far.min(axis=1, initial=np.inf) < crossed_reach)[-crossed_keys:]
     counts = np.zeros((len(met), 2))
@@ -440,11 +439,11 @@ def crossings(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.
 def opposed(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.intp]) -> Pieces[bool]:
     """Whether too many beams of the keyframes ``own`` and ``others`` pass through each other's walls for one map.
 
-    As a whole, or along any stretch of ``own``: the way out of a room that only looks like another one is short.
+    As a whole, or along any stretch of ``own``: the way out of a room that only looks like another is short.
     """
     counts = yield from crossings(keyframes, own, others)
     through, judged = counts.sum(axis=0)
-    # Greatest contradiction of two submaps (share of the points in view of both that one looked through), as a whole
+    # Maximum contradiction of two submaps (share of the points in view of both that one looked through), as a whole
     # and along a stretch: right joins of recordings had at most 0.05 and 0.15, wrong ones in six of seven drives
     # through equal rooms 0.18 and more.
     join_contradiction = (0.1, 0.18)
@@ -459,7 +458,7 @@ def opposed(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.in
 
 def surroundings(keyframes: KeyframeMap, centre: int) -> tuple[NDArray[np.intp], Scan]:
     """Numbers of the keyframes around ``centre``, and their points merged in its frame."""
-    query_reach = 3.0  # their distance from the newest keyframe at most, m
+    query_reach = 3.0  # their maximum distance from the latest keyframe, m
     numbers = keyframes.around(centre, QUERY_KEYS, query_reach)
     poses = between(keyframes.poses[centre], keyframes.poses[numbers])
     scan = merged([keyframes.frames[k].scan for k in numbers], poses)
@@ -530,7 +529,7 @@ def _sector(x, y):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
 
 @njit(cache=True)
 def _view(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    """Least range per sector and its neighbours, m; 0 where any of the three saw nothing."""
+    """Return the minimum range per sector and its neighbours, m; 0 where any of the three saw nothing."""
     nearest = np.full(VIEW_SECTORS, np.inf)
     for i in range(points.shape[0]):
         k = _sector(points[i, 0], points[i, 1])
@@ -545,7 +544,7 @@ def _view(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
 
 @njit(cache=True)
 def _sight(view, x, y):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    """Of a point: 0 if it is not in view, 1 if it was seen, 2 if it is in view and was looked through."""
+    """Return the view of a point: 0 not in view, 1 seen, 2 in view and looked through."""
     limit = view[_sector(x, y)]
     r = math.hypot(x, y)
     # Distance in front of what was seen behind a point from which on the point was looked through, m.
@@ -600,7 +599,7 @@ def likeness(one: Array, others: Array) -> Array:
 def _distances(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     descriptor_bins = 20
     result = np.zeros(descriptor_bins)
-    descriptor_reach = 5.0  # distance from the robot up to which points are in the descriptor, m
+    descriptor_reach = 5.0  # maximum distance of the descriptor's points from the robot, m
     limit = descriptor_reach * descriptor_reach
     total = 0
     for i in range(points.shape[0]):
