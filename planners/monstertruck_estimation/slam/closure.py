@@ -2,8 +2,9 @@
 
 Candidates are keyframes that may be near within the bound of the drift: the likeliest by position, and the most similar
 by descriptor. The surroundings of the latest keyframe (not one scan, which looks the same all along a corridor) are
-matched to those of the candidate by branch and bound, then by ICP. A match in a small window is accepted at once; in a wide
-one it waits until others, from different places, agree with it (pairwise consistency: Mangelson et al. 2018). A closure that the optimised graph rejects is removed.
+matched to those of the candidate by branch and bound, then by ICP. A match in a small window is accepted at once; in a
+wide one it waits until others, from different places, agree with it (pairwise consistency: Mangelson et al. 2018). A
+closure that the optimised graph rejects is removed.
 
 A place seen again from the other side overlaps little. At the end of a run (``review``), where the drift is small, a
 match is also accepted if the part that must have been in view of the place fits, and neither side looked through the
