@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import first_mistake
+from monstertruck_schemas.points import PointName, PointOrder
 from monstertruck_schemas.req import UNCONDITIONAL, BehaviourOrder, ExploreOrder, GoalOrder, MissionOrder, Order, Role
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.zones import LONGEST_OFF, OFF_FOR, ZoneArea, ZoneOrder
@@ -22,6 +23,8 @@ Heading = Annotated[float, Field(ge=-math.tau, le=math.tau)]
 Place = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
 """x, y (m) and optionally yaw (rad)."""
 Id = Annotated[int, Field(ge=0, lt=2**53)]
+Stamp = Annotated[int, Field(ge=0, lt=2**63)]
+"""Time of the robot's clock (ns)."""
 
 
 class _Command(BaseModel):
@@ -165,6 +168,18 @@ class ChangeZone(Asked):
     """How long the zone is off (s)."""
 
 
+class ChangePoint(Asked):
+    """Mark a place as a point of interest, or remove a point."""
+
+    do: Literal["point"]
+    order: PointOrder
+    name: PointName
+    place: tuple[Number, Number] | None = None
+    """Place of a mark (m); None for the robot's."""
+    yaw: Heading | None = None
+    """Heading of a mark (rad); None for the robot's."""
+
+
 class AskToDrive(Asked):
     """Ask the current driver to hand over."""
 
@@ -218,6 +233,8 @@ class ReplayRecording(Asked):
 
     do: Literal["replay"]
     name: Annotated[str, Field(max_length=128)]
+    stamp: Stamp | None = None
+    """Moment to begin with, and to stay at; None for the start."""
 
 
 class InjectFault(Asked):
@@ -267,6 +284,8 @@ class ControlReplay(_Command):
 
     do: Literal["seek"]
     at: Number | None = None
+    stamp: Stamp | None = None
+    """Moment to show."""
     playing: bool | None = None
     rate: Number | None = None
 
@@ -286,6 +305,7 @@ AnyCommand = (
     | TrackFile
     | StartPath
     | ChangeZone
+    | ChangePoint
     | AskToDrive
     | HandOver
     | Acknowledge

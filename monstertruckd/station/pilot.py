@@ -40,6 +40,7 @@ from monstertruckd.station.commands import (
     AskToDrive,
     Behave,
     ChangeGoal,
+    ChangePoint,
     ChangeSetting,
     ChangeZone,
     DeleteRecording,
@@ -230,6 +231,8 @@ def _other_call(client: TruckClient, command: Asked) -> Coroutine[Any, Any, Any]
             return client.hand_over(command.to)
         case ChangeZone():
             return client.zone(command.order, command.name, command.area, command.seconds)
+        case ChangePoint():
+            return client.point(command.order, command.name, command.place, command.yaw)
         case Acknowledge():
             return client.call("acknowledge", {"text": command.text})
         case ListSettings():

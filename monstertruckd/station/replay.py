@@ -173,6 +173,20 @@ class ReplayFeed:
                 self._send_all(viewer)
         self._send_state()
 
+    def holds(self, stamp: int) -> bool:
+        """Return whether the recording holds the moment of a stamp of the robot's clock (ns)."""
+        return self._begin <= stamp <= self._end
+
+    def show_moment(self, stamp: int) -> None:
+        """Show the moment of a stamp of the robot's clock (ns), and stay there.
+
+        Raises:
+            InputError: the recording does not hold it.
+        """
+        if not self.holds(stamp):
+            raise InputError(f"{self.name}: does not hold this moment")
+        self.control((stamp - self._begin) / SECOND, playing=False, rate=None)
+
     def _send_all(self, viewer: Viewer) -> None:
         viewer.show("facts", self._facts)
         viewer.show("link", frames.text("link", alive=True, round_trip=0.0, text=""))

@@ -263,8 +263,8 @@ class Station:
         for viewer in self._viewers:
             viewer.send(frames.text("robots", names=self.names))
 
-    def _drop_replay(self) -> None:
-        """Drop the oldest recording that no browser watches, to make room for another.
+    def _unwatched(self) -> str:
+        """Return the oldest recording that no browser watches.
 
         Raises:
             InputError: all recordings are being watched.
@@ -272,6 +272,10 @@ class Station:
         name = next((name for name, feed in self.replays.items() if not feed.watched), None)
         if name is None:
             raise InputError(f"{MOST_REPLAYS} recordings are looked at already: expected fewer at once")
+        return name
+
+    def _drop_replay(self, name: str) -> None:
+        """Show a recording no longer."""
         self._following.pop(self.replays.pop(name)).cancel()
 
     @property
@@ -279,21 +283,28 @@ class Station:
         """Names that browsers can watch: robots, then recordings."""
         return [*self.feeds, *self.replays]
 
-    async def replay(self, address: RobotAddress, name: str, user: str, viewer: Viewer) -> str:
-        """Fetch a recording and offer it in every browser; returns its name there.
+    async def replay(
+        self, address: RobotAddress, name: str, user: str, viewer: Viewer, stamp: int | None = None
+    ) -> str:
+        """Fetch a recording and offer it in every browser, at a moment (ns, robot's clock) if given; return its name.
 
         Raises:
-            InputError: the name is invalid, the recording cannot be shown, or too many are shown already.
+            InputError: the name is invalid, the recording cannot be shown or does not hold the moment, or too many are
+                shown already.
             TruckError: the robot refuses, or is absent.
         """
         title = f"{address.name} {name.removesuffix('.mcap')}"
         if self._open_log is None or not RECORDING.fullmatch(name):
             raise InputError(f"{name}: cannot be replayed here")
         async with self._fetching:
-            if title in self.replays:
-                return title
+            shown = self.replays.get(title)
+            if shown is not None and stamp is not None and not shown.watched and not shown.holds(stamp):
+                self._drop_replay(title)  # fetched while it was being written: it has grown
+                shown = None
+            if shown is not None:
+                return self._at_moment(shown, stamp)
             if len(self.replays) >= MOST_REPLAYS:
-                self._drop_replay()
+                self._drop_replay(self._unwatched())
             if self._folder is None:
                 self._folder = Path(tempfile.mkdtemp(prefix="monstertruckd-station-"))
             file, open_log = self._folder / f"{address.name}-{name}", self._open_log
@@ -308,7 +319,13 @@ class Station:
                 file.unlink(missing_ok=True)
             self.replays[title] = feed
         self._follow(feed)
-        return title
+        return self._at_moment(feed, stamp)
+
+    @staticmethod
+    def _at_moment(feed: ReplayFeed, stamp: int | None) -> str:
+        if stamp is not None:
+            feed.show_moment(stamp)
+        return feed.name
 
     def show_emulated(self, viewers: Iterable[Viewer]) -> None:
         """Send the faults and obstacles of the emulated robot, if there is one."""
@@ -552,6 +569,8 @@ class _Browser:
             case ControlReplay():
                 if isinstance(self._feed, ReplayFeed):
                     self._feed.control(command.at, command.playing, command.rate)
+                    if command.stamp is not None:
+                        self._feed.show_moment(command.stamp)
             case ReplayRecording():
                 self._fetch(command)
             case EchoRequest():
@@ -638,7 +657,7 @@ class _Browser:
         try:
             if not isinstance(feed, RobotFeed):
                 raise InputError("no robot is looked at")
-            name = await self._station.replay(feed.address, command.name, self.user.name, self.viewer)
+            name = await self._station.replay(feed.address, command.name, self.user.name, self.viewer, command.stamp)
         except TruckError as error:
             self.viewer.send(frames.refusal(command.id, error))
         else:

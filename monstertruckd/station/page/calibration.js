@@ -1,8 +1,6 @@
 // Calibration in the page: the wizards that fit the robot, and the one that runs, with its questions, progress and result.
-import { element } from "./panels.js";
+import { byId, element } from "./dom.js";
 import { number, words } from "./words.js";
-
-const byId = (id) => document.getElementById(id);
 
 /** A value with half its interval, as people write it. */
 export function shown({ value, low, high, unit }) {
@@ -13,9 +11,13 @@ export function shown({ value, low, high, unit }) {
 }
 
 export class Calibration {
-  /** page: outcome shows an answer. */
+  /**
+   * @param {import("./socket.js").Link} link
+   * @param {import("./dom.js").Page} page
+   */
   constructor(link, page) {
-    Object.assign(this, { link, ...page });
+    this.link = link;
+    this.page = page;
     this.wizards = null;
     this.asked = "";
     link.on("calibrating", (state) => this.show(state));
@@ -37,7 +39,7 @@ export class Calibration {
 
   async order(order, more = {}) {
     const answer = await this.link.ask({ do: "calibrate", order, ...more });
-    this.outcome("calibration", answer);
+    this.page.outcome("calibration", answer);
     return answer;
   }
 

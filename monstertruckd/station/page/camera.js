@@ -1,14 +1,15 @@
 // The camera large, over the map, with the path and the ground that the robot is about to cover drawn into its picture.
+import { byId } from "./dom.js";
 import { moved, projected, relative } from "./geometry.js";
 
-const byId = (id) => document.getElementById(id);
 const STEP = 0.05; // metres between two points of a line
 const AHEAD = 2.5; // metres of the way that are drawn for the robot's edges
 const FAR = 6; // metres from the robot up to which a path is drawn
 
 export class CameraView {
   constructor(link, map) {
-    Object.assign(this, { link, map });
+    this.link = link;
+    this.map = map;
     link.on("robot", () => this.show(false));
     link.on("facts", () => this.offer());
     link.on("camera", () => this.offer());

@@ -13,6 +13,8 @@ const LINES = {
   behave: ({ order, behaviour }) => ["behave", order, order === "start" && behaviour],
   set: ({ key, value, save }) => ["set", save && "--save", key, ...(typeof value === "number" && value < 0 ? ["--"] : []), String(value)],
   settings: () => ["get"],
+  point: ({ order, name, place, yaw }) => ["points", order, name, ...(place ? ["--", ...place.map(shown), degrees(yaw)] : [])],
+  zone: ({ order, name, area }) => ["zone", order, name, ...(area ? ["--", ...area.corners.map((corner) => corner.map(shown).join(","))] : [])],
   calibrate: ({ order, step }) => (order === "start" ? ["calibrate", step.split(".")[0]] : null),
 };
 
@@ -21,7 +23,7 @@ export function commandLine(command, robot) {
   const words = LINES[command.do]?.(command)?.filter(Boolean);
   if (!words) return null;
   const [name, ...rest] = words;
-  const group = ["mission", "behave", "calibrate"].includes(name) ? 1 : 0;
+  const group = ["mission", "behave", "calibrate", "points", "zone"].includes(name) ? 1 : 0;
   const named = robot && robot !== "truck" ? ["--robot", robot] : [];
   const quoted = (word) => (/^[\w.,/:@+=-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`);
   return ["monstertruckd", name, ...rest.slice(0, group), ...named, ...rest.slice(group)].map(quoted).join(" ");

@@ -1,5 +1,6 @@
 // Driving by hand. Every 50 ms the loop below reads the input and sends what it says at that moment; nothing else sends a
 // motion. A page that hangs, sleeps in a background tab or lost its link sends nothing, and the robot's lease runs out.
+import { byId, setText } from "./dom.js";
 import { number, words } from "./words.js";
 
 const BEAT = 50;
@@ -28,9 +29,8 @@ export class Drive {
     this.grace = 0;
     this.blocked = null; // mode of the gate that does not let the present hand drive
     this.unseen = 0; // until then, or while the hand then drives on, the button counts
-    this.byId = (id) => document.getElementById(id);
-    this.steering = this.byId("steering");
-    this.speed = this.byId("speed");
+    this.steering = byId("steering");
+    this.speed = byId("speed");
     for (const mode of MODES) this.steering.add(new Option(words(`steering.${mode}`), mode));
     this.steering.value = "counter";
     link.on("facts", (facts) => this.takeFacts(facts));
@@ -50,7 +50,7 @@ export class Drive {
   }
 
   listen() {
-    const stick = this.byId("stick");
+    const stick = byId("stick");
     const take = (event) => {
       const { left, top, width, height } = stick.getBoundingClientRect();
       let x = ((event.clientX - left) / width) * 2 - 1;
@@ -82,7 +82,7 @@ export class Drive {
     for (const end of ["focusin", "mousedown"]) window.addEventListener(end, (event) => typing(event) && this.held.clear());
     document.addEventListener("visibilitychange", () => document.hidden && this.letGo());
     this.speed.addEventListener("input", () => this.showSpeed());
-    this.byId("unseen").addEventListener("click", () => (this.unseen = this.unseen ? 0 : performance.now() + UNSEEN_WAIT));
+    byId("unseen").addEventListener("click", () => (this.unseen = this.unseen ? 0 : performance.now() + UNSEEN_WAIT));
   }
 
   key(event, down) {
@@ -161,6 +161,7 @@ export class Drive {
     } else if (performance.now() < this.grace) this.send(["stick", 0, 0]);
   }
 
+  /** @param {any[]} hand the input, and how far sideways and ahead, -1 to 1 */
   send([input, x, y]) {
     if (this.link.newest.hello?.role === "observer" || document.body.dataset.replay === "true") return;
     const limit = this.limit();
@@ -180,16 +181,16 @@ export class Drive {
   }
 
   show(hand) {
-    const knob = this.byId("knob");
-    const radius = this.byId("stick").clientWidth / 2 - 32;
+    const knob = byId("knob");
+    const radius = byId("stick").clientWidth / 2 - 32;
     knob.style.transform = hand ? `translate(${hand[1] * radius}px, ${-hand[2] * radius}px)` : "";
-    this.byId("stick").classList.toggle("held", Boolean(hand));
+    byId("stick").classList.toggle("held", Boolean(hand));
     if (this.unseen && this.unseen < performance.now()) this.unseen = 0;
-    this.byId("unseen").setAttribute("aria-pressed", String(this.confirms()));
+    byId("unseen").setAttribute("aria-pressed", String(this.confirms()));
     const left = Math.ceil((this.grace - performance.now()) / 1000);
     const blocked = hand && ["disarmed", "estopped"].includes(this.link.newest.gate?.mode) ? this.link.newest.gate.mode : null;
     if (blocked !== this.blocked) {
-      setText(this.byId("hand-note"), blocked ? words(`input.blocked.${blocked}`) : "");
+      setText(byId("hand-note"), blocked ? words(`input.blocked.${blocked}`) : "");
       this.blocked = blocked;
     }
     const text = blocked ? words(`input.blocked.${blocked}`)
@@ -197,23 +198,19 @@ export class Drive {
       : left > 0 ? words("input.grace", { seconds: left })
       : this.pad ? words("input.ready", { name: this.pad.id.slice(0, 24) })
       : words("input.none");
-    setText(this.byId("input"), text);
+    setText(byId("input"), text);
     const slowed = this.limit() < Number(this.speed.value) - 0.001;
     const delay = this.link.roundTrip();
     const note = delay === null ? "speed.unknown" : "speed.slowed";
-    setText(this.byId("speed-note"), slowed ? words(note, { speed: number(this.limit()), delay: number(delay, 0) }) : "");
+    setText(byId("speed-note"), slowed ? words(note, { speed: number(this.limit()), delay: number(delay, 0) }) : "");
   }
 
   showSpeed() {
-    setText(this.byId("speed-value"), words("speed.value", { speed: number(Number(this.speed.value)) }));
+    setText(byId("speed-value"), words("speed.value", { speed: number(Number(this.speed.value)) }));
   }
 }
 
 /** Whether an event is about a field of text or a list, which take keys themselves. */
 function typing({ target }) {
   return target instanceof Element && target.closest("select, input:not([type=range])") !== null;
-}
-
-function setText(element, text) {
-  if (element.textContent !== text) element.textContent = text;
 }

@@ -1,9 +1,8 @@
 // All robots at a glance: a map of where they are, and a table by which the page switches to one of them.
+import { byId, element } from "./dom.js";
 import { compose, outline } from "./geometry.js";
-import { element } from "./panels.js";
 import { modeText, number, reason, words } from "./words.js";
 
-const byId = (id) => document.getElementById(id);
 const LOOKS = { disarmed: "", armed: "warn", driving: "good", stopping: "warn", estopped: "bad" };
 const LEVELS = { low: "warn", critical: "bad", overcharged: "warn", sensor_fault: "warn" };
 const COLUMNS = ["fleet.robot", "fleet.gate", "fleet.battery", "fleet.link", "fleet.place"];

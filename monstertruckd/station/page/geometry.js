@@ -1,5 +1,18 @@
 // Plane geometry of the robot: x forward, y left, angles counter-clockwise, metres and radians.
 
+/**
+ * x, y and angle.
+ *
+ * @typedef {number[]} Pose
+ */
+
+/**
+ * A pose given in the frame of another one, in that one's frame.
+ *
+ * @param {Pose} frame
+ * @param {Pose} pose
+ * @returns {Pose}
+ */
 export const compose = ([x, y, a], [px, py, pa]) => [
   x + Math.cos(a) * px - Math.sin(a) * py,
   y + Math.sin(a) * px + Math.cos(a) * py,
@@ -8,7 +21,13 @@ export const compose = ([x, y, a], [px, py, pa]) => [
 
 export const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 
-/** Pose after a constant twist (vx, vy, wz) for some seconds. */
+/**
+ * Pose after a constant twist (vx, vy, wz) for some seconds.
+ *
+ * @param {Pose} pose
+ * @param {number[]} twist
+ * @param {number} seconds
+ */
 export function moved(pose, [vx, vy, wz], seconds) {
   const turn = wz * seconds;
   if (Math.abs(turn) < 1e-6) return compose(pose, [vx * seconds, vy * seconds, turn]);
@@ -31,13 +50,24 @@ export function outline(length, width) {
   return [[l, w], [-l, w], [-l, -w], [l, -w]];
 }
 
-/** Pose in the frame of another pose. */
+/**
+ * Pose in the frame of another pose.
+ *
+ * @param {Pose} frame
+ * @param {Pose} pose
+ * @returns {Pose}
+ */
 export function relative([x, y, a], [px, py, pa]) {
   const [dx, dy] = [px - x, py - y];
   return [Math.cos(a) * dx + Math.sin(a) * dy, Math.cos(a) * dy - Math.sin(a) * dx, wrapped(pa - a)];
 }
 
-/** A vector turned by a quaternion (x, y, z, w). */
+/**
+ * A vector turned by a quaternion (x, y, z, w).
+ *
+ * @param {number[]} quaternion
+ * @param {number[]} vector
+ */
 export function turned([qx, qy, qz, qw], [x, y, z]) {
   const [tx, ty, tz] = [2 * (qy * z - qz * y), 2 * (qz * x - qx * z), 2 * (qx * y - qy * x)];
   return [x + qw * tx + qy * tz - qz * ty, y + qw * ty + qz * tx - qx * tz, z + qw * tz + qx * ty - qy * tx];
@@ -50,7 +80,7 @@ const NEAREST = 0.05; // metres before the lens from which on a point is drawn
  *
  * @param {number[]} point x, y, z in base
  * @param {{translation: number[], rotation: number[]}} mount of the camera in base: x forward, y left, z up
- * @param {object} lens as the robot's configuration has it: a pinhole with Brown's distortion
+ * @param {any} lens as the robot's configuration has it: a pinhole with Brown's distortion
  */
 export function projected(point, { translation, rotation }, lens) {
   const [qx, qy, qz, qw] = rotation;

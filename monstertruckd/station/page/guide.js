@@ -1,8 +1,7 @@
 // What explains the page: five steps at the first visit, a help text on each pane, and the map of the keys.
-import { element } from "./panels.js";
+import { byId, element } from "./dom.js";
 import { words } from "./words.js";
 
-const byId = (id) => document.getElementById(id);
 const STEPS = ["map", "authority", "pad", "tool-goal", "estop"]; // what each step points at
 const PANES = ["drive", "tasks", "truck", "system", "events", "settings", "recordings", "plots", "tryout"];
 const KEYS = ["space", "escape", "drive", "steering", "unseen", "map", "tabs", "help"];
@@ -19,7 +18,7 @@ export class Guide {
     byId("guide-next").onclick = () => this.step(this.at + 1);
     byId("guide-skip").onclick = () => this.step(STEPS.length);
     window.addEventListener("keydown", (event) => {
-      if (event.key === "?" && !event.target.closest("input:not([type=range], [type=checkbox])")) this.keys(byId("keys").hidden);
+      if (event.key === "?" && !/** @type {Element} */ (event.target).closest("input:not([type=range], [type=checkbox])")) this.keys(byId("keys").hidden);
     });
     if (localStorage.getItem("guided") === null) this.step(0);
   }

@@ -1,20 +1,24 @@
-import { CameraView } from "./camera.js";
 import { Calibration } from "./calibration.js";
-import { Drive } from "./drive.js";
-import { FleetView } from "./fleet.js";
-import { MapView } from "./map.js";
+import { CameraView } from "./camera.js";
 import { commandLine } from "./commandline.js";
-import { element, Panels } from "./panels.js";
-import { Plots } from "./plots.js";
+import { byId, element } from "./dom.js";
+import { Drive } from "./drive.js";
+import { Events } from "./events.js";
+import { FleetView } from "./fleet.js";
+import { Goals } from "./goal.js";
 import { Guide } from "./guide.js";
+import { MapView } from "./map.js";
+import { MissionTool } from "./mission.js";
+import { Panels } from "./panels.js";
+import { Places } from "./places.js";
+import { Plots } from "./plots.js";
 import { ReplayBar } from "./replay.js";
 import { Link } from "./socket.js";
+import { Tools } from "./tools.js";
 import { Tryout } from "./tryout.js";
+import { loadWords, reason, words } from "./words.js";
 import { Work } from "./work.js";
 import { Zones } from "./zones.js";
-import { degrees, loadWords, number, reason, words } from "./words.js";
-
-const byId = (id) => document.getElementById(id);
 
 const theme = localStorage.getItem("theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
 document.documentElement.dataset.theme = theme;
@@ -62,25 +66,37 @@ async function letPlannersDrive() {
 
 await loadWords();
 const drive = new Drive(link, estop);
-const map = new MapView(byId("map"), link, aimed);
+const map = new MapView(byId("map"), link);
+const tools = new Tools(map);
 const panels = new Panels(link);
 const fleet = new FleetView(link, map, chosen);
 new ReplayBar(link, chosen); // first: the others look at what it says of the page
-new Work(link, { outcome, order, stopDriving, letPlannersDrive, watch: chosen });
-new Guide();
+/** @type {import("./dom.js").Page} */
+const page = {
+  outcome,
+  order,
+  stopDriving,
+  letPlannersDrive,
+  begin: (what, command) => work.begin(what, command),
+  go: (pose) => goals.go(pose),
+  watch: chosen,
+  pointed(at) {
+    map.take("cursor", at);
+    panels.showPast(at);
+  },
+  dateOf: (stamp) => panels.dateOf(stamp),
+};
+const work = new Work(link, page);
+const goals = new Goals(link, map, tools, page);
+new Zones(link, map, tools, page);
+new MissionTool(link, map, tools, page);
+new Places(link, map, tools, page);
+new Tryout(link, tools, page);
+new Events(link, page);
+new Calibration(link, page);
+const plots = new Plots(link, page);
 new CameraView(link, map);
-new Calibration(link, { outcome });
-const plots = new Plots(link, { outcome, pointed });
-
-/** Show map and camera as they were at a time that a plot is pointed at; null = as they are. */
-function pointed(at) {
-  map.take("cursor", at);
-  panels.showPast(at);
-}
-
-const zones = new Zones(link, map, { outcome, hint });
-
-const tryout = new Tryout(link, { outcome, aim: (on) => aim(on, "tryout.hint") });
+new Guide();
 
 // What a press of a button does, as a command line: who has seen it can write a script.
 link.onAsk = (command) => {
@@ -160,7 +176,7 @@ byId("theme").onclick = () => {
   if (fleet.open) fleet.draw();
 };
 
-// Map and goals
+// Map
 
 function press(id, on) {
   byId(id).setAttribute("aria-pressed", on);
@@ -174,71 +190,6 @@ byId("tool-heading").onclick = () => {
 byId("tool-in").onclick = () => map.zoom(1.3);
 byId("tool-out").onclick = () => map.zoom(1 / 1.3);
 byId("tool-fit").onclick = () => map.fit();
-byId("tool-goal").onclick = () => {
-  const on = !map.aiming || tryout.placing;
-  tryout.place(false);
-  aim(on);
-};
-
-byId("tool-draw").onclick = () => {
-  tryout.place(false);
-  draw(!map.drawing);
-};
-
-byId("tool-zone").onclick = () => {
-  const on = !map.corners;
-  tryout.place(false);
-  aim(false);
-  draw(false);
-  zones.draw(on);
-};
-
-function aim(on, why = "goal.hint") {
-  if (on) draw(false);
-  if (on && map.corners) zones.draw(false);
-  map.setAiming(on);
-  press("tool-goal", on && why === "goal.hint");
-  hint(on ? why : null);
-}
-
-function draw(on) {
-  if (on) aim(false);
-  if (on && map.corners) zones.draw(false);
-  map.setDrawing(on);
-  press("tool-draw", on);
-  hint(on ? "map.draw.hint" : null);
-}
-
-function hint(key) {
-  byId("hint").hidden = key === null;
-  if (key !== null) byId("hint").textContent = words(key);
-}
-
-function aimed(pose, line = null) {
-  if (tryout.take(pose)) return void map.take("pending", null);
-  aim(false);
-  draw(false);
-  map.pending = pose;
-  map.drawn = line;
-  if (line) map.via = [];
-  showGoal();
-}
-
-function showWaypoints() {
-  const key = JSON.stringify(map.via);
-  byId("waypoints").hidden = !map.via.length;
-  if (byId("waypoints").dataset.shown === key) return;
-  byId("waypoints").dataset.shown = key;
-  byId("waypoints").replaceChildren(...map.via.map(([x, y], i) => {
-    const drop = element("button", { className: "quiet", textContent: "×", ariaLabel: words("goal.via.drop", { number: i + 1 }) });
-    drop.onclick = () => {
-      map.take("via", map.via.filter((_, j) => j !== i));
-      showGoal();
-    };
-    return element("li", {}, element("span", { textContent: words("goal.via.row", { x: number(x), y: number(y) }) }), drop);
-  }));
-}
-
 const LAYERS = ["scan", "trail", "frontiers", "points", "zones", "ground"];
 for (const name of LAYERS) {
   const input = element("input", { type: "checkbox", checked: map.layers[name] });
@@ -249,72 +200,5 @@ byId("tool-layers").onclick = () => {
   byId("layers").hidden = !byId("layers").hidden;
   byId("tool-layers").setAttribute("aria-expanded", !byId("layers").hidden);
 };
-
-/** What the goal does now: nothing drives to it while the gate does not let the robot drive. */
-function goalPhase(phase) {
-  const mode = link.newest.gate?.mode;
-  return ["disarmed", "stopping", "estopped"].includes(mode) && phase !== "paused" ? words(`goal.held.${mode}`) : words(`phase.${phase}`);
-}
-
-function showGoal() {
-  const state = link.newest.goal;
-  const pending = map.pending ?? map.drawn;
-  const running = state && state.phase !== "idle";
-  byId("goal").hidden = !pending && !(state?.number > 0);
-  byId("goal-drop").hidden = !pending;
-  byId("goal-go").hidden = byId("goal-via").hidden = !map.pending;
-  byId("path-go").hidden = !map.drawn;
-  showWaypoints();
-  byId("goal-pause").hidden = Boolean(pending) || !running || state.phase === "paused";
-  byId("goal-resume").hidden = Boolean(pending) || state?.phase !== "paused";
-  byId("goal-cancel").hidden = Boolean(pending) || !running;
-  byId("goal-go").textContent = words(link.newest.gate?.mode === "disarmed" ? "goal.arm" : "goal.go");
-  let text = "";
-  if (map.drawn) text = words("path.drawn", { metres: number(lengthOf(map.drawn), 1) });
-  else if (pending) text = words("goal.at", { x: number(pending[0]), y: number(pending[1]), yaw: degrees(pending[2]) });
-  else if (running) text = words("goal.state", { number: state.number, phase: goalPhase(state.phase), remaining: number(state.remaining, 1) });
-  else if (state?.outcome === "estopped") text = words("goal.estopped", { number: state.number });
-  else if (state) text = words("goal.ended", { number: state.number, text: state.text || reason(state.outcome) });
-  if (byId("goal-text").textContent !== text) byId("goal-text").textContent = text;
-}
-link.on("goal", showGoal);
-link.on("gate", showGoal);
-link.on("robot", showGoal);
-
-byId("goal-go").onclick = async () => {
-  const goal = map.pending;
-  const held = await stopDriving();
-  if (!outcome("map.goal", await link.ask({ do: "goal", goal, via: map.via }))) return;
-  map.pending = null;
-  map.via = [];
-  showGoal();
-  if (held) await letPlannersDrive();
-};
-byId("goal-via").onclick = () => {
-  map.via = [...map.via, map.pending.slice(0, 2)];
-  map.take("pending", null);
-  showGoal();
-  aim(true);
-};
-byId("path-go").onclick = async () => {
-  const held = await stopDriving();
-  if (!outcome("map.draw", await link.ask({ do: "track", points: map.drawn }))) return;
-  map.take("drawn", null);
-  showGoal();
-  if (held) await letPlannersDrive();
-};
-byId("goal-drop").onclick = () => {
-  map.drawn = null;
-  map.via = [];
-  map.take("pending", null);
-  showGoal();
-};
-for (const name of ["pause", "resume", "cancel"]) {
-  byId(`goal-${name}`).onclick = async () => outcome(`goal.${name}`, await link.ask({ do: "goal_control", order: name }));
-}
-
-function lengthOf(line) {
-  return line.slice(1).reduce((sum, [x, y], i) => sum + Math.hypot(x - line[i][0], y - line[i][1]), 0);
-}
 
 document.documentElement.dataset.ready = "true";

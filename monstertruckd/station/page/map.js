@@ -6,23 +6,26 @@ const COLOURS = ["map", "map-free", "map-wall", "map-grid", "scan", "trail", "ro
 const TRAIL_STEP = 0.03;
 const TRAIL_LENGTH = 6000;
 const POSES = 60;
-const DRAWN_STEP = 0.08; // metres between two points of a path that is drawn
-const DRAWN_MOST = 400;
 const ROUGH = 30; // millimetres of standard deviation that are drawn full
-const AIM = 0.15; // metres of dragging from which on it is a heading
+const GRASP = 18; // pixels from a place within which a press means it
 
 export class MapView {
-  constructor(canvas, link, onAim) {
+  constructor(canvas, link) {
     this.canvas = canvas;
     this.link = link;
-    this.onAim = onAim;
+    /** @type {import("./tools.js").Tool | null} what takes the presses; null = the map is moved by them */
+    this.tool = null;
+    /** @type {import("./tools.js").Tool | null} the tool of the finger that is down */
+    this.grip = null;
+    /** @type {{draw: (c: CanvasRenderingContext2D, px: number) => void}[]} what tools draw over the map */
+    this.overlays = [];
     this.centre = [0, 0];
     this.scale = 90; // pixels per metre
     this.rotation = 0;
     this.follow = true;
+    /** @type {((on: boolean) => void) | null} */
+    this.onFollow = null;
     this.headingUp = false;
-    this.aiming = false;
-    this.drawing = false;
     this.layers = { scan: true, trail: true, frontiers: false, points: true, ground: false, zones: true, ...JSON.parse(localStorage.getItem("layers") ?? "{}") };
     this.pointers = new Map();
     this.clear();
@@ -51,12 +54,9 @@ export class MapView {
     this.canvas.dataset.drawn = false;
     this.tiles = new Map();
     this.path = this.route = null;
-    this.pending = this.drawn = null;
-    this.via = [];
     this.goal = null;
     this.ground = null;
     this.zones = [];
-    this.corners = null;
     this.wanted = 0;
     this.dirty = true;
   }
@@ -263,20 +263,26 @@ export class MapView {
     return [this.width / 2 + this.scale * (c * dx - s * dy), this.height / 2 - this.scale * (s * dx + c * dy)];
   }
 
+  /** Index of the nearest of some places that a press there means; -1 = none. */
+  nearest(places, [x, y]) {
+    const distances = places.map((place) => Math.hypot(place.x - x, place.y - y));
+    const least = Math.min(...distances);
+    return least * this.scale <= GRASP ? distances.indexOf(least) : -1;
+  }
+
   press(event) {
     this.canvas.setPointerCapture(event.pointerId);
     this.pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
-    if (this.drawing && this.pointers.size === 1) this.take("drawn", [this.toWorld(event.offsetX, event.offsetY)]);
-    if (this.corners && this.pointers.size === 1) {
-      this.corners.push(this.toWorld(event.offsetX, event.offsetY));
-      this.onCorners?.();
-      this.dirty = true;
-    }
-    if (this.aiming && this.pointers.size === 1) {
-      const [x, y] = this.toWorld(event.offsetX, event.offsetY);
-      this.pending = [x, y, this.pose ? Math.atan2(y - this.pose[1], x - this.pose[0]) : 0];
-      this.dirty = true;
-    }
+    if (this.pointers.size > 1) this.letGo(true); // two fingers move the map
+    else this.grip = this.tool;
+    this.grip?.press(this.toWorld(event.offsetX, event.offsetY));
+    this.dirty = true;
+  }
+
+  letGo(cancelled) {
+    const { grip } = this;
+    this.grip = null;
+    grip?.release(cancelled);
   }
 
   drag(event) {
@@ -284,16 +290,8 @@ export class MapView {
     if (!before) return;
     const now = [event.offsetX, event.offsetY];
     this.pointers.set(event.pointerId, now);
-    if (this.drawing && this.drawn && this.pointers.size === 1) {
-      const [x, y] = this.toWorld(...now);
-      const [lx, ly] = this.drawn.at(-1);
-      if (Math.hypot(x - lx, y - ly) > DRAWN_STEP && this.drawn.length < DRAWN_MOST) this.drawn.push([x, y]);
-    } else if (this.corners?.length && this.pointers.size === 1) {
-      this.corners[this.corners.length - 1] = this.toWorld(...now);
-    } else if (this.aiming && this.pointers.size === 1) {
-      const [x, y] = this.toWorld(...now);
-      const [gx, gy] = this.pending;
-      if (Math.hypot(x - gx, y - gy) > AIM) this.pending[2] = Math.atan2(y - gy, x - gx);
+    if (this.grip) {
+      this.grip.drag(this.toWorld(...now));
     } else if (this.pointers.size === 2) {
       const [a, b] = [...this.pointers.values()];
       const other = a === now ? b : a;
@@ -313,15 +311,8 @@ export class MapView {
   }
 
   release(event) {
-    if (!this.pointers.delete(event.pointerId) || this.pointers.size) return;
-    if (this.drawing) {
-      const line = event.type === "pointercancel" || !this.drawn || this.drawn.length < 2 ? null : this.drawn;
-      this.take("drawn", line);
-      if (line) this.onAim(null, line);
-    }
-    if (!this.aiming) return;
-    if (event.type === "pointercancel") this.pending = null;
-    this.onAim(this.pending);
+    if (!this.pointers.delete(event.pointerId)) return;
+    this.letGo(event.type === "pointercancel");
     this.dirty = true;
   }
 
@@ -353,24 +344,9 @@ export class MapView {
     this.dirty = true;
   }
 
-  setAiming(aiming) {
-    this.aiming = aiming;
-    if (aiming) this.pending = null;
-    this.canvas.classList.toggle("aiming", aiming);
-    this.dirty = true;
-  }
-
-  /** Corners of a zone that is being drawn, to which presses add; null ends it. */
-  setCorners(corners) {
-    this.corners = corners;
-    this.canvas.classList.toggle("aiming", Boolean(corners) || this.aiming || this.drawing);
-    this.dirty = true;
-  }
-
-  setDrawing(drawing) {
-    this.drawing = drawing;
-    if (drawing) this.pending = this.drawn = null;
-    this.canvas.classList.toggle("aiming", drawing || this.aiming);
+  setTool(tool) {
+    this.tool = tool;
+    this.canvas.classList.toggle("aiming", tool !== null);
     this.dirty = true;
   }
 
@@ -427,9 +403,8 @@ export class MapView {
     this.drawGhost(c, px);
     if (this.pose) this.drawTruck(c, px);
     this.drawPast(c, px);
-    if (this.goal) this.drawGoal(c, [this.goal.x, this.goal.y, this.goal.yaw], px, this.colour.goal);
-    this.drawPlaces(c, px);
-    if (this.pending) this.drawGoal(c, this.pending, px, this.colour.accent);
+    this.drawFrontier(c, px);
+    for (const each of this.overlays) each.draw(c, px);
     c.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
     this.drawScale(c);
   }
@@ -452,7 +427,6 @@ export class MapView {
       c.globalAlpha = 1;
       if (!image) this.label(c, px, ...corners[0], name);
     }
-    if (this.corners?.length) this.drawZone(c, px, this.corners, this.colour.accent);
   }
 
   drawZone(c, px, corners, colour) {
@@ -581,14 +555,10 @@ export class MapView {
     c.fill();
   }
 
-  /** Drawn path, waypoints, where an exploration goes, and points of interest. */
-  drawPlaces(c, px) {
-    if (this.drawn) this.stroke(c, this.drawn, this.colour.accent, 3 * px);
-    if (this.via.length) this.stroke(c, [...(this.pose ? [this.pose] : []), ...this.via, ...(this.pending ? [this.pending] : [])], this.colour.accent, 1.5 * px, [4 * px, 4 * px]);
-    this.via.forEach(([x, y], i) => this.mark(c, px, x, y, this.colour.accent, String(i + 1)));
-    const { explore, points } = this.link.newest;
+  /** Where an exploration goes. */
+  drawFrontier(c, px) {
+    const { explore } = this.link.newest;
     if (this.layers.frontiers && explore?.target && explore.phase !== "idle") this.mark(c, px, explore.target.x, explore.target.y, this.colour.frontier, "");
-    if (this.layers.points) for (const { x, y, name } of points?.points ?? []) this.mark(c, px, x, y, this.colour.point, name ?? "");
   }
 
   mark(c, px, x, y, colour, label) {

@@ -1,21 +1,14 @@
 // The panels beside the map: safety gate, truck, system, events, banners.
+import { byId, element } from "./dom.js";
 import { wheelAngles } from "./geometry.js";
 import { Past } from "./series.js";
 import { degrees, modeText, moves, number, reason, words } from "./words.js";
 
-const byId = (id) => document.getElementById(id);
-const KEPT = 300;
 const SILENT = 1.0;
 const OLD = 3.0; // seconds after which a value that the robot no longer says has its age
 const HOT = 80; // degrees of the computer
 const POOR = 250; // ms there and back from which on the slower link is named
 const LATE = 0.02; // seconds: one control tick
-
-export function element(name, fields = {}, ...children) {
-  const made = Object.assign(document.createElement(name), fields);
-  made.append(...children);
-  return made;
-}
 
 function svg(name, fields) {
   const made = document.createElementNS("http://www.w3.org/2000/svg", name);
@@ -53,13 +46,8 @@ export class Panels {
     this.seen = new Set();
     this.pictures = new Past(1); // seconds between two pictures: ten minutes of them are some 15 MB
     this.pointed = null;
-    this.early = []; // events that came before the robot's time was known
     link.on("robot", () => this.clear());
     link.on("stop", (stop) => this.showStop(stop));
-    link.on("event", (event) => {
-      this.early.push(event);
-      this.listEvents();
-    });
     link.on("health", (table) => this.showServices(table));
     link.on("late", ({ seconds }) => this.banner("late", words("banner.late", { seconds: number(seconds) }), "warn"));
     link.on("camera", (message) => this.showPicture(message));
@@ -67,15 +55,12 @@ export class Panels {
     this.buildTop();
     this.buildHorizon();
     this.tabs();
-    byId("events-least").onchange = ({ target }) => (byId("events").dataset.least = target.value);
     setInterval(() => this.refresh(), 100);
   }
 
   clear() {
     this.seen.clear();
     this.pictures.clear();
-    this.early = [];
-    byId("events").replaceChildren();
     byId("services").replaceChildren();
     byId("banners").replaceChildren();
     byId("chain").hidden = byId("stopped").hidden = true;
@@ -102,7 +87,6 @@ export class Panels {
   refresh() {
     const { newest } = this.link;
     const gate = this.alive ? newest.gate : null;
-    this.listEvents();
     this.showLink();
     this.showGate(gate);
     if (!byId("pane-truck").hidden) this.showTruck();
@@ -189,16 +173,14 @@ export class Panels {
     const cause = stop.causes[0];
     const seconds = number(Math.max((gate.stamp - stop.stamp) / 1e9, 0), 0);
     const remedy = words(`remedy.${stop.reason}`);
-    const text = words("stopped", { time: this.clockTime(stop.stamp), seconds, why: cause.text || reason(cause.reason), source: cause.source });
+    const text = words("stopped", { time: this.dateOf(stop.stamp).toLocaleTimeString(), seconds, why: cause.text || reason(cause.reason), source: cause.source });
     setText("stopped", remedy === `remedy.${stop.reason}` ? text : `${text} ${remedy}`);
   }
 
-  /** Local time of a stamp of the robot's clock, by the newest state of the gate and when it came. */
-  clockTime(stamp) {
+  /** When a stamp of the robot's clock was, by the newest state of the gate and when it came. */
+  dateOf(stamp) {
     const { gate } = this.link.newest;
-    if (!gate) return "";
-    const ago = (gate.stamp - stamp) / 1e6 + 1000 * this.link.age("gate");
-    return new Date(Date.now() - ago).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit" });
+    return new Date(Date.now() - (gate.stamp - stamp) / 1e6 - 1000 * this.link.age("gate"));
   }
 
   showStop(stop) {
@@ -208,28 +190,6 @@ export class Panels {
       return element("li", {}, element("span", { textContent: cause.text || reason(cause.reason) }),
         element("small", { textContent: ` ${cause.source}${before > 0.005 ? `, ${words("cause.since", { seconds: number(before) })}` : ""}` }));
     }));
-  }
-
-  /** List the events that have come, once the robot's time is known. */
-  listEvents() {
-    if (this.link.newest.gate) for (const event of this.early.splice(0)) this.addEvent(event);
-  }
-
-  /** An event; one like the newest is counted there. */
-  addEvent(event) {
-    const list = byId("events");
-    const text = event.text || reason(event.reason);
-    const key = `${event.severity}|${event.source}|${event.reason}|${text.replace(/[0-9.]+/g, "#")}`;
-    const last = list.firstElementChild;
-    const again = last?.dataset.key === key;
-    const count = again ? Number(last.dataset.count) + 1 : 1;
-    const first = again ? last.dataset.first : this.clockTime(event.stamp);
-    const item = element("li", { className: event.severity },
-      element("span", { textContent: text }), ...(count > 1 ? [element("b", { textContent: words("events.count", { count }) })] : []),
-      element("small", { textContent: `${count > 1 ? words("events.since", { first, last: this.clockTime(event.stamp) }) : first} · ${event.source} · ${reason(event.reason)}` }));
-    Object.assign(item.dataset, { key, count, first });
-    again ? last.replaceWith(item) : list.prepend(item);
-    while (list.children.length > KEPT) list.lastChild.remove();
   }
 
   showServices({ services }) {
@@ -398,11 +358,11 @@ export class Panels {
   }
 
   tabs() {
-    const tabs = [...document.querySelectorAll("[role=tab]")];
+    const tabs = /** @type {HTMLElement[]} */ ([...document.querySelectorAll("[role=tab]")]);
     const choose = (tab) => {
       for (const each of tabs) {
         const chosen = each === tab;
-        each.setAttribute("aria-selected", chosen);
+        each.setAttribute("aria-selected", String(chosen));
         each.tabIndex = chosen ? 0 : -1;
         if (chosen) each.scrollIntoView({ block: "nearest", inline: "nearest" });
         byId(each.getAttribute("aria-controls")).hidden = !chosen;

@@ -1,23 +1,28 @@
 // The pane of live plots: any number of any topic, in panels that the user pins, with one cursor for them, the map and the camera.
-import { element } from "./panels.js";
+import { byId, element } from "./dom.js";
 import { Table, titleOf, unitIn } from "./series.js";
 import { number, words } from "./words.js";
 
-const byId = (id) => document.getElementById(id);
 const COLOURS = ["route", "scan", "goal", "ghost", "deformed", "frontier"];
 const HEIGHT = 150;
 const PAUSE = 250; // ms between two drawings of a panel
 const MOST = 100; // numbers that the station sends one browser
 
 /**
- * @typedef {{names: string[], plot?: object, box?: HTMLElement, at?: number}} Panel
+ * @typedef {{names: string[], units?: {name: string, factor: number}[], plot?: any, box?: HTMLElement, at?: number}} Panel
  */
 export class Plots {
-  /** page: outcome shows an answer, pointed is called with the time that the cursor is at, or null. */
+  /**
+   * @param {import("./socket.js").Link} link
+   * @param {import("./dom.js").Page} page
+   */
   constructor(link, page) {
-    Object.assign(this, { link, ...page });
+    this.link = link;
+    this.page = page;
     this.table = new Table();
     this.set = 0;
+    /** @type {any} the library, once the pane was shown */
+    this.uPlot = null;
     this.meanings = null;
     this.cursor = null;
     /** @type {Panel[]} */
@@ -49,14 +54,14 @@ export class Plots {
     this.table.choose(names);
     if (!names.length && !this.set) return;
     const answer = await this.link.ask({ do: "plot", set: ++this.set, names });
-    if (this.link.open) this.outcome("tab.plots", answer);
+    if (this.link.open) this.page.outcome("tab.plots", answer);
   }
 
   /** Load what only this pane needs, once. */
   async begin() {
     if (this.meanings) return;
     const [listed, { default: uPlot }] = await Promise.all([this.link.ask({ do: "numbers" }), import("./uplot.js")]);
-    if (!this.outcome("tab.plots", listed)) return;
+    if (!this.page.outcome("tab.plots", listed)) return;
     if (!document.querySelector("link[href='/page/uplot.css']")) document.head.append(element("link", { rel: "stylesheet", href: "/page/uplot.css" }));
     this.meanings = listed.value.numbers;
     this.uPlot = uPlot;
@@ -111,7 +116,7 @@ export class Plots {
     for (const panel of this.panels) panel.plot?.destroy();
     byId("plots").replaceChildren(...this.panels.map((panel, i) => this.build(panel, i)));
     const into = byId("plot-into").value;
-    byId("plot-into").replaceChildren(new Option(words("plots.new"), ""), ...this.panels.map((_, i) => new Option(words("plots.into", { number: i + 1 }), i)));
+    byId("plot-into").replaceChildren(new Option(words("plots.new"), ""), ...this.panels.map((_, i) => new Option(words("plots.into", { number: i + 1 }), String(i))));
     byId("plot-into").value = this.panels[into] ? into : "";
     byId("plots-none").hidden = this.panels.length > 0;
   }
@@ -141,7 +146,7 @@ export class Plots {
       scales: { x: { time: false } },
       series: [{}, ...panel.names.map((_, j) => ({ stroke: colour(COLOURS[j % COLOURS.length]), width: 1.5, scale: `y ${panel.units[j].name}`, spanGaps: true, points: { show: false } }))],
       axes: [
-        { ...text, size: 26, values: (plot, ticks) => ticks.map((tick) => `${Math.round(tick - this.until())} s`) },
+        { ...text, size: 26, values: (_plot, ticks) => ticks.map((tick) => `${Math.round(tick - this.until())} s`) },
         ...units.map((unit, j) => ({ ...text, scale: `y ${unit}`, side: j % 2 ? 1 : 3, size: 44, label: unit || undefined, labelSize: unit ? 14 : 0, labelFont: "11px system-ui, sans-serif", grid: { ...text.grid, show: j === 0 } })),
       ],
       hooks: { setCursor: [(plot) => this.point(plot)] },
@@ -164,7 +169,7 @@ export class Plots {
     const at = plot.cursor.idx == null ? null : plot.data[0][plot.cursor.idx] ?? null;
     if (at === this.cursor) return;
     this.cursor = at;
-    this.pointed(at);
+    this.page.pointed(at);
     for (const panel of this.panels) this.label(panel);
   }
 
@@ -184,6 +189,7 @@ export class Plots {
     this.label(panel);
   }
 
+  /** @param {Panel} panel */
   label({ names, units, box }) {
     const at = this.cursor ?? this.until();
     const outputs = box?.querySelectorAll("output") ?? [];

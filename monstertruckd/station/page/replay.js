@@ -1,7 +1,6 @@
 // The time bar of a recording that is shown in place of a robot.
+import { byId } from "./dom.js";
 import { number, words } from "./words.js";
-
-const byId = (id) => document.getElementById(id);
 
 export class ReplayBar {
   /** watch: called with the robot's name when the recording is closed. */

@@ -16,6 +16,8 @@ export class Link {
     this.waiting = new Map();
     this.number = 0;
     this.robot = null;
+    /** @type {((command: any) => void) | null} is called with each command that has an outcome */
+    this.onAsk = null;
     setInterval(() => this.ping(), PING);
     this.connect();
   }

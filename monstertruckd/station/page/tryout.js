@@ -1,17 +1,24 @@
 // The pane of an emulated robot: faults of its devices, and obstacles that the next press on the map puts into its world.
-import { element } from "./panels.js";
+import { byId, element } from "./dom.js";
 import { words } from "./words.js";
 
-const byId = (id) => document.getElementById(id);
 const FAULTS = ["none", "unplugged", "deaf", "noise"];
 
 export class Tryout {
-  /** page: outcome shows an answer; aim(true) lets the next press on the map choose a place. */
-  constructor(link, page) {
-    Object.assign(this, { link, ...page });
-    this.placing = false;
+  button = "obstacle-add";
+  hint = "tryout.hint";
+
+  /**
+   * @param {import("./socket.js").Link} link
+   * @param {import("./tools.js").Tools} tools
+   * @param {import("./dom.js").Page} page
+   */
+  constructor(link, tools, page) {
+    this.link = link;
+    this.tools = tools;
+    this.page = page;
+    tools.add(this);
     link.on("emulated", (state) => this.show(state));
-    byId("obstacle-add").onclick = () => this.place(!this.placing);
     byId("obstacle-clear").onclick = () => this.ask({ do: "obstacle", at: null });
   }
 
@@ -28,21 +35,20 @@ export class Tryout {
     }));
   }
 
-  place(on) {
-    this.placing = on;
-    byId("obstacle-add").setAttribute("aria-pressed", on);
-    this.aim(on);
+  press(place) {
+    this.at = place;
   }
 
-  /** A place on the map was pressed; whether it was meant for an obstacle. */
-  take(pose) {
-    if (!this.placing) return false;
-    this.place(false);
-    if (pose) this.ask({ do: "obstacle", at: pose.slice(0, 2) });
-    return true;
+  drag(place) {
+    this.at = place;
+  }
+
+  release(cancelled) {
+    this.tools.choose(null);
+    if (!cancelled) this.ask({ do: "obstacle", at: this.at });
   }
 
   async ask(command) {
-    if (!this.outcome("tab.tryout", await this.link.ask(command))) this.show(this.link.newest.emulated);
+    if (!this.page.outcome("tab.tryout", await this.link.ask(command))) this.show(this.link.newest.emulated);
   }
 }

@@ -1,3 +1,4 @@
+// @ts-nocheck
 /*
 uPlot 1.6.32: dist/uPlot.iife.min.js of the npm package uplot, with an export as its last line.
 

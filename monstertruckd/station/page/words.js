@@ -2,13 +2,16 @@
 let table = {};
 const STILL = 0.005; // m/s and rad/s: less is standing
 
+/** @returns {any[]} elements that have this attribute */
+const having = (attribute) => [...document.querySelectorAll(`[${attribute}]`)];
+
 export async function loadWords() {
   table = await (await fetch("/strings.json")).json();
-  for (const element of document.querySelectorAll("[data-s]")) element.textContent = words(element.dataset.s);
-  for (const element of document.querySelectorAll("[data-aria]")) element.setAttribute("aria-label", words(element.dataset.aria));
-  for (const element of document.querySelectorAll("[data-alt]")) element.alt = words(element.dataset.alt);
-  for (const element of document.querySelectorAll("[data-hint]")) element.placeholder = words(element.dataset.hint);
-  for (const element of document.querySelectorAll("[data-label]")) {
+  for (const element of having("data-s")) element.textContent = words(element.dataset.s);
+  for (const element of having("data-aria")) element.setAttribute("aria-label", words(element.dataset.aria));
+  for (const element of having("data-alt")) element.alt = words(element.dataset.alt);
+  for (const element of having("data-hint")) element.placeholder = words(element.dataset.hint);
+  for (const element of having("data-label")) {
     element.setAttribute("aria-label", words(element.dataset.label));
     element.title = words(element.dataset.label);
   }

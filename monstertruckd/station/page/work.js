@@ -1,8 +1,6 @@
 // The panes of tasks, settings and recordings.
-import { element } from "./panels.js";
+import { byId, element } from "./dom.js";
 import { number, reason, words } from "./words.js";
-
-const byId = (id) => document.getElementById(id);
 
 function button(text, press, look = "") {
   const made = element("button", { textContent: text, className: look });
@@ -11,9 +9,13 @@ function button(text, press, look = "") {
 }
 
 export class Work {
-  /** page: outcome shows an answer; order, stopDriving, letPlannersDrive; watch is called with the name of a recording that is to be shown. */
+  /**
+   * @param {import("./socket.js").Link} link
+   * @param {import("./dom.js").Page} page
+   */
   constructor(link, page) {
-    Object.assign(this, { link, ...page });
+    this.link = link;
+    this.page = page;
     link.on("fetching", ({ name, share }) => {
       const bar = byId("recordings").querySelector(`[data-name="${name}"] progress`);
       if (bar) bar.value = share;
@@ -54,7 +56,7 @@ export class Work {
 
   async ask(what, command) {
     const answer = await this.link.ask(command);
-    this.outcome(what, answer);
+    this.page.outcome(what, answer);
     return answer;
   }
 
@@ -62,15 +64,15 @@ export class Work {
 
   /** Start a task and let planners drive. A robot is armed only when nothing else is in the way, and held until the task has begun, for it may have a path of its own. */
   async begin(what, command) {
-    const held = await this.stopDriving();
+    const held = await this.page.stopDriving();
     let answer = await this.link.ask(command);
     const arms = answer.reason === "disarmed";
     if (arms) {
-      if (!(await this.order("arm", { hold: true }))) return answer;
+      if (!(await this.page.order("arm", { hold: true }))) return answer;
       answer = await this.link.ask(command);
     }
-    const begun = this.outcome(what, answer);
-    if (begun && held) this.letPlannersDrive();
+    const begun = this.page.outcome(what, answer);
+    if (begun && held) this.page.letPlannersDrive();
     else if (!begun && arms) this.link.ask({ do: "order", order: "disarm" });
     return answer;
   }
@@ -157,7 +159,7 @@ export class Work {
   async loadSettings() {
     if (document.body.dataset.replay === "true") return;
     const answer = await this.link.ask({ do: "settings" });
-    if (!this.outcome("tab.settings", answer)) return;
+    if (!this.page.outcome("tab.settings", answer)) return;
     byId("settings").replaceChildren(...answer.value.settings.map((row) => this.setting(row)));
     this.filterSettings();
     byId("settings-save-row").hidden = !this.engineer;
@@ -181,7 +183,7 @@ export class Work {
     input.setAttribute("aria-describedby", `${id}-note`);
     const set = async (wanted) => {
       const answer = await this.link.ask({ do: "set", key, value: wanted, save: byId("settings-save").checked });
-      if (!this.outcome(key, answer)) input.value = shown(value);
+      if (!this.page.outcome(key, answer)) input.value = shown(value);
     };
     input.onchange = () => {
       if (input.value === shown(value)) return;
@@ -203,7 +205,7 @@ export class Work {
   async loadRecordings() {
     if (document.body.dataset.replay === "true") return;
     const answer = await this.link.ask({ do: "recordings" });
-    if (!this.outcome("tab.recordings", answer)) return;
+    if (!this.page.outcome("tab.recordings", answer)) return;
     const rows = answer.value.recordings;
     byId("recordings-none").hidden = rows.length > 0;
     byId("recordings").replaceChildren(...rows.map((row) => this.recording(row)));
@@ -227,11 +229,11 @@ export class Work {
       actions.replaceChildren(element("progress", { max: 1, value: 0, ariaLabel: words("recordings.fetching", { name }) }));
       const answer = await this.link.ask({ do: "replay", name });
       offer();
-      if (this.outcome("recordings.replay", answer)) this.watch(answer.value.robot);
+      if (this.page.outcome("recordings.replay", answer)) this.page.watch(answer.value.robot);
     };
     const confirm = () => {
       const sure = button(words("recordings.sure", { size: `${number(bytes / 1e6, 1)} MB` }), async () => {
-        if (this.outcome("recordings.delete", await this.link.ask({ do: "delete_recording", name }))) this.loadRecordings();
+        if (this.page.outcome("recordings.delete", await this.link.ask({ do: "delete_recording", name }))) this.loadRecordings();
       }, "danger");
       actions.replaceChildren(sure, button(words("recordings.keep"), offer));
       sure.focus();

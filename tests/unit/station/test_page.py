@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 import re
 import shlex
 from pathlib import Path
@@ -15,6 +16,7 @@ from monstertruck_schemas.body import LensConfig
 from monstertruck_schemas.event import Cause, Stop
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import GateMode, GateState
+from monstertruckd.station.pilot import read_mission
 from monstertruckd.tools.cli.main import app
 from tests.daemon.browser_kit import NEEDS_CHROMIUM, chromium
 from tests.unit.station.test_server import serving
@@ -217,9 +219,10 @@ async def a_zone_is_drawn_on_the_map_and_turned_off(page: Page) -> None:
     zone |= {"inside": "stop", "saved": True, "off_until": None}
     await say(page, {"kind": "zones", "m": {"zones": [zone], "inside": ["ramp"]}})
     await page.click("#tool-zone")
-    for x, y in ((300, 200), (420, 220), (380, 330)):
+    for place in ([-1, 1], [0.5, 1], [0.5, -0.5]):
         assert await page.is_disabled("#zone-add")
-        await page.click("#map", position={"x": x, "y": y})
+        await page.mouse.click(*await page.evaluate(PLACE, place))
+    await drag(page, await page.evaluate(PLACE, [0.5, -0.5]), await page.evaluate(PLACE, [0.5, -0.8]))
     await page.evaluate("void (window.sent = [])")
     await page.click("#zone-add")
     await page.click("#tab-tasks")
@@ -228,10 +231,143 @@ async def a_zone_is_drawn_on_the_map_and_turned_off(page: Page) -> None:
     sent = json.loads(await page.evaluate("JSON.stringify(window.sent)"))
     add, off = (each for each in sent if each["do"] == "zone")
     assert (add["order"], add["area"]["kind"], add["area"]["inside"]) == ("add", "keepout", "stop")
-    assert len(add["area"]["corners"]) == 3
+    corners = [value for corner in add["area"]["corners"] for value in corner]
+    assert corners == pytest.approx([-1, 1, 0.5, 1, 0.5, -0.8], abs=0.02), "a corner that is dragged is no new one"
     assert (off["order"], off["name"], off["seconds"]) == ("off", "ramp", 600)
     await page.click("#zone-drop")
+    await page.click("#tool-zone")
+    x, y = await page.evaluate(PLACE, [1, 0])
+    await drag(page, (x, y), (x, y + 90))
+    assert await page.input_value("#zone-name") == "ramp", "a zone that is there is edited"
+    await page.evaluate("void (window.sent = [])")
+    await page.click("#zone-add")
+    (edited,) = await asked(page)
+    assert (edited["name"], edited["area"]["kind"], edited["area"]["limit"]) == ("ramp", "speed", 0.1)
+    assert edited["area"]["corners"][1] == pytest.approx([1, -1], abs=0.02)
+    await answer(page, edited)
+    await page.wait_for_selector("#zone", state="hidden")
     await page.click("#tab-drive")
+
+
+async def places_are_marked_moved_renamed_driven_to_and_removed_on_the_map(page: Page) -> None:
+    assert not await page.is_visible("#tool-point"), "the robot keeps none"
+    point = {"name": "door", "kind": "mark", "x": 1.0, "y": 0.0, "yaw": 0.0}
+    tag = {"name": "tag-3", "kind": "tag", "x": -1.0, "y": 0.0, "yaw": 0.0}
+    await say(page, {"kind": "points", "m": {"points": [point, tag]}})
+    await page.click("#tool-point")
+    await page.evaluate("void (window.sent = [])")
+    x, y = await page.evaluate(PLACE, [0, 1])
+    await drag(page, (x, y), (x, y - 60))
+    await page.fill("#point-name", "door")
+    assert await page.is_disabled("#point-save"), "another point's name"
+    await page.fill("#point-name", "bench")
+    await page.click("#point-save")
+    (marked,) = await asked(page)
+    assert (marked["order"], marked["name"], marked["place"]) == ("mark", "bench", pytest.approx([0, 1], abs=0.02))
+    assert marked["yaw"] == pytest.approx(math.pi / 2, abs=0.03), "dragged upwards"
+    await answer(page, marked)
+    await page.wait_for_selector("#point", state="hidden")
+
+    x, y = await page.evaluate(PLACE, [1, 0])
+    await drag(page, (x, y), (x + 90, y))
+    await page.fill("#point-name", "gate")
+    await page.click("#point-save")
+    (moved,) = await asked(page)
+    assert (moved["order"], moved["name"], moved["place"]) == ("mark", "gate", pytest.approx([2, 0], abs=0.02))
+    await answer(page, moved)
+    await page.wait_for_function("window.sent.length > 0")
+    (gone,) = await asked(page)
+    assert (gone["order"], gone["name"]) == ("remove", "door")
+    await answer(page, gone)
+
+    x, y = await page.evaluate(PLACE, [-1, 0])
+    await page.mouse.click(x, y)
+    assert await page.is_disabled("#point-name"), "a tag is where the camera sees it"
+    await page.click("#point-go")
+    (goal,) = await asked(page)
+    assert goal["goal"] == pytest.approx([-0.3, 0, math.pi]), "it faces the tag"
+    await answer(page, goal, ok=False, reason="busy", text="a mission runs")
+    await page.click("#point-remove")
+    (gone,) = await asked(page)
+    assert gone["name"] == "tag-3"
+    await answer(page, gone)
+    await page.click("#tool-point")
+    await page.click("#tab-tasks")
+    assert await page.locator("#points li").count() == 2
+    await page.click("#point-here")
+    (here,) = await asked(page)
+    assert here == {"do": "point", "order": "mark", "name": "place-1", "id": here["id"]}
+    await answer(page, here)
+
+
+async def a_mission_is_drawn_on_the_map_run_and_watched(page: Page) -> None:
+    point = {"name": "door", "kind": "mark", "x": 1.0, "y": 0.0, "yaw": 0.0}
+    await say(page, FACTS, {"kind": "points", "m": {"points": [point]}})
+    assert not await page.is_visible("#tool-mission"), "the robot has no planner"
+    await say(page, FACTS | {"goals": True})
+    await page.click("#tool-mission")
+    for place in ([0, 1], [1, 0], [0, -1], [-1, -1]):
+        x, y = await page.evaluate(PLACE, place)
+        await page.mouse.click(x, y)
+    x, y = await page.evaluate(PLACE, [0, 1])
+    await drag(page, (x, y), (x - 90, y))
+    await page.locator("#mission-stops button").last.click()
+    assert await page.locator("#mission-stops li").all_inner_texts() == [
+        "-1.00, 1.00 m, 0°×",
+        "door×",
+        "0.00, -1.00 m, -135°×",
+    ]
+    await page.fill("#mission-name", "Not a name")
+    assert await page.is_disabled("#mission-run")
+    await page.fill("#mission-name", "patrol")
+    await page.fill("#mission-rounds", "3")
+    await page.evaluate("void (window.sent = [])")
+    async with page.expect_download() as download:
+        await page.click("#mission-keep")
+    assert (await download.value).suggested_filename == "patrol.yaml"
+    await page.click("#mission-run")
+    (order,) = await asked(page)
+    mission = read_mission(order["text"])
+    loop, home = mission.steps
+    assert (mission.name, loop.do, loop.times, home.do) == ("patrol", "repeat", 3, "return")
+    first, door, last = loop.steps
+    assert (door.do, door.point) == ("goto_point", "door")
+    assert (first.x, first.y, last.x, last.y) == pytest.approx((-1, 1, 0, -1), abs=0.02)
+    await answer(page, order)
+    await page.wait_for_selector("#mission", state="hidden")
+    assert await page.evaluate(STOPS) == [1, 1, -1]
+    await say(page, {"kind": "robot", "name": "truck"}, FACTS)
+
+
+STOPS = """
+async () => {
+  const { stopOf } = await import("/page/mission.js");
+  return ["1.2", "2", null].map((node) => stopOf({ running: true, node }, [1, 2, 3]));
+}
+"""
+PLACE = """
+([x, y]) => {
+  const { left, top, width, height } = document.querySelector("#map").getBoundingClientRect();
+  return [left + width / 2 + 90 * x, top + height / 2 - 90 * y];
+}
+"""
+"""Where a place in map is on the screen, before the robot has a pose."""
+
+
+async def drag(page: Page, start: tuple[float, float], end: tuple[float, float]) -> None:
+    await page.mouse.move(*start)
+    await page.mouse.down()
+    await page.mouse.move(*end, steps=4)
+    await page.mouse.up()
+
+
+async def asked(page: Page) -> list[dict[str, Any]]:
+    """What the page has asked since the last call."""
+    return list(await page.evaluate("window.sent.splice(0).filter((each) => each.id !== undefined)"))
+
+
+async def answer(page: Page, command: dict[str, Any], **outcome: Any) -> None:
+    await say(page, {"kind": "answer", "id": command["id"], "ok": True, **outcome})
 
 
 async def a_robot_without_a_map_is_called_so(page: Page) -> None:
@@ -475,17 +611,33 @@ async def events_have_times_are_counted_and_filtered(page: Page) -> None:
     for text in ("late by 4 ms", "late by 50 ms"):
         await say(page, {"kind": "event", "m": event | {"text": text}})
     await say(page, {"kind": "event", "m": event | {"text": "armed", "severity": "info"}})
+    for text in ("late by 5 ms", "armed"):
+        severity = "info" if text == "armed" else "warning"
+        await say(page, {"kind": "event", "m": event | {"text": text, "severity": severity}})
     await page.click("#tab-events")
-    await page.wait_for_function("() => document.querySelectorAll('#events li').length === 2")
-    newest, before = await page.locator("#events li").all_inner_texts()
-    assert "late by 50 ms" in before
-    assert "3 times" in before
-    assert re.search(r"\d\d:\d\d:\d\d", newest)
-    assert re.search(r"\d\d:\d\d:\d\d.* to \d\d:\d\d:\d\d", before)
+    rows = page.locator("#events > li")
+    assert await rows.count() == 2, "alike are one row, whatever came between"
+    newest, before = await rows.all_inner_texts()
+    assert "2 times" in newest
+    assert "late by 5 ms" in before
+    assert re.search(r"4 times, \d\d:\d\d:\d\d.* to \d\d:\d\d:\d\d", before)
+    assert await rows.last.locator("button").count() == 4, "each with its own moment"
+    await rows.last.locator("summary").click()
+    await page.evaluate("void (window.sent = [])")
+    await rows.last.locator("button").first.click()
+    (listing,) = await asked(page)
+    files = [("run-2-0", 9e12, False), ("run-3-1", 2e12, True), ("run-3-0", 1.0, False)]
+    recordings = [{"name": name, "modified": at, "kind": "run", "open": is_open} for name, at, is_open in files]
+    await answer(page, listing, value={"recordings": recordings})
+    await page.wait_for_function("window.sent.some((each) => each.do === 'replay')")
+    (replay,) = await asked(page)
+    assert (replay["name"], replay["stamp"]) == ("run-2-0", 10**9), "the first that ended later"
+    await answer(page, replay, ok=False, reason="busy", text="somebody else downloads")
+    await expect(page.locator("#refusal")).to_contain_text("somebody else downloads")
     await page.select_option("#events-least", "error")
-    assert await page.locator("#events li:visible").count() == 0
+    assert await page.locator("#events > li:visible").count() == 0
     await page.select_option("#events-least", "warning")
-    assert await page.locator("#events li:visible").count() == 1
+    assert await page.locator("#events > li:visible").count() == 1
     await page.click("#tab-drive")
 
 
@@ -780,6 +932,12 @@ COMMANDS: list[tuple[dict[str, Any], str | None]] = [
     ({"do": "set", "key": "gate.speed", "value": 0.1, "save": True}, "set --save gate.speed 0.1"),
     ({"do": "set", "key": "gate.speed", "value": -1, "save": False}, "set gate.speed -- -1"),
     ({"do": "settings"}, "get"),
+    (
+        {"do": "point", "order": "mark", "name": "door", "place": [1, -2], "yaw": 3.14159},
+        "points mark door -- 1 -2 180",
+    ),
+    ({"do": "point", "order": "remove", "name": "door"}, "points remove door"),
+    ({"do": "zone", "order": "off", "name": "ramp", "seconds": 600}, "zone off ramp"),
     ({"do": "calibrate", "order": "start", "step": "battery.gain"}, "calibrate battery"),
     ({"do": "calibrate", "order": "list"}, None),
     ({"do": "hand_over", "to": "ann"}, None),
@@ -863,6 +1021,8 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page)
         await a_robot_without_a_map_is_called_so(page)
         await a_zone_is_drawn_on_the_map_and_turned_off(page)
+        await places_are_marked_moved_renamed_driven_to_and_removed_on_the_map(page)
+        await a_mission_is_drawn_on_the_map_run_and_watched(page)
         await what_a_sensor_said_long_ago_is_not_shown_as_of_now(page)
         await a_stop_is_shown_with_its_chain_of_causes(page)
         await a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page)

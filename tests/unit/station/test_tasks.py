@@ -414,6 +414,17 @@ async def test_a_recording_that_nobody_looks_at_makes_room_for_another(monkeypat
             await station.replay(address, "run-3.mcap", "", viewer)
         station.replays[titles[2]].detach(viewer)
 
+        begin = station.replays[titles[2]]._begin
+        assert await station.replay(address, "run-2.mcap", "", viewer, begin + 7 * SECOND) == titles[2]
+        station.replays[titles[2]].attach(viewer)
+        state = of(await shown(viewer), "replay")[-1]
+        assert (state["at"], state["playing"]) == (7.0, False)
+        station.replays[titles[2]].detach(viewer)
+        grown = station.replays[titles[2]]
+        with pytest.raises(InputError, match="does not hold this moment"):
+            await station.replay(address, "run-2.mcap", "", viewer, begin + 70 * SECOND)
+        assert station.replays[titles[2]] is not grown, "it was fetched again: it may have grown"
+
         def unreadable(file):
             raise InputError(f"{file.name}: no log")
 
