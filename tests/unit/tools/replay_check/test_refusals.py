@@ -101,7 +101,7 @@ def test_the_table_says_what_came_again():
 
 def test_the_table_says_how_far_and_when(tmp_path):
     log = changed(LEVEL, tmp_path / "log.mcap", flip("sensor/compass", 100, digit("heading", 1), bit=4))
-    done = run(log, "--check")
+    done = run(log, "--check", "--tolerance", "1e-6")
     assert done.exit_code == Reason.REPLAY_DIFFERS.exit_code
     assert "° at " in done.output
     assert "first difference: state/" in done.output
@@ -110,11 +110,11 @@ def test_the_table_says_how_far_and_when(tmp_path):
 
 def test_json_says_the_same(tmp_path):
     log = changed(LEVEL, tmp_path / "log.mcap", flip("sensor/compass", 100, digit("heading", 1), bit=4))
-    done = run(log, "--check", "--json")
+    done = run(log, "--check", "--json", "--tolerance", "1e-6")
     assert done.exit_code == Reason.REPLAY_DIFFERS.exit_code
     figures = json.loads(done.stdout)
     assert figures["reason"] == "replay_differs"
-    assert figures["compared"] > figures["equal"] > 1000
+    assert figures["compared"] > figures["equal"] > 500
     assert figures["first_difference"] == figures["topics"]["state/odometry"]["first_difference"]
     assert figures["topics"]["state/odometry"]["greatest"]["rad"]["value"] > 0
 
