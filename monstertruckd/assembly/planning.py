@@ -1,6 +1,7 @@
 """Builds path source, tracker, goals, levelling and map picture of a configuration, each with its ends of the bus."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Final
 
 from monstertruck_drivers.config import Devices
@@ -22,6 +23,7 @@ from monstertruck_planners.goals.service import GoalService
 from monstertruck_planners.missions.service import MissionInputs, MissionParts, MissionService
 from monstertruck_planners.steps import DEFORMING, EXPLORING, PLANNING, PLANNING_BY_KIND, STEPS, TRACKING
 from monstertruck_planners.track.config import TrackerConfig
+from monstertruck_planners.track.drivable import require_drivable
 from monstertruck_planners.track.paths import PathService, load_path
 from monstertruck_planners.track.service import TrackerService, TrackSetup
 from monstertruck_planners.zones.service import ZoneInputs, ZoneService
@@ -47,10 +49,12 @@ from monstertruckd.config.truck import PathConfig, TruckConfig
 from monstertruckd.recorder.picture import MapService
 
 
-def _drawn(config: PathConfig, frame: str, events: EventSink) -> Path | None:
-    """The configured path; None, and an event, if its file cannot be used."""
+def _drawn(config: PathConfig, frame: str, drivable: Callable[[Path], None], events: EventSink) -> Path | None:
+    """The configured path; None, and an event, if its file cannot be used or the body cannot drive it."""
     try:
-        return load_path(config.file, closed=config.closed, frame=frame)
+        path = load_path(config.file, closed=config.closed, frame=frame)
+        drivable(path)
+        return path
     except InputError as error:
         text = f"{error}; the robot starts without this path"
         events(Reason.FILE_DAMAGED, Severity.WARNING, ServiceName.PATH.value, text)
@@ -77,8 +81,9 @@ def build_planners(
         tracker = config.tracker.model_copy(update={"angle": min(config.tracker.angle, body.chassis.reached_angle)})
         paths = bus.publisher(topics.PATH, Writer.PLANNER)
         frame = "odom" if config.slam is None else "map"
+        drivable = partial(require_drivable, config=tracker, geometry=body.chassis.bicycle)
         yield PathService(
-            None if config.path is None else _drawn(config.path, frame, bus.event_sink()),
+            None if config.path is None else _drawn(config.path, frame, drivable, bus.event_sink()),
             config.emulated,
             clock,
             bus.subscribe(topics.REQ_PATH, fifo(4)),
@@ -88,6 +93,8 @@ def build_planners(
             paths,
             bus.event_sink(),
             config.gate.max_request_age,
+            drivable,
+            inline if isinstance(clock, VirtualClock) else in_thread,
         )
         yield _build_tracker(config, tracker, bus, clock, body, requests, actors)
         if config.own_planner is not None:

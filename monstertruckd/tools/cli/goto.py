@@ -1,5 +1,6 @@
 """``goto``, ``track`` and ``path``: send the robot to a pose or along a path, and follow it there; ``convert-path``."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -7,7 +8,7 @@ import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.path_forms import PathForm
-from monstertruckd.tools.cli.connection import require_section, with_robot
+from monstertruckd.tools.cli.connection import require_section, robot_config, with_robot
 from monstertruckd.tools.cli.options import (
     HEADING,
     EndpointOption,
@@ -17,12 +18,13 @@ from monstertruckd.tools.cli.options import (
     parse_pose,
     require_finite,
 )
-from monstertruckd.tools.cli.output import JsonOption, print_end, print_json
+from monstertruckd.tools.cli.output import JsonOption, print_end, print_json, remark
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
     from monstertruck_runtime.drives import Arrival
+    from monstertruck_schemas.plan import Path as PathMessage
 
 ROUTE_TIMEOUT: Final = 6.0
 """Seconds to wait for a first route."""
@@ -73,6 +75,9 @@ def track(
     file: PathArgument,
     closed: ClosedOption = False,
     columns: ColumnsOption = None,
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Turn with changes of direction where the robot cannot follow the path.")
+    ] = False,
     arm: ArmOption = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
@@ -80,8 +85,8 @@ def track(
 ) -> None:
     """Send a path to the robot and follow how it is driven.
 
-    Ends at its end or when it is lost, with the reason's exit code. Ctrl-C stops the robot; armed later, it does not
-    resume the path.
+    The robot refuses a path that it cannot drive and names the place. Ends at its end or when it is lost, with the
+    reason's exit code. Ctrl-C stops the robot; armed later, it does not resume the path.
     """
     from monstertruck_planners.track.paths import load_path
     from monstertruck_runtime.drives import follow
@@ -93,11 +98,40 @@ def track(
     async def main(client: "TruckClient", clock: "Clock") -> "Arrival":
         localised = (await client.call("config")).get("slam") is not None
         there = path.model_copy(update={"frame": "map" if localised else "odom"})
+        if repair:
+            there = await _repaired(client, there)
         with on_the_terminal() as report:
             return await follow(client, clock, there, arm=arm, report=report)
 
     end = with_robot(main, robot, endpoint, ROUTE_TIMEOUT)
     print_end(end.reason, end.text, end.as_json(), json_output=json_output)
+
+
+async def _repaired(client: "TruckClient", path: "PathMessage") -> "PathMessage":
+    """Return a path that the robot can drive, and print what was changed.
+
+    Raises:
+        InputError: a bend has no replacement that is free on the robot's map.
+        NotFoundError: the robot has no tracker.
+    """
+    from monstertruck_planners.collision import DistanceField, Footprint
+    from monstertruck_planners.route.repair import repaired
+    from monstertruck_schemas.topics import MAP
+
+    await require_section(client, "tracker", "follows no paths")
+    config = await robot_config(client)
+    assert config.tracker is not None
+    chassis, grid = config.chassis(), await client.get_retained(MAP)
+    tracker = config.tracker.model_copy(update={"angle": min(config.tracker.angle, chassis.reached_angle)})
+    free = None
+    if grid is not None and path.frame == "map":
+        field = DistanceField.from_grid(grid, unknown_blocks=False)
+        free = partial(field.free, Footprint(config.geometry.length, config.geometry.width))
+    path, texts = repaired(path, tracker, chassis.bicycle, free)
+    checked = "" if free is not None else " (not compared with a map)"
+    for text in texts:
+        remark(f"repaired{checked}: {text}")
+    return path
 
 
 def path(

@@ -51,6 +51,9 @@ class TrackerConfig(Schema):
     """Maximum heading error at the end of a completed path, rad."""
     lost_distance: Positive = 0.5
     """Distance from the path beyond which the tracker gives up, m."""
+    path_tolerance: Positive = 0.15
+    """Accepted deviation of the best drive from a path that an operator sends or configures, m: paths that the robot
+    can only drive with larger deviations are refused."""
     slow_clearance: Positive = 0.12
     """Clearance along the next metres below which the tracker reduces the speed in proportion, m."""
     slow_tilt: Annotated[float, Field(gt=0, lt=math.pi / 4)] = 0.1

@@ -1,6 +1,6 @@
 """Configured paths and paths of operators, published for the trackers."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -11,6 +11,7 @@ from monstertruck_runtime.outside import text_of
 from monstertruck_runtime.path_files import EXPECTED, LARGEST, path_from
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import Sequences, does_not_drive, examine, parse_request
+from monstertruck_runtime.threads import Offload
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.plan import BehaviourState, Path
 from monstertruck_schemas.reasons import Reason
@@ -39,8 +40,10 @@ class PathService:
     A request for the current path that ``halts`` withdraws it, whether the truck stands or not. Started by name, the
     configured path is driven once: a truck that was disarmed on the way does not continue when it is armed again.
 
+    A path that the body cannot drive is refused with the place.
+
     Args:
-        drawn: the configured path.
+        drawn: the configured path, which the body can drive.
         at_once: follow it as soon as the truck is armed, without a start by name.
         clock: time.
         requests: ``req/path``.
@@ -50,6 +53,8 @@ class PathService:
         out: ``plan/path``.
         events: where events go.
         max_age: seconds; see ``GateConfig.max_request_age``.
+        require_drivable: raises an ``InputError`` for a path that the body cannot drive; takes up to 0.2 s.
+        offload: runs it beside the event loop.
     """
 
     name = ServiceName.PATH.value
@@ -66,6 +71,8 @@ class PathService:
         out: Publisher[Path],
         events: EventSink,
         max_age: float,
+        require_drivable: Callable[[Path], None],
+        offload: Offload,
     ) -> None:
         self._drawn = drawn
         self._at_once = at_once
@@ -77,6 +84,8 @@ class PathService:
         self._out = out
         self._events = events
         self._max_age = max_age
+        self._require_drivable = require_drivable
+        self._offload = offload
         self._sequences = Sequences(max_age)
         self._start_sequences = Sequences(max_age)
 
@@ -88,7 +97,7 @@ class PathService:
         while True:
             request = await self._requests.next()
             try:
-                path = self._withdrawn(request) if request.path.halts else self._examined(request)
+                path = self._withdrawn(request) if request.path.halts else await self._examined(request)
             except RequestRefusedError as error:
                 self._events(error.refusal, Severity.WARNING, request.source, f"path refused: {error}")
             except InputError as error:
@@ -126,15 +135,17 @@ class PathService:
             raise RequestRefusedError(Reason.NOT_FOUND, f"path {request.path.name!r} is not the present one")
         return present.model_copy(update={"halts": True})
 
-    def _examined(self, request: PathRequest) -> Path:
+    async def _examined(self, request: PathRequest) -> Path:
         """The path of a request.
 
         Raises:
             RequestRefusedError: the sender may not, or not now.
-            InputError: the path cannot be tracked.
+            InputError: the body cannot drive the path.
         """
         self._examine(request, self._sequences)
         check_path(request.path)
+        await self._offload(lambda: self._require_drivable(request.path))
+        self._require_rest()
         return request.path
 
     def _examine(self, request: Request, sequences: Sequences) -> None:
@@ -143,8 +154,11 @@ class PathService:
         Raises:
             RequestRefusedError: the sender may not, or not now.
         """
+        examine(request, self._gate.latest, sequences, self._clock.now(), self._max_age)
+        self._require_rest()
+
+    def _require_rest(self) -> None:
         gate = self._gate.latest
-        examine(request, gate, sequences, self._clock.now(), self._max_age)
         if gate is not None and gate.mode.moving:
             raise RequestRefusedError(Reason.BUSY, f"the robot is {gate.mode}, stop it first")
         behaviour = self._behaviour.latest

@@ -1,16 +1,21 @@
 """Paths from files and from outside: who may send them, when, and which can be tracked."""
 
 import asyncio
+from functools import partial
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import pytest
 
+from monstertruck_kinematics.truck import FourWheelSteering
+from monstertruck_planners.track.config import PurePursuitConfig
+from monstertruck_planners.track.drivable import require_drivable
 from monstertruck_planners.track.paths import PathService, load_path
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox, fifo, latest
+from monstertruck_runtime.threads import inline
 from monstertruck_schemas.event import Event
 from monstertruck_schemas.plan import MAX_POSES, BehaviourState, Path
 from monstertruck_schemas.reasons import Reason
@@ -43,6 +48,8 @@ class Bench:
             self.bus.publisher(PATH, Writer.PLANNER),
             self.bus.event_sink(),
             0.5,
+            partial(require_drivable, config=PurePursuitConfig(), geometry=FourWheelSteering()),
+            inline,
         )
         self.seq, self.at_once = 0, at_once
 
@@ -206,6 +213,7 @@ IMPOSSIBLE = {
     "negative speed": ROUTE.model_copy(update={"speeds": np.full(len(ROUTE.poses) // 3, -0.1)}),
     "zigzag": path(straight(10.0), [1.0 - 2.0 * (i % 2) for i in range(201)]),
     "long name": ROUTE.model_copy(update={"name": "x" * 129}),
+    "fold": path([[0.0, 0.0], [2.0, 0.0], [0.0, 0.0]]),
     "odd count": ROUTE.model_copy(update={"poses": np.zeros(7)}),
     "long way back": path([[0.0, 0.0], [99.0, 0.0], [198.0, 0.0]], closed=True),
 }
