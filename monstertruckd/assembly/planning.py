@@ -346,6 +346,7 @@ def _build_missions(config: TruckConfig, bus: Bus, clock: Clock, parts: MissionP
             slam=None if config.slam is None else bus.subscribe(topics.SLAM, latest()),
             battery=bus.subscribe(topics.BATTERY, latest()) if list(packs(config.devices, config.monitors)) else None,
             lidar=config.devices.lidar is not None,
+            zones=None if config.zones is None else bus.subscribe(topics.ZONES, latest()),
         ),
         state=bus.publisher(topics.MISSION, Writer.PLANNER),
         events=bus.event_sink(),

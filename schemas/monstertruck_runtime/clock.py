@@ -49,6 +49,14 @@ def is_date(real: int) -> bool:
     return real >= 946_684_800 * SECOND
 
 
+def minute_of_day(real: int) -> int | None:
+    """Return the local time of day (minutes since midnight) at a real time (ns); None if that can be no date."""
+    if not is_date(real):
+        return None
+    local = time.localtime(real // SECOND)
+    return 60 * local.tm_hour + local.tm_min
+
+
 def processor_time() -> float:
     """Processor time of the calling thread (s), independent of the computer's other load."""
     return time.thread_time()

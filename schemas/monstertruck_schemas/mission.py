@@ -17,6 +17,7 @@ Policy = Literal["abort", "continue", "return"]
 to where the mission began, and end."""
 
 
+DAY_TIME: Final = r"([01]\d|2[0-3]):[0-5]\d"
 PointName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
 Percent = Annotated[float, Field(ge=0, le=100)]
 
@@ -41,6 +42,10 @@ class Condition(Schema):
     """At least this many tags are known"""
     obstacle: Seconds | None = None
     """An obstacle has stopped the robot for this time, s"""
+    zone: Name | None = None
+    """The robot's footprint reaches into the zone of this name"""
+    time: Annotated[str, Field(pattern=rf"^{DAY_TIME}-{DAY_TIME}$")] | None = None
+    """The time of day (local, of the robot's computer) lies in this interval, as 22:00-06:30"""
     any_of: Annotated[tuple["Condition", ...], Field(min_length=1, max_length=16, strict=False)] | None = None
     """At least one of these conditions holds"""
     unless: "Condition | None" = None

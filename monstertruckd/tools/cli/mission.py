@@ -206,6 +206,7 @@ def abilities(config: Path | None, map_folder: Path | None) -> "Abilities":
             points=robot.points is not None,
             charge=bool(list(packs(robot.devices, robot.monitors))),
             lidar=robot.devices.lidar is not None,
+            zones=robot.zones is not None,
             behaviour=behaviour if names else None,
         )
     if map_folder is not None:

@@ -50,6 +50,7 @@ class Abilities:
     charge: bool = True
     """Whether it estimates the charge of its battery."""
     lidar: bool = True
+    zones: bool = True
     behaviour: Callable[[str, Mapping[str, float | str | bool]], object] | None = lambda _name, _settings: None
     """Raises a ``TruckError`` if there is no such behaviour or it refuses the settings; None = there are none."""
     known: frozenset[str] | None = None
@@ -234,6 +235,8 @@ def _lacking(condition: Condition, able: Abilities, known: frozenset[str] | None
         yield _unknown(condition.point, known)
     if not able.lidar and condition.obstacle is not None:
         yield "condition on obstacles: the robot has no lidar (`devices.lidar`)"
+    if not able.zones and condition.zone is not None:
+        yield "condition on zones: the robot's configuration has no section `zones`"
     inner = (*(condition.any_of or ()), *(() if condition.unless is None else (condition.unless,)))
     for one in inner:
         yield from _lacking(one, able, known)

@@ -20,6 +20,10 @@ class Facts:
     """Number of known tags."""
     obstacle: float = 0.0
     """Time for which an obstacle has stopped the robot (s)."""
+    zones: frozenset[str] = frozenset()
+    """Names of the zones that the footprint reaches into."""
+    minute: int | None = None
+    """Local time of day (minutes since midnight); None if unknown."""
 
 
 UNKNOWN: Final = Facts()
@@ -36,9 +40,17 @@ def holds(condition: Condition, facts: Facts) -> bool:
         and (of.point is None or of.point in facts.points)
         and (of.tags is None or facts.tags >= of.tags)
         and (of.obstacle is None or facts.obstacle >= of.obstacle)
+        and (of.zone is None or of.zone in facts.zones)
+        and (of.time is None or (facts.minute is not None and _within(of.time, facts.minute)))
         and (of.any_of is None or any(holds(one, facts) for one in of.any_of))
         and (of.unless is None or not holds(of.unless, facts))
     )
+
+
+def _within(interval: str, minute: int) -> bool:
+    """Return whether a minute of the day lies in an interval as 22:00-06:30; its end does not belong to it."""
+    begin, end = (60 * int(at[:2]) + int(at[3:]) for at in interval.split("-"))
+    return begin <= minute < end if begin <= end else not end <= minute < begin
 
 
 def in_words(condition: Condition) -> str:
@@ -56,6 +68,10 @@ def in_words(condition: Condition) -> str:
         words.append(f"{of.tags} tags known")
     if of.obstacle is not None:
         words.append(f"stopped by an obstacle for {of.obstacle:g} s")
+    if of.zone is not None:
+        words.append(f"in zone {of.zone}")
+    if of.time is not None:
+        words.append(f"time of day {of.time}")
     if of.any_of is not None:
         words.append(f"any of ({'; '.join(map(in_words, of.any_of))})")
     if of.unless is not None:

@@ -30,7 +30,7 @@ from monstertruck_planners.missions.progress import (
     watched,
 )
 from monstertruck_planners.tasks import R, TaskServer
-from monstertruck_runtime.clock import SECOND, Clock, Schedule
+from monstertruck_runtime.clock import SECOND, Clock, Schedule, minute_of_day
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError, disk_reason
 from monstertruck_runtime.outside import contents, reading
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
@@ -87,6 +87,7 @@ from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.sensor import Battery
 from monstertruck_schemas.state import GateState, Odometry
 from monstertruck_schemas.topics import BATTERY, ODOMETRY
+from monstertruck_schemas.zones import Zones
 
 T = TypeVar("T", GoalState, ExplorationState, BehaviourState)
 
@@ -126,6 +127,8 @@ class MissionInputs:
     """None if the robot does not estimate its charge."""
     lidar: bool = False
     """Whether a lidar sees obstacles."""
+    zones: Subscription[Zones] | None = None
+    """None if the robot keeps no zones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,6 +339,7 @@ class MissionService:
             points=self._in.points is not None,
             charge=self._in.battery is not None,
             lidar=self._in.lidar,
+            zones=self._in.zones is not None,
             behaviour=None if behaviours is None else behaviours.check,
         )
 
@@ -633,12 +637,15 @@ class MissionService:
             names = frozenset(point.name for point in points.points)
             self._known = points, names, sum(point.kind is PointKind.TAG for point in points.points)
         _, names, tags = self._known
+        zones = None if self._in.zones is None else self._in.zones.latest
         return Facts(
             charge=None if charge is None else 100.0 * charge,
             elapsed=(now - self._began) / SECOND,
             points=names,
             tags=tags,
             obstacle=0.0 if self._blocked is None else (now - self._blocked) / SECOND,
+            zones=frozenset(() if zones is None else zones.inside),
+            minute=minute_of_day(now + self._clock.real_offset()),
         )
 
     def _observe_obstacle(self) -> None:

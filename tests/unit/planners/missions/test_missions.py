@@ -172,7 +172,7 @@ class Pretended:
     ) -> None:
         self.tasks = self
         self.clock, self.number, self.reached = clock, 0, [Reason.GOAL_REACHED] * 99
-        topics = ("gate", "pose", "goal", "behaviour", "explore", "points", "slam", "battery")
+        topics = ("gate", "pose", "goal", "behaviour", "explore", "points", "slam", "battery", "zones")
         self.latest = dict.fromkeys(topics)
         self.reports, self.events, self.goals, self.held = [], [], [], set()
         self.refusals: list[RequestRefusedError] = []
@@ -853,6 +853,23 @@ def test_an_obstacle_that_stays_is_a_condition():
             robot.latest["gate"].reasons = reasons
             await robot.clock.sleep(seconds)
         assert robot.goals == []
+        await robot.clock.sleep(1.0)
+        assert robot.goals == [(3.0, 0.0)]
+        await robot.clock.sleep(3.0)
+
+    assert played(story).reports[-1].outcome is Reason.MISSION_DONE
+
+
+def test_a_zone_that_the_robot_enters_is_a_condition():
+    watch = {"when": {"zone": "stairs"}, "then": [{**GO, "x": 3.0}], "after": "end"}
+
+    async def story(robot: Pretended) -> None:
+        robot.order(
+            MissionOrder.START, {"do": "parallel", "steps": [{"do": "wait", "seconds": 60.0}], "watch": [watch]}
+        )
+        await robot.clock.sleep(1.0)
+        assert robot.goals == []
+        robot.latest["zones"] = SimpleNamespace(inside=("ramp", "stairs"))
         await robot.clock.sleep(1.0)
         assert robot.goals == [(3.0, 0.0)]
         await robot.clock.sleep(3.0)

@@ -183,6 +183,14 @@ def test_who_cancels_ends_it_in_any_depth(reason: Reason):
         ({"point": "dock"}, Facts(points=frozenset({"dock"})), True),
         ({"tags": 2}, Facts(tags=1), False),
         ({"obstacle": 3}, Facts(obstacle=3.5), True),
+        ({"zone": "stairs"}, Facts(zones=frozenset({"stairs", "ramp"})), True),
+        ({"zone": "stairs"}, Facts(zones=frozenset({"ramp"})), False),
+        ({"time": "08:00-17:30"}, Facts(minute=8 * 60), True),
+        ({"time": "08:00-17:30"}, Facts(minute=17 * 60 + 30), False),
+        ({"time": "22:00-06:30"}, Facts(minute=23 * 60), True),
+        ({"time": "22:00-06:30"}, Facts(minute=6 * 60 + 29), True),
+        ({"time": "22:00-06:30"}, Facts(minute=12 * 60), False),
+        ({"time": "00:00-23:59"}, UNKNOWN, False),
         ({"battery_below": 20, "after": 5}, EMPTY, False),
         ({"any_of": [LOW, {"after": 5}]}, Facts(elapsed=6.0), True),
     ],
@@ -244,13 +252,13 @@ def test_what_the_robot_lacks_is_found_in_any_depth():
 
     steps = [
         {"do": "branch", "when": {"any_of": [LOW, {"tags": 2}]}, "then": [{"do": "behaviour", "name": "wall"}]},
-        {"do": "wait_until", "when": {"unless": {"obstacle": 3}}},
+        {"do": "wait_until", "when": {"unless": {"obstacle": 3, "zone": "stairs"}}},
         {"do": "parallel", "steps": [go(1)], "watch": [{"when": {"point": "dock"}, "then": [go(1)]}]},
     ]
-    able = Abilities(points=False, charge=False, lidar=False, behaviour=behaviour)
+    able = Abilities(points=False, charge=False, lidar=False, zones=False, behaviour=behaviour)
     found = lacking(mission(*steps), able)
     assert [(one.number, one.key[-1]) for one in found] == [
-        ("1", "when"), ("1", "when"), ("1.1", 0), ("2", "when"), ("3", "when"),
+        ("1", "when"), ("1", "when"), ("1.1", 0), ("2", "when"), ("2", "when"), ("3", "when"),
     ]  # fmt: skip
     assert lacking(mission(*steps), Abilities()) == []
     known = Abilities(known=frozenset({"door"}))
