@@ -134,7 +134,7 @@ class World:
         save_map(WorldMap(mask, CELL), folder / "mask.yaml")
         areas: dict[str, Any] = {f"keep{i}": {"kind": "keepout", "corners": p} for i, p in enumerate(self.keepout)}
         areas |= {f"slow{i}": {"kind": "speed", "limit": LIMIT, "corners": p} for i, p in enumerate(self.speed)}
-        self.zones = {"areas": areas, "keepout_mask": {"map": str(folder / "mask.yaml")}}
+        self.zones = {"areas": areas, "keepout_mask": {"map": folder / "mask.yaml"}}
         self.closed = self.keepout + self.masked
         self.goals = [self._goal() for _ in range(GOALS)]
 
@@ -224,10 +224,10 @@ def trial(seed: int) -> dict[str, Any]:
         config = with_overlay(
             config,
             {
-                "planner": {"map": str(world.map)},
+                "planner": {"map": world.map},
                 "odometry": {"start": {"x": x, "y": y, "yaw": yaw}},
                 "zones": world.zones,
-                "sim": {"seed": seed, "world": {"map": str(world.map)}},
+                "sim": {"seed": seed, "world": {"map": str(world.map), "start": {"x": x, "y": y, "yaw": yaw}}},
             },
         )
 
