@@ -8,11 +8,17 @@ from typing import Any
 
 from markdown.extensions.toc import slugify
 from mkdocs.structure.files import File, Files, InclusionLevel
-from pages import commands, configuration, devices, figures, never_tried, symptoms, topics
+from pages import commands, configuration, devices, figures, never_tried, reasons, symptoms, topics
 from pages.markdown import Page, join
 
 ROOT = Path(__file__).resolve().parents[2]
-OUTSIDE = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+OUTSIDE = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "SECURITY.md": "security.md",
+    "CODE_OF_CONDUCT.md": "conduct.md",
+}
 """Pages of the repository's top level, and their places on the site."""
 ASSETS = ("style.css", "iframe-worker.js")
 UNSEARCHED = ("changelog", "files/")
@@ -38,6 +44,7 @@ def on_config(config: Any) -> Any:
         *figures.pages(),
         never_tried.page(texts),
         symptoms.page(),
+        reasons.page(),
     ]
     config.nav = _expanded(config.nav, set(_names(config.nav)))
     return config

@@ -15,7 +15,7 @@ from pages.markdown import Page, join, table
 ROOT = Path(__file__).resolve().parents[3]
 EXIT_CODES = """\
 0 when it did what was asked, 2 for a wrong option or a refused configuration, 6 when Ctrl-C or SIGTERM cut it short;
-every other failure has its own code: [table](../command-line.md#exit-codes)."""
+every other failure has its own code: [reasons](../reasons.md)."""
 
 
 def pages(texts: Mapping[str, tuple[str, str]]) -> list[Page]:

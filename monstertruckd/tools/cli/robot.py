@@ -85,17 +85,9 @@ def plugins(json_output: JsonOption = False) -> None:
     )
 
 
-def reasons(
-    json_output: JsonOption = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="The table of docs/command-line.md.")] = False,
-) -> None:
+def reasons(json_output: JsonOption = False) -> None:
     """Print the reasons of events, refusals and ends, each with the exit code it gives a command."""
     from monstertruck_schemas.reasons import Reason
-
-    if markdown:
-        for reason in sorted(Reason, key=lambda reason: reason.exit_code):
-            print(f"| {reason.exit_code} | `{reason.value}` | {reason.text} |")
-        return
 
     if json_output:
         print_json([{"reason": reason, "exit_code": reason.exit_code, "text": reason.text} for reason in Reason])

@@ -1,18 +1,27 @@
-"""The page on the command line tells the exit codes and keys there are."""
+"""The pages on the command line and on the reasons name the exit codes and keys there are."""
 
+import sys
 from pathlib import Path
 
 import pytest
 
-from monstertruckd.tools.cli.robot import reasons
+from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.driving.modes import SPEEDS, SteeringMode
 
+SITE = Path(__file__).resolve().parents[3] / "docs" / "site"
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "command-line.md").read_text()
 
 
-def test_every_reason_is_in_the_table_with_its_code(capsys: pytest.CaptureFixture[str]):
-    reasons(markdown=True)
-    assert capsys.readouterr().out in PAGE, "put in what `monstertruckd reasons --markdown` prints"
+def test_every_reason_is_in_the_table_with_its_code(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.syspath_prepend(str(SITE))
+    from pages import reasons
+
+    text = reasons.page().text
+    for name in [name for name in sys.modules if name == "pages" or name.startswith("pages.")]:
+        del sys.modules[name]
+    rows = [line for line in text.splitlines() if line.startswith("| ")][2:]
+    assert rows == sorted(rows, key=lambda row: int(row.split("|")[1]))
+    assert sorted(rows) == sorted(f"| {each.exit_code} | `{each.value}` | {each.text} |" for each in Reason)
 
 
 def test_modes_and_speeds_of_the_keyboard_are_reported():
