@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from markdown.extensions.toc import slugify
 from mkdocs.structure.files import File, Files, InclusionLevel
 from pages import commands, configuration, devices, figures, never_tried, reasons, symptoms, topics
 from pages.markdown import Page, join
@@ -35,9 +34,8 @@ def on_config(config: Any) -> Any:
         if "site" not in file.relative_to(ROOT / "docs").parts:
             written[file.relative_to(ROOT / "docs").as_posix()] = file.read_text()
     texts = {uri: (_title(text), _to_site(text, uri)) for uri, text in written.items() if uri != "changelog.md"}
-    sections = {_role(title): anchor for title, anchor in _headings(written["devices.md"])}
     generated[:] = [
-        *devices.pages(sections),
+        *devices.pages(),
         *commands.pages(texts),
         *topics.pages(),
         *configuration.pages(),
@@ -154,12 +152,3 @@ def _readme_first(uri: str) -> tuple[bool, str]:
 
 def _title(markdown: str) -> str:
     return markdown.partition("# ")[2].partition("\n")[0]
-
-
-def _headings(markdown: str) -> list[tuple[str, str]]:
-    titles = re.findall(r"^## (.+)$", markdown, re.MULTILINE)
-    return [(title, slugify(title, "-")) for title in titles]
-
-
-def _role(title: str) -> str:
-    return title.partition(":")[0].lower()

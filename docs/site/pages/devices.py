@@ -2,7 +2,7 @@
 
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -14,7 +14,10 @@ from pages.markdown import Page, join, prose, raised, section, table
 from pages.models import Definitions, label, plain
 from pages.topics import anchor
 
-CONFIG = Path(__file__).resolve().parents[3] / "configs" / "truck.yaml"
+ROOT = Path(__file__).resolve().parents[3]
+CONFIG = ROOT / "configs" / "truck.yaml"
+BEHAVIOURS = ROOT / "tests" / "unit" / "drivers" / "behaviours"
+"""Documented behaviours and the tests that hold them: one file a kind, a package of drivers, or a subject."""
 
 LINE_FAULTS = """\
 Faults of the cable: `unplug`, `plug`, `power-cycle`,
@@ -24,16 +27,18 @@ Faults of a signal (a reported value or a received command): `signal NAME FAULT 
 [`emulate`](../commands/emulate.md) and [`simulate`](../commands/simulate.md) take faults on standard input."""
 
 
-def pages(sections: dict[str, str]) -> list[Page]:
-    """Return a page per kind.
+def pages() -> Iterator[Page]:
+    """Yield a page per kind, and one of the behaviours that all devices share."""
+    yield from map(_page, DEVICES.values())
+    shared = [(BEHAVIOURS / f"{name}.md").read_text(encoding="utf-8") for name in ("ports", "usb", "common")]
+    title = "Ports, USB and emulators"
+    text = join(
+        f"# {title}", "Behaviours that all devices share, and the tests that hold them.", *map(_lowered, shared)
+    )
+    yield Page("devices/shared.md", title, text)
 
-    Args:
-        sections: Heading in ``devices.md`` by role, in lower case.
-    """
-    return [_page(kind, sections.get(kind.role.name)) for kind in DEVICES.values()]
 
-
-def _page(kind: DeviceKind, habits: str | None) -> Page:
+def _page(kind: DeviceKind) -> Page:
     driver, probe = kind.implementation_class(), kind.probe_function()
     emulator = get_type_hints(kind.emulator_factory())["return"]
     models = Definitions(kind.settings_class())
@@ -41,9 +46,7 @@ def _page(kind: DeviceKind, habits: str | None) -> Page:
         f"# {kind.doc}",
         f"Driver, settings and emulated faults of `{kind.name}`.",
         _facts(kind),
-        f"Tests that compare the emulator with the device's documented behaviour: [table](../devices.md#{habits})."
-        if habits
-        else "",
+        "Set-up and wiring: [devices](../devices.md).",
         "## Driver",
         prose(driver.__doc__),
         "These errors end a session; the restart policy starts the next:",
@@ -60,6 +63,7 @@ def _page(kind: DeviceKind, habits: str | None) -> Page:
         "## Faults",
         _faults(emulator),
         LINE_FAULTS if kind.opens in ("serial", "i2c") else "",
+        *_held(kind),
     )
     return Page(f"devices/{kind.name}.md", f"{kind.role.name}: {kind.name}", text)
 
@@ -81,6 +85,20 @@ def _facts(kind: DeviceKind) -> str:
 
 def _group(kind: DeviceKind) -> str:
     return "monitors" if kind.role.duty is Duty.MONITOR else "devices"
+
+
+def _held(kind: DeviceKind) -> Iterator[str]:
+    """Yield the behaviours of a kind or of its package, if a file holds them."""
+    package = kind.implementation.split(".")[1]
+    for name in (kind.name, package):
+        if (file := BEHAVIOURS / f"{name}.md").is_file():
+            yield "## Behaviours"
+            yield file.read_text(encoding="utf-8").partition("\n\n")[2]
+            return
+
+
+def _lowered(markdown: str) -> str:
+    return markdown.replace("# ", "## ", 1).strip()
 
 
 def _topics(ends: Mapping[str, Topic[Any]]) -> str:

@@ -76,6 +76,7 @@ def test_every_device_command_and_topic_has_its_place(site: Path):
         text = (site / "devices" / f"{kind.name}.html").read_text()
         for heading in ("Settings", "Probe", "Emulator", "Faults"):
             assert f'id="{heading.lower()}"' in text, (kind.name, heading)
+        assert ('id="behaviours"' in text) == (kind.name not in {"link_quality", "host_health"}), kind.name
     for name in commands_of(app):
         assert (site / "commands" / f"{'-'.join(name)}.html").is_file(), name
     for topic in TOPICS:
