@@ -160,6 +160,8 @@ async def test_what_the_tracker_proposed_before_a_restart_is_shown_and_accepted(
         file.write_text(json.dumps({"base": "", "result": proposed.model_dump(mode="json")}))
         await truck.start_simulator()
         await truck.start_daemon()
+        async with truck.client():
+            pass  # it answers
         shown, accepted, again = [await command(truck, word) for word in ("show", "accept", "accept")]
     assert "proposed, not used: front steers to the left" in shown.stderr
     assert accepted.returncode == 0, accepted.stderr

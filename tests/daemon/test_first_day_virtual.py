@@ -38,8 +38,6 @@ ANSWERS = {
     "monstertruckd calibrate steering --rough": ["--yes"],
 }
 """What the operator answers to the wizards."""
-LONG = ("explore", "points", "goto", "map")
-"""Commands of the lines that take minutes of the truck's time, or need what those leave behind."""
 AHEAD = 0.8
 """Distance of the box at which the operator drives, m."""
 HELD = {"disarmed", "estopped"}
@@ -219,14 +217,19 @@ def here_or_pulled(line: Line) -> bool:
     return here(line) or (is_ours(line) and line.arguments[0] == "find-port")
 
 
+def takes_minutes(line: Line) -> bool:
+    """Of the truck's time, or it needs what such a line leaves behind."""
+    return line.arguments[0] in ("explore", "points", "goto", "map") or line.arguments[:2] == ["calibrate", "steering"]
+
+
 def test_from_unpacking_to_driving_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    spend(tmp_path, monkeypatch, lambda line: line.arguments[0] not in LONG)
+    spend(tmp_path, monkeypatch, lambda line: not takes_minutes(line))
     load_truck(Path("configs/truck.yaml"))  # with the ports that were found
 
 
 @pytest.mark.long
 def test_the_day_ends_with_a_map_and_all_tags_at_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    day = spend(tmp_path, monkeypatch, lambda line: line.arguments[0] in (*LONG, "disarm"))
+    day = spend(tmp_path, monkeypatch, lambda line: takes_minutes(line) or line.arguments[0] == "disarm")
     truth = day.rig.truth.array()
     assert math.dist(truth[-1, 1:3], (0.0, 0.0)) < 0.3, "not at home"
     saved = load(tmp_path / "runs" / "map")
