@@ -20,7 +20,7 @@ async def surprise(trip: Trip, ahead: float, aside: float, size: float) -> None:
     trip.rig.world.add(now, Box(truth.x + ahead, truth.y + aside, size, size))
 
 
-@pytest.mark.parametrize("kind", ["rsband", "teb"])
+@pytest.mark.parametrize("kind", ["rsband", pytest.param("teb", marks=pytest.mark.long)])
 def test_a_box_put_onto_the_route_is_passed_by_deformation(kind: str):
     async def story(trip: Trip) -> None:
         await trip.goal(6.0, 3.9, 0.0)
@@ -39,6 +39,7 @@ def test_a_box_put_onto_the_route_is_passed_by_deformation(kind: str):
     assert np.ptp(rig.truth.array()[:, 2]) > 0.2, "it went round"
 
 
+@pytest.mark.long
 def test_without_a_deformer_the_route_is_planned_anew():
     async def story(trip: Trip) -> None:
         await trip.goal(6.0, 3.9, 0.0)

@@ -271,6 +271,7 @@ def test_an_emergency_stop_ends_a_goal():
     assert abs(travel(story).truth.array()[-1, 1] - at[0]) < 0.005
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("where", ["worker"])
 def test_planner_and_tracker_drive_the_same_from_wherever_they_are_placed(where: str):
     async def story(trip: Trip) -> None:

@@ -13,7 +13,12 @@ pytestmark = [pytest.mark.virtual, pytest.mark.timeout(240)]
 
 
 @pytest.mark.parametrize(
-    ("driver", "beams"), [("kind: ld19", 450), ("kind: rplidar, model: c1", 500), ("kind: hokuyo_lx", 1081)]
+    ("driver", "beams"),
+    [
+        ("kind: ld19", 450),
+        ("kind: rplidar, model: c1", 500),
+        pytest.param("kind: hokuyo_lx", 1081, marks=pytest.mark.long),
+    ],
 )
 def test_the_truck_drives_its_path_with_a_lidar_of_another_maker(tmp_path, driver, beams):
     config = tmp_path / "truck.yaml"

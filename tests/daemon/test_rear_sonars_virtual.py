@@ -111,8 +111,7 @@ def test_it_stops_when_its_sonars_fall_silent():
     assert Reason.UNSEEN_STOP in done.reasons[-1]
 
 
-@pytest.mark.parametrize("behind", [0.3, 0.5])
-@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize(("behind", "side"), [(0.3, -1), (0.5, 1)])
 def test_it_waits_for_a_person_who_walks_in_behind_it(behind: float, side: int):
     """A person comes from beside the truck, ``behind`` m behind its tail, stands there for 4 s and walks on."""
     begins, pace, radius = 2.0, 0.8, 0.15

@@ -9,7 +9,7 @@ from tests.make_replay_logs import RUNS, record
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
 
-@pytest.mark.parametrize("name", mostly_long([*RUNS, "goals"], {"fusion", "goals"}))
+@pytest.mark.parametrize("name", mostly_long([*RUNS, "goals"], {"fusion"}))
 def test_a_fresh_run_comes_again(tmp_path, name):
     record(name, tmp_path / "run.mcap")
     check = check_log(tmp_path / "run.mcap")

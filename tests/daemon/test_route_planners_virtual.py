@@ -7,7 +7,6 @@ from monstertruck_planners.route.catalog import ROUTE_PLANNERS
 from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from tests.daemon.goal_kit import Trip, assert_at, travel
-from tests.long_kit import mostly_long
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
@@ -23,7 +22,8 @@ def test_all_kinds_are_tried():
     assert {*LOCAL, "hybrid"} == set(ROUTE_PLANNERS)
 
 
-@pytest.mark.parametrize("kind", mostly_long(LOCAL, {"grid_astar"}))
+@pytest.mark.long
+@pytest.mark.parametrize("kind", LOCAL)
 def test_a_goal_is_reached_over_a_waypoint(kind: str):
     async def story(trip: Trip) -> None:
         answer = await trip.goal(5.0, 3.9, 0.0, via=[(3.0, 3.6)])

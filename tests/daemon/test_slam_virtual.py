@@ -59,6 +59,7 @@ def test_health_tiles_and_the_saved_map(drive: Drive, folder: Path):
         assert {path.name for path in save.folder.iterdir()} == {"map.yaml", "map.png", "graph.npz", "manifest.json"}
 
 
+@pytest.mark.long
 def test_a_robot_without_a_compass_maps_as_well():
     without = {"devices": {"compass": None}, "gate": {"attitude": None}}
     drive = driven("slam.yaml", lap(SECONDS), topics.MAP, topics.COMPASS, **without)

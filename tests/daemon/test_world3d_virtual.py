@@ -39,6 +39,7 @@ def driving(test, overlay: dict | None = None, file: str = "demo.yaml"):
     return found[0]
 
 
+@pytest.mark.long
 def test_it_drives_the_lap_of_the_loop():
     """Straight on and into the first bend: the tracker and the odometry know nothing of tyres and springs."""
 

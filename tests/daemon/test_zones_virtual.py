@@ -53,6 +53,7 @@ def test_a_goal_is_reached_round_a_keepout_zone_and_slowly_over_a_speed_zone():
     assert max(speeds) > 0.12
 
 
+@pytest.mark.long
 def test_a_zone_that_is_drawn_on_the_way_is_driven_round_and_one_that_is_off_is_crossed():
     async def story(trip: Trip) -> None:
         await order(trip, "wall", "off", seconds=600)

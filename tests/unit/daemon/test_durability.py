@@ -16,7 +16,7 @@ SUBJECTS = (maps.SUBJECT, *state.SUBJECTS)
 def test_nothing_acknowledged_is_lost_by_a_power_cut_and_nothing_is_mixed(tmp_path: Path, subject: Subject):
     if shutil.which("cc") is None:
         pytest.skip("there is no C compiler")
-    assert cuts([subject], 16, 3, tmp_path) == {subject.name: {"cuts": 16, "faults": 0}}
+    assert cuts([subject], 6, 3, tmp_path) == {subject.name: {"cuts": 6, "faults": 0}}
 
 
 @pytest.mark.parametrize("subject", SUBJECTS, ids=lambda subject: subject.name)

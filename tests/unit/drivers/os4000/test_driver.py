@@ -374,6 +374,7 @@ async def minutes(rig: Rig, count: int) -> list[ServiceHealth]:
     return health
 
 
+@pytest.mark.long
 def test_a_compass_without_a_heading_is_set_up_once_an_hour_at_most():
     """It was written to every 2.3 s: its memory wears, and each write pauses the stream."""
 
