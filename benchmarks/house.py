@@ -46,6 +46,7 @@ REST: Final = (
     "drivers/monstertruck_drivers/receiver",
     "drivers/monstertruck_drivers/roboclaw",
     "drivers/monstertruck_drivers/rplidar",
+    "drivers/monstertruck_drivers/sheet_lidar",
     "drivers/monstertruck_drivers/srf08",
     "drivers/monstertruck_drivers/steppers",
     "drivers/monstertruck_drivers/vesc",

@@ -376,6 +376,15 @@ DEVICES: Final = DeviceCatalog(
         usb=UsbIdentity("10c4:ea60", "CP2102 USB to UART Bridge Controller", "ttyUSB"),
     ),
     DeviceKind(
+        name="sheet_lidar",
+        doc="Laser scanner described by its data sheet (frames of this project)",
+        roles=(LIDAR,),
+        settings="monstertruck_drivers.sheet_lidar.config:SheetLidarConfig",
+        implementation="monstertruck_drivers.sheet_lidar.driver:SheetLidarDriver",
+        emulator="monstertruck_drivers.sheet_lidar.emulator:emulated",
+        probe="monstertruck_drivers.sheet_lidar.probe:probe",
+    ),
+    DeviceKind(
         name="epos",
         doc="maxon EPOS 24/1 motor controller (RS232)",
         roles=(DRIVE, DRIVE_2, DRIVE_3, DRIVE_4),

@@ -58,6 +58,9 @@ class SimConfig(Schema):
     """The servo controller's deadman output is wired to the drive controller's quick-stop input"""
     servo_timeout: Annotated[float, Field(ge=0, le=10)] = 0.0
     """Seconds of the servo controller's own serial time-out (0 = off, as delivered)"""
+    as_built: bool = False
+    """What ``world`` does not state of the robot (body, geometry, mounts, servos, motor, pack) follows from the rest of
+    the configuration; otherwise it is the Monstertruck's"""
     world: WorldConfig = WorldConfig()
     stand: StandConfig = StandConfig()
     """How `stand: simulator` sees the robot"""

@@ -345,7 +345,7 @@ def impossible_settings(config: GateConfig, body: BodyLimits, times: Iterable[tu
             f"robot stands after {needed:.3g} m: at most {seen:.2f} m, {whose}"
         )
     longest = body.length / config.speed
-    for name, seconds in (*_times(config), *times):
+    for name, seconds in (*unattended(config), *times):
         if seconds > longest:
             yield f"{name} {seconds:g} s: at most {longest:.2f} s, as long as its own length takes at gate.speed"
     yield from _beyond_checks(config)
@@ -379,7 +379,7 @@ def required_sensors(config: GateConfig) -> dict[str, SensorLimit]:
     return {name: limit for name, limit in limits if GateConfig.model_fields[name].default.critical}
 
 
-def _times(config: GateConfig) -> Iterator[tuple[str, float]]:
+def unattended(config: GateConfig) -> Iterator[tuple[str, float]]:
     """Settings that let the truck continue unattended for that time, s."""
     for name, limit in required_sensors(config).items():
         yield f"gate.{name}.stale_after", limit.stale_after

@@ -12,6 +12,7 @@ from monstertruck_sim.computer import hangs_by_hub
 from monstertruck_sim.config import SimConfig
 from monstertruckd.config.load import Tree, calibrated, load_tree, validated
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.simulation.as_built import as_built
 
 DEADMAN_LINE: Final[Mapping[str, Any]] = {
     "devices": {"steering": {"driver": {"deadman_channel": 2}}},
@@ -31,6 +32,13 @@ class SimulatedTruckConfig(TruckConfig):
     )
 
     sim: SimConfig
+
+    @model_validator(mode="after")
+    def _as_built(self) -> Self:
+        if not self.sim.as_built:
+            return self
+        world = as_built(self.sim.world, self)
+        return self.model_copy(update={"sim": self.sim.model_copy(update={"world": world, "as_built": False})})
 
     @model_validator(mode="after")
     def _same_kind(self) -> Self:

@@ -1,0 +1,1 @@
+"""Laser scanner described by its data sheet."""

@@ -1,0 +1,89 @@
+"""Driver of a laser scanner described by its data sheet: listens, and publishes every scan."""
+
+import numpy as np
+
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.scanning.clock_map import ClockMap
+from monstertruck_drivers.scanning.clock_watch import ClockWatch
+from monstertruck_drivers.scanning.turns import MISSING
+from monstertruck_drivers.sheet_lidar.config import SheetLidarConfig
+from monstertruck_drivers.sheet_lidar.protocol import STAMP_TURN, SheetParser, SheetScan
+from monstertruck_drivers.streaming import DeviceStream
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_schemas.event import Severity
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
+
+EXPECTED = "of a scanner with the configured number of beams: another device, or another data sheet"
+
+
+class SheetLidarDriver:
+    """Scanner on a port.
+
+    Args:
+        config: data sheet, frame and patience.
+        port: where it is plugged in.
+        clock: time.
+        out: where scans go.
+        events: where readiness and changes of its clock are reported.
+        name: of the service.
+    """
+
+    def __init__(
+        self,
+        config: SheetLidarConfig,
+        port: Port,
+        clock: Clock,
+        out: Publisher[LaserScan],
+        events: EventSink,
+        name: str = "lidar",
+    ) -> None:
+        self.name = name
+        self._config, self._port, self._clock, self._out, self._events = config, port, clock, out, events
+        self._watch = ClockWatch(events, name)
+        self._without = NO_ECHO if config.no_return == "free" else MISSING
+
+    async def run(self, ready: Ready) -> None:
+        """Serve one session.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence, or scans that arrive late for seconds.
+            ProtocolError: bytes without a scan.
+            WrongDeviceError: nothing that comes at the start is a scan of that many beams.
+            PortBusyError: another process holds the port.
+        """
+        config = self._config
+        async with await self._port.open() as link:
+            stream = DeviceStream(link, self._clock, SheetParser(config.beams).feed)
+            transfer = 0.001  # seconds assumed from the last beam to the arrival of the frame
+            latency = config.time_increment * config.beams + transfer
+            mapping = ClockMap(round(latency * SECOND), turn=STAMP_TURN)
+            scans = await stream.first(config.first_scan, EXPECTED)
+            ready()
+            self._events(Reason.DEVICE_READY, Severity.INFO, self.name, f"{config.beams} beams, {config.rate:g} Hz")
+            while True:
+                arrival = self._clock.now()
+                for scan in scans:
+                    self._publish(scan, self._watch.stamp(mapping, scan.stamp, arrival, link.name), arrival)
+                scans = await stream.receive(config.stale)
+
+    def _publish(self, scan: SheetScan, stamp: int, received: int) -> None:
+        config, met = self._config, scan.ranges > 0
+        self._out.put(
+            LaserScan(
+                stamp=stamp,
+                received=received,
+                seq=self._out.next_seq(),
+                frame=config.frame,
+                start_angle=config.start_angle,
+                end_angle=config.start_angle + config.increment * (config.beams - 1),
+                time_increment=config.time_increment,
+                scan_time=1.0 / config.rate,
+                range_min=config.range_min,
+                range_max=config.range_max,
+                ranges=np.where(met, scan.ranges / 1000.0, np.inf),
+                codes=np.where(met, VALID_BEAM, self._without).astype(np.uint8),
+            )
+        )

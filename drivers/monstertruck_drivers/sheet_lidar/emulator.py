@@ -1,0 +1,116 @@
+"""The device side of a laser scanner described by its data sheet."""
+
+import asyncio
+import math
+from typing import Final
+
+import numpy as np
+
+from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.emulation import BeamSource, EmulatorSetup, ReceivedBytes
+from monstertruck_drivers.scanning.head import FAULTS as HEAD_FAULTS
+from monstertruck_drivers.scanning.head import TurningHead
+from monstertruck_drivers.sheet_lidar.config import SheetLidarConfig
+from monstertruck_drivers.sheet_lidar.protocol import STAMP_TURN, SheetScan, build
+from monstertruck_drivers.signals import SignalKind, Signals
+from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.errors import InputError
+
+RANGE: Final = "range"
+"""Distances of a scan, mm."""
+COUNTER: Final = "counter"
+"""Time stamp, ms."""
+
+
+class SheetLidarEmulator:
+    """Scanner that streams from power-up on.
+
+    Faults (``inject``): ``silent on|off``, ``bad_crc N`` (the next N scans), and the faults of the head.
+
+    Args:
+        clock: time.
+        source: source of the ranges.
+        config: data sheet.
+        seed: seed of covers.
+    """
+
+    def __init__(
+        self, clock: Clock, source: BeamSource, config: SheetLidarConfig | None = None, *, seed: int = 0
+    ) -> None:
+        self.name = "lidar"
+        self.received = ReceivedBytes()
+        """Bytes the host sent, for tests: it takes no notice of any."""
+        self._config = config or SheetLidarConfig()
+        rng = np.random.default_rng(seed)
+        kinds = {RANGE: SignalKind.ARRAY, COUNTER: SignalKind.NUMBER}
+        self.signals = Signals(clock.now, kinds, rng, codes={RANGE: 1})
+        self.head = TurningHead(clock, source, self._config.sheet, self._config.rate, rng)
+        self._bearings = self._config.start_angle + self._config.increment * np.arange(self._config.beams)
+        self._clock = clock
+        self._silent = False
+        self._bad_sums = 0
+        self._powered_at = 0
+
+    async def run(self, end: DeviceEnd) -> None:
+        """Stream until cancelled."""
+        end.on_plug = lambda plugged: self.power_cycle() if plugged else None  # the port is its supply
+        self.power_cycle()
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._stream(end))
+            while True:
+                self.received.extend(await end.read())
+
+    def power_cycle(self) -> None:
+        """Supply off and on: its clock starts at 0, its head stands."""
+        self.head.stop()
+        self._powered_at = self.head.now()
+
+    def inject(self, fault: str, *values: str) -> None:
+        """Start or end a fault.
+
+        Raises:
+            InputError: unknown fault or bad value.
+        """
+        match fault, values:
+            case "silent", (("on" | "off") as state,):
+                self._silent = state == "on"
+            case "bad_crc", (count,) if count.isdigit():
+                self._bad_sums = int(count)
+            case _ if self.head.inject(fault, *values):
+                pass
+            case _:
+                raise InputError(
+                    f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: silent on|off | "
+                    f"bad_crc N | {HEAD_FAULTS}"
+                )
+
+    async def _stream(self, end: DeviceEnd) -> None:
+        begin = float(self.head.now())
+        while True:
+            period = SECOND / max(self.head.frequency, 2.0)  # the world draws beams of half a second at most
+            each = period * abs(self._config.increment) / math.tau
+            times = (begin + each * np.arange(self._config.beams)).astype(np.int64)
+            await self._clock.sleep_until(self.head.world_time(int(times[-1])))
+            # Nanoseconds that it lags behind after the host's machine slept, at most; older scans are lost.
+            overslept = 5 * SECOND // 10
+            late = self.head.now() - int(times[-1]) > overslept
+            begin = float(self.head.now() if late else begin + period)
+            self.head.turn(times)
+            if self._silent or times[0] < self._powered_at:
+                continue
+            data = build(self._scan(times))
+            if self._bad_sums:
+                self._bad_sums -= 1
+                data = data[:-1] + bytes((data[-1] ^ 0x10,))
+            end.write(data)
+
+    def _scan(self, times: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> SheetScan:
+        ranges = self.head.look(-self._bearings / math.tau, times)
+        millimetres = self.signals.report(RANGE, np.rint(ranges * 1000).astype(np.int64))
+        stamp = self.signals.report(COUNTER, (int(times[0]) - self._powered_at) // 1_000_000 % STAMP_TURN)
+        return SheetScan(int(stamp) % STAMP_TURN, np.clip(millimetres, 0, 0xFFFF).astype(np.uint16))
+
+
+def emulated(setup: EmulatorSetup) -> SheetLidarEmulator:
+    """The scanner of a simulated robot."""
+    return SheetLidarEmulator(setup.clock, setup.physics.lidar, setup.settings, seed=setup.seed)

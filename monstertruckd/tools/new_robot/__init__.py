@@ -1,0 +1,1 @@
+"""A new robot's configuration and its simulated twin, from a few answers."""
