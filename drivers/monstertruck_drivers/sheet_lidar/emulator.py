@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
-from monstertruck_drivers.emulation import BeamSource, EmulatorSetup, ReceivedBytes
+from monstertruck_drivers.emulation import Array, BeamSource, EmulatorSetup, ReceivedBytes
 from monstertruck_drivers.scanning.head import FAULTS as HEAD_FAULTS
 from monstertruck_drivers.scanning.head import TurningHead
 from monstertruck_drivers.sheet_lidar.config import SheetLidarConfig
@@ -45,7 +45,8 @@ class SheetLidarEmulator:
         kinds = {RANGE: SignalKind.ARRAY, COUNTER: SignalKind.NUMBER}
         self.signals = Signals(clock.now, kinds, rng, codes={RANGE: 1})
         self.head = TurningHead(clock, source, self._config.sheet, self._config.rate, rng)
-        self._bearings = self._config.start_angle + self._config.increment * np.arange(self._config.beams)
+        steps = np.arange(self._config.beams, dtype=np.float64)
+        self._bearings: Array = self._config.start_angle + self._config.increment * steps
         self._clock = clock
         self._silent = False
         self._bad_sums = 0

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 class AnswersCommand(NumberCommand):
     """Command with an option for every answer; the model behind them is loaded when the command is used."""
 
+    _params: "list[Parameter]"
+    _answers: "list[Parameter] | None" = None
+
     @property
     def params(self) -> "list[Parameter]":
         """Declared options, and from the first use on those of the answers."""
@@ -31,7 +34,7 @@ class AnswersCommand(NumberCommand):
 
     @params.setter
     def params(self, declared: "list[Parameter]") -> None:
-        self._params, self._answers = declared, None
+        self._params = declared
 
     def invoke(self, ctx: "Context") -> Any:
         """Run it; the answers are in the context's ``obj``."""

@@ -142,8 +142,9 @@ def question(name: str) -> str:
 def mistake(name: str, answer: Any) -> str | None:
     """Mistake of one answer by itself, or None."""
     field = Answers.model_fields[name]
+    kind: Any = Annotated[field.annotation, field, *field.metadata]
     try:
-        TypeAdapter(Annotated[field.annotation, field, *field.metadata]).validate_python(answer, strict=False)
+        TypeAdapter(kind).validate_python(answer, strict=False)
     except ValidationError as error:
         return first_mistake(error, name)
     return None

@@ -90,7 +90,7 @@ def _devices(answers: Answers, chassis: Chassis) -> Section:
         found["lidar"] = {"mount": {"x": answers.lidar_x, "z": answers.lidar_z}, "driver": answers.lidar_driver}
     found |= _drives(answers, chassis)
     if answers.steering in ("maestro", "pca9685"):
-        driver = {"kind": answers.steering} | _axles(answers, chassis)
+        driver: Section = {"kind": answers.steering} | _axles(answers, chassis)
         if answers.steering == "maestro":
             driver["battery"] = _pack(answers.cells) if answers.battery == "steering" else None
         found["steering"] = {"driver": _in_time(driver, answers)}
@@ -134,7 +134,7 @@ def _drives(answers: Answers, chassis: Chassis) -> Section:
         case _:
             esc = {"max_rate": _rounded(rate), "deceleration": _rounded(slowing)}
             esc |= {"quick_deceleration": _rounded(quick * slowing)}
-            unit = {"kind": answers.drive.removesuffix("_esc")} | _axles(answers, chassis)
+            unit: Section = {"kind": answers.drive.removesuffix("_esc")} | _axles(answers, chassis)
             if answers.drive == "maestro_esc":
                 unit["battery"] = _pack(answers.cells) if answers.battery == "drive" else None
             return {"actuators": {"driver": kind | {"esc": {"channel": 2} | esc, "unit": _in_time(unit, answers)}}}
@@ -268,4 +268,5 @@ def _navigation(answers: Answers, chassis: Chassis, tracker: Section) -> Section
 def _rounded(value: float) -> float:
     """``value`` to three figures, upwards."""
     digits = 2 - math.floor(math.log10(value))
-    return round(math.ceil(value * 10**digits - 1e-9) / 10**digits, max(digits, 0))
+    scale: float = 10.0**digits
+    return round(math.ceil(value * scale - 1e-9) / scale, max(digits, 0))
