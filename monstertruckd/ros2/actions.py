@@ -66,7 +66,7 @@ class ActionGoal(Generic[W]):
     stamp: int
     """When it was accepted, real time, ns."""
     work: W
-    """What the robot has to do."""
+    """Goal in the terms of the robot."""
     status: GoalStatus = GoalStatus.ACCEPTED
     text: str = ""
     """Why it failed."""
@@ -75,14 +75,14 @@ class ActionGoal(Generic[W]):
 
 
 class RobotAction(ABC, Generic[W]):
-    """What the robot does for the goals of one action; ``W`` is a goal as the robot understands it."""
+    """Execution of the goals of one action; ``W`` is a goal as the robot understands it."""
 
     name: ClassVar[str]
     interface: ClassVar[str]
 
     @abstractmethod
     def read(self, goal: RosMessage) -> W:
-        """Return what a goal asks for.
+        """Return the converted goal.
 
         Raises:
             InputError: the robot could misunderstand it.
@@ -90,7 +90,7 @@ class RobotAction(ABC, Generic[W]):
 
     @abstractmethod
     async def drive(self, driver: TruckClient, work: W, show: Callable[[RosValues], None]) -> tuple[Reason, str]:
-        """Have the robot do it; returns the outcome and its text. Cancelled, it stops what it has begun.
+        """Have the robot do it; returns the outcome and its text. A cancelled one stops the robot's task.
 
         Args:
             driver: session of the node that sent the goal.
@@ -138,7 +138,7 @@ class ActionServer(Generic[W]):
     """Serves one action.
 
     Args:
-        action: what the robot does.
+        action: execution of its goals.
         node: of ROS 2.
         operators: sessions of the nodes that send goals.
         active: whether goals are accepted at present.
@@ -271,7 +271,7 @@ class ActionServer(Generic[W]):
 
 
 def _distinct(editions: Iterable[str], part: str) -> Iterable[str]:
-    """Editions without those that equal another one on the wire."""
+    """Return the editions that differ on the wire."""
     found: dict[str, str] = {}
     for edition in editions:
         found.setdefault(type_hash(f"{edition}{part}"), edition)

@@ -17,14 +17,14 @@ from monstertruckd.ros2.interfaces import type_hash, wire_name
 LIVELINESS: Final = "@ros2_lv"
 """First chunk of all tokens; wildcards do not match it."""
 NO_HASH: Final = "TypeHashNotSupported"
-"""In place of every hash in Humble, which has none."""
+"""Replaces every hash in Humble, which has none."""
 GID_SIZE: Final = 16
 
 _ATTACHMENT: Final = struct.Struct(f"<qqB{GID_SIZE}s")
 
 
 class EntityKind(StrEnum):
-    """What a token stands for."""
+    """Entity of a token."""
 
     NODE = "NN"
     PUBLISHER = "MP"
@@ -41,11 +41,11 @@ class RosQos:
     """Messages that are kept for late subscribers, or while a subscriber is busy."""
     reliable: bool = True
     latched: bool = False
-    """Transient local: late subscribers receive the newest ``depth`` messages."""
+    """Transient local: late subscribers receive the latest ``depth`` messages."""
 
     @property
     def text(self) -> str:
-        """As in a token; a value that is the default of ``rmw_zenoh`` is empty."""
+        """Return the form in a token; defaults of ``rmw_zenoh`` are empty."""
         depth = "" if self.depth == 42 else str(self.depth)  # 42: that default
         return f"{'' if self.reliable else 2}:{1 if self.latched else ''}:,{depth}:,:,:,,"
 
@@ -107,7 +107,7 @@ def token_key(
         domain: ``ROS_DOMAIN_ID``.
         session: id of the Zenoh session.
         numbers: of the node and of the entity, unique in the session; of a node equal.
-        entity: what it stands for.
+        entity: node, publisher, subscriber, service or client of the token.
         type_and_qos: type hash and quality of service; of a node not used.
     """
     node, own = numbers
@@ -143,17 +143,17 @@ def gid_of(token: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """What comes beside every message."""
+    """Attachment of every message."""
 
     sequence: int
-    """Counts the messages of the publisher from 1; of a reply that of the request."""
+    """Sequence number of the publisher from 1; a reply repeats the number of its request."""
     stamp: int
     """When it was sent, ns since 1970."""
     gid: bytes
-    """Of the publisher; of a reply that of the client."""
+    """GID of the publisher; a reply has the GID of its client."""
 
     def packed(self) -> bytes:
-        """As bytes."""
+        """Return the bytes of the attachment."""
         return _ATTACHMENT.pack(self.sequence, self.stamp, GID_SIZE, self.gid)
 
     @classmethod

@@ -1,7 +1,7 @@
-"""Tasks: what the robot does on request until it ends, one of each kind at a time.
+"""Tasks: requested activities that end, one of each kind at a time.
 
 A goal, an exploration, a mission and a behaviour (a move is one) are tasks. Every service that does one kind is a
-`Task`; its `TaskServer` does what is the same for all of them, in this order:
+`Task`; its `TaskServer` handles the common part of all tasks, in this order:
 
 1. A request is examined: who may ask, whether it is fresh, whether its number has been used.
 2. To start one, nothing else may drive the robot, the service must `accept` the request, and the robot must be armed.
@@ -56,7 +56,7 @@ class Task(Protocol[R_contra, P, S_co]):
     """One kind of task, as the service that does it tells its server."""
 
     noun: str
-    """What one is called in messages, such as "exploration"."""
+    """Name of a task in messages, such as "exploration"."""
 
     @property
     def running(self) -> bool:
@@ -74,7 +74,7 @@ class Task(Protocol[R_contra, P, S_co]):
         """
 
     def begin(self, accepted: P, request: R_contra, number: int) -> None:
-        """Start what was accepted."""
+        """Start the accepted task."""
 
     def control(self, request: R_contra) -> None:
         """Pause, resume or stop the one that runs, or give up the one that can be resumed.
@@ -93,7 +93,7 @@ class TaskServer(Generic[R, P, S]):
     Args:
         task: the service that does them.
         clock: time.
-        gate: newest state of the gate.
+        gate: latest state of the gate.
         max_age: see ``GateConfig.max_request_age``.
         out: where they are reported.
         changes: fields of the report whose change is published at once.
@@ -101,7 +101,7 @@ class TaskServer(Generic[R, P, S]):
         others: reports on tasks that exclude these.
         own: sources whose tasks do not exclude them.
         replaces: a new task replaces the running one instead of being refused.
-        drives: modes of the gate in which one can be started.
+        drives: modes of the gate that permit a start.
     """
 
     def __init__(
@@ -129,9 +129,9 @@ class TaskServer(Generic[R, P, S]):
         self._program: tuple[str, str | None] | None = None
         self._changed = asyncio.Event()
         self.number = 0
-        """Of the newest task."""
+        """Number of the latest task."""
         self.reported: S | None = None
-        """Newest report."""
+        """Latest report."""
 
     def take(self, request: R) -> int:
         """Carry out a request; returns the number of the task that it starts, or is about.

@@ -1,4 +1,4 @@
-"""Zones of the map: ground that the robot keeps out of, and ground on which it drives slowly."""
+"""Zones of the map: keepout zones and speed zones."""
 
 from enum import StrEnum
 from itertools import pairwise
@@ -16,9 +16,9 @@ Corners = Annotated[tuple[Corner, ...], Field(strict=False, max_length=200)]
 Whole = Annotated[int, Field(ge=0, lt=2**31)]
 
 LONGEST_OFF: Final = 86_400.0
-"""Maximum time for which a zone may be off (s)."""
+"""Maximum off time of a zone (s)."""
 OFF_FOR: Final = 600.0
-"""Time for which a zone is off unless the request says otherwise (s)."""
+"""Default off time of a zone (s)."""
 
 
 class ZoneArea(Schema):

@@ -51,14 +51,14 @@ class LevelGround:
         return np.zeros(np.broadcast(x, y).shape)
 
     def cast(self, xs: Array, ys: Array, zs: Array, headings: Array, rises: Array, reach: float) -> Array:
-        """As ``UnevenGround``."""
+        """Implements ``UnevenGround``."""
         with np.errstate(divide="ignore"):
             met = np.where(rises < 0.0, zs / -rises, np.inf)
         return np.where(met <= reach, met, np.inf)
 
 
 class RigidSpace(Space):
-    """``Space`` of rigid bodies: spare ones stand for what is put into the world, for people and for other robots.
+    """``Space`` of rigid bodies: spare ones represent objects, people and other robots.
 
     Args:
         footprint: of the robot, in its surroundings.
@@ -108,7 +108,7 @@ class RigidSpace(Space):
         if not robots and not people and self._known is self.obstacles:
             return
         self._known = self.obstacles
-        # Robots of rigid bodies and people are drawn as what they are.
+        # Robots of rigid bodies and people are drawn by their own shapes.
         there = [(shape, True) for shape in self._known] + [(disc, False) for disc in people] + robots
         for kind, cls in (("disc", Disc), ("box", Box)):
             shown = self._shown[kind]
@@ -163,7 +163,7 @@ class RigidSweep:
         self._blocks = has_blocks(plant)
 
     def __call__(self, poses: Array, beams: Beams | None, times_ns: NDArray[np.int64], reach: float) -> Array:
-        """As ``Sweep``."""
+        """Implements ``Sweep``."""
         x, y, yaw, pitch, roll, z = poses
         config = self._config
         beams = turned(LEVEL_BEAMS if beams is None else beams, pitch, roll)
@@ -193,7 +193,7 @@ class RigidEchoes:
         self._blocks = has_blocks(plant)
 
     def __call__(self, yaw: float, pitch: float, roll: float, z: float) -> Caster | None:
-        """As ``Solids``."""
+        """Implements ``Solids``."""
         if not self._blocks:
             return None
         height = z + self._height
@@ -245,7 +245,7 @@ def to_blocks(plant: RigidPlant, places: Array, ways: Array, reach: float) -> Ar
 
 
 def drive_line(truck: SimTruckConfig, parts: Mechanics) -> DriveLine:
-    """What the motors turn, by the body.
+    """Drive line of a body.
 
     Of the truck one motor for four wheels: open differentials in both axles, a rigid transfer case between them. Of a
     car the rear wheels, with a differential. Of a skid-steer robot the wheels of a side, coupled, or every wheel alone.
@@ -277,7 +277,7 @@ def drive_line(truck: SimTruckConfig, parts: Mechanics) -> DriveLine:
 
 
 def wheel_steering(truck: SimTruckConfig) -> Steering:
-    """From servos to wheels: by the fitted linkage of the truck, by an ideal one of a car; or none is steered."""
+    """Convert servo angles to wheel angles, by the truck's fitted linkage or a car's ideal one."""
     chassis = truck.chassis()
     linkage = chassis.linkage
     if truck.body.kind == "truck" and isinstance(linkage, LinkedAxles):

@@ -28,19 +28,19 @@ TIMESTEP: Final = 0.002
 SPARE: Final = 24
 """Discs, and boxes, that can be put into a world while it runs; people and other robots are among them."""
 PARKED: Final = -50.0
-"""Height at which spare ones wait, m."""
+"""Height of unused spare bodies, m."""
 SUPPORTS: Final = 4
 """Blocks that can be put under wheels."""
 SUPPORT_SIDES: Final = (0.12, 0.12, 0.4)
 """Sides of such a block, m: the part of its height that is not needed is below the ground."""
 TALL: Final = 0.6
-"""Height of what is put into a world, m."""
+"""Height of objects that are put into a world, m."""
 
 log = logging.getLogger(__name__)
 
 
 class Warnings:
-    """What MuJoCo warned of; its own way is a file in the present folder."""
+    """Warnings of MuJoCo, which by default writes them to a file in the current folder."""
 
     count: ClassVar[int] = 0
 
@@ -53,10 +53,10 @@ class Warnings:
 
 # Two geometries touch where a bit of the type of one is in the affinity of the other.
 CARRIES: Final = (5, 2)
-"""Type and affinity of what wheels stand on."""
+"""Type and affinity of the ground."""
 _GROUND: Final = {"contype": f"{CARRIES[0]}", "conaffinity": f"{CARRIES[1]}"}
 UPRIGHT: Final = (9, 2)
-"""Type and affinity of walls and of what stands in a world."""
+"""Type and affinity of walls and objects."""
 _UPRIGHT: Final = {"contype": f"{UPRIGHT[0]}", "conaffinity": f"{UPRIGHT[1]}"}
 _TOUCHES: Final = {
     "all": {"contype": "2", "conaffinity": "1"},
@@ -68,11 +68,11 @@ _TAG_PIXELS: Final = 16
 _TYRE: Final = "0.01 1"
 """Time constant, s, and damping ratio of its contact: under the weight it gives 0.3 mm."""
 _FLAT: Final = 1e-3
-"""Least height of a height field, m."""
+"""Minimum height of a height field, m."""
 
 
 class Group(IntEnum):
-    """Of geometries."""
+    """Groups of geometries."""
 
     GROUND = 0
     WALLS = 1
@@ -90,7 +90,7 @@ class DriveLine:
     Args:
         shafts: for every driven shaft its wheels' spin joints; between them are open differentials: the shaft turns
             with the mean of its wheels and gives all the same torque.
-        locked: groups of spin joints whose means turn alike (a rigid transfer case).
+        locked: groups of spin joints whose means turn equally (a rigid transfer case).
         stiffness: of the wind-up between a shaft and the mean of its wheels, Nm/rad.
         damping: Nm s/rad.
         clutch: greatest torque of all wheels of a shaft together, Nm.
@@ -452,11 +452,11 @@ def _shape(body: Element, shape: Shape, name: str) -> None:
 
 
 _HEAD_STIFFNESS: Final = 15.0
-"""Stiffness between a stabiliser's shaft and what it turns, Nm/rad."""
+"""Stiffness between a stabiliser's shaft and its load, Nm/rad."""
 _HEAD_DAMPING: Final = 0.15
 """Nm s/rad."""
 HEAD_LAG: Final = _HEAD_DAMPING / _HEAD_STIFFNESS
-"""Seconds by which a joint would trail a shaft that turns, because its damper holds it against the body."""
+"""Delay of a joint behind its turning shaft, s, caused by its damper."""
 
 
 def _drive(root: Element, description: Description, drive: DriveLine) -> None:

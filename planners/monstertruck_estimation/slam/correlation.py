@@ -2,7 +2,7 @@
 
 Every level of the grid holds the maximum over squares of 2^level cells, so that a block of translations is bounded by
 one look-up per point (Hess, Kohler, Rapp, Andor 2016; Olson 2009). The search returns the true maximum in its window.
-A submap, merged from several keyframes, carries the pyramids of its own cloud.
+A submap, merged from several keyframes, carries the pyramids of the merged cloud.
 """
 
 import math
@@ -28,7 +28,7 @@ RESOLUTION: Final = 0.05
 LONGEST: Final = 0.5
 """An element is drawn to this half length at most, m."""
 WORK: Final = 400_000
-"""Blocks evaluated, unless the caller says otherwise."""
+"""Default number of evaluated blocks."""
 PIECE: Final = 2e6
 """Look-ups of one piece of a search: 4 to 6 ms."""
 
@@ -74,7 +74,7 @@ class Peak:
     rival: float
     """Best score of a clearly different pose in the window; 0 if none came near."""
     unseen: float = 0.0
-    """Greatest score a better rival may have, as the search for it has ended early; 0 if it has not."""
+    """Upper bound of a rival's score after a search that ended early; else 0."""
 
 
 def look_ups(points: Array, window: tuple[float, float], levels: int) -> float:
@@ -105,7 +105,7 @@ def correlate(
     apart: float = 0.0,
     work: int = WORK,
 ) -> Peak | None:
-    """Search at once; see ``correlation``. ``apart`` is that of a ``RivalSearch``; 0: do not look for rivals."""
+    """Search at once; see ``correlation``. ``apart`` is the same as in a ``RivalSearch``; 0: do not look for rivals."""
     rival = RivalSearch(apart) if apart > 0 else None
     return finished(correlation(grid, points, guess, window, deviation, least, rival, work))
 
@@ -128,9 +128,9 @@ def correlation(
         guess: shape (3,); middle of the window.
         window: half width of the translation (m) and of the yaw (rad).
         deviation: standard deviation of the guess (m, rad), which breaks ties.
-        least: poses scoring less are no result.
+        least: poses with a lower score are ignored.
         rival: look for a rival, too.
-        work: blocks evaluated before the search, and that for the rival, ends with what it has.
+        work: maximum number of blocks evaluated by the search, and again by the search for a rival.
     """
     if not len(points):
         return None
@@ -179,7 +179,7 @@ class _SearchEnd:
     x: int
     y: int
     left: float
-    """What a pose not evaluated may score; 0 after a search that came to its end."""
+    """Upper bound of the score of a pose not evaluated; 0 after a complete search."""
 
 
 def _searched(place: _Place, least: float, enough: float, zone: _Zone, work: float) -> Pieces[_SearchEnd]:
@@ -290,7 +290,7 @@ def _per_axis(cells: int, top: int) -> int:
 
 @njit(cache=True)
 def _least_square(low: int, width: int) -> int:
-    """Least square of the whole numbers low .. low + width - 1."""
+    """Return the minimum square of the integers low .. low + width - 1."""
     high = low + width - 1
     if low > 0:
         return low * low
@@ -325,7 +325,7 @@ def _coarsest(
 
 
 _State = tuple[float, int, int, int, int, int, Array, Blocks]
-"""Of a search: best score, its turn index, x and y, blocks of the coarsest level taken, and the heap of the others."""
+"""State of a search: best score, its turn index, x and y, taken coarsest blocks, and the heap of the rest."""
 
 
 @njit(cache=True)
@@ -334,13 +334,13 @@ def _search(
     bounds: Array, shut_k: int, shut_x: float, shut_y: float, shut_cells: float, shut_turns: float, enough: float,
     most: int, state: _State,
 ) -> tuple[_State, float, bool]:  # fmt: skip
-    """Best-first branch and bound: the state after it, what a pose not evaluated may score, and whether it is done.
+    """Best-first branch and bound: returns the state, the bound of a pose not evaluated, and whether it is done.
 
     The turn index is -1 if nothing reached the first ``best``. The search begins with the sorted ``blocks`` of the
     coarsest level, and pauses when more than ``most`` below it were evaluated. The block of the greatest bound is next,
     whatever its size: depth first, a search that ends early would have seen one corner of a great window, and not the
     place that fits.
-    Poses within ``shut_cells`` and ``shut_turns`` of (shut_x, shut_y, shut_k) do not count. One that scores more than
+    Poses within ``shut_cells`` and ``shut_turns`` of (shut_x, shut_y, shut_k) are excluded. One that scores more than
     ``enough`` ends the search.
     """
     best, best_k, best_x, best_y, taken, size, keys, heap = state

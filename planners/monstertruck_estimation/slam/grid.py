@@ -1,6 +1,6 @@
 """Occupancy grid by the beam model: log odds of every cell, growing, its changes published as tiles.
 
-Inverse sensor model with constant log odds for the end of a beam and for what it passed (Thrun, Burgard, Fox:
+Inverse sensor model with constant log odds for the end of a beam and for the passed cells (Thrun, Burgard, Fox:
 Probabilistic Robotics, table 9.2). A scan counts once per cell, and an end outweighs passes: otherwise walls seen at a
 grazing angle, and everything near the sensor, would be counted by the dozen.
 """
@@ -48,7 +48,7 @@ class OccupancyGrid:
         self.clear()
 
     def clear(self) -> None:
-        """Empty the grid; ``changes`` still compares with what was published."""
+        """Empty the grid; ``changes`` still compares with the published grid."""
         self._corner = np.zeros(2, np.int64)
         self._odds = np.zeros((0, 0), np.int16)
         self._marks = np.zeros((0, 0), np.uint16)
@@ -96,7 +96,7 @@ class OccupancyGrid:
         return GridPatch(np.ascontiguousarray(cells), self._metres(corner), self.config.resolution)
 
     def changes(self) -> list[GridPatch]:
-        """The tiles that differ from the last call's, ordered by row and column."""
+        """Return the tiles that changed since the last call, ordered by row and column."""
         result = []
         known = self._published if self._redrawn else ()
         for key in sorted({*known, *self._candidates()}):
@@ -182,7 +182,7 @@ def _cells(points, sensor, scale):  # type: ignore[no-untyped-def] # noqa: ANN00
 
 @njit(cache=True)
 def trace(odds, marks, stride, ends, corner, mark, model, hits):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN201
-    """Add one scan to a grid: first the cells in which beams end, then those they pass, every cell once.
+    """Add one scan to a grid: first the ends of the beams, then the passed cells, every cell once.
 
     Args:
         odds: int16, flat; log odds of the cells.
@@ -211,7 +211,7 @@ def trace(odds, marks, stride, ends, corner, mark, model, hits):  # type: ignore
         across, along = abs(dx) >= abs(dy), max(abs(dx), abs(dy))
         if along == 0:
             continue
-        # One cell of the longer axis a step, the shorter one in fixed point: no branch but the mark's.
+        # One cell of the longer axis a step, the shorter one in fixed point: no branch except for the mark.
         if across:
             step, side, slope = (1 if dx > 0 else -1), stride, (dy << fraction_bits) // along
         else:
@@ -242,7 +242,7 @@ def passed_ends(inputs: ScanInput, reach: float) -> Array:
 
     Of a level scan only: what a tilted beam passes is not at the height of the others.
     """
-    level = 0.02  # slope of the scanning plane up to which beams without a return say something: 0.1 m over 5 m
+    level = 0.02  # maximum slope of the scanning plane for beams without a return: 0.1 m over 5 m
     if inputs.slopes is not None and max(map(abs, inputs.slopes)) > level:
         return NONE
     beams = np.flatnonzero(np.isposinf(inputs.ranges))
@@ -297,7 +297,7 @@ class GridBuilder:
 
     Args:
         config: the grid, and which scans are integrated.
-        body: length and width of the robot, m; None = not known.
+        body: length and width of the robot, m; None if unknown.
     """
 
     def __init__(self, config: GridConfig, body: tuple[float, float] | None = None) -> None:
@@ -359,7 +359,7 @@ class GridBuilder:
         return True
 
     def keep_marked(self, stamps: NDArray[np.int64], kept: NDArray[np.bool_]) -> None:
-        """Rebuild the grid of those of its scans that the trajectory marks.
+        """Rebuild the grid from the scans that the trajectory marks.
 
         Args:
             stamps: shape (n,), ns, rising.
@@ -393,7 +393,7 @@ class GridBuilder:
         self.grid.add(transform(pose, np.array([mount[:2]]))[0], points[:returns], passed)
 
     def _prune(self) -> None:
-        """Drop every other scan but the newest quarter."""
+        """Drop every other scan except in the latest quarter."""
         count = len(self._stamps)
         self._keep([i for i in range(count) if i % 2 == 0 or i >= 3 * count // 4])
 

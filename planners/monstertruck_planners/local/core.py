@@ -1,4 +1,4 @@
-"""What the local planners share: the route cut to the window, the rest of the last path, the local search.
+"""Shared parts of the local planners: the route cut to the window, the rest of the last path, the local search.
 
 Loads numba.
 """
@@ -41,7 +41,7 @@ PATH_CUSP_REACHED = 0.02
 def escape_motion(
     field: FieldData, footprint: FootprintData, cover: CoveringDiscs, pose: Array, primitives: Array, margin: float
 ) -> Array:
-    """Shortest motion to a pose that keeps the margin, on which no part of the truck comes nearer to anything.
+    """Shortest motion to a pose that keeps the margin, without any part of the truck coming nearer to an obstacle.
 
     Args:
         field: obstacles.
@@ -88,14 +88,14 @@ class CycleStart:
     band: PosePath
     """The route in the window, from near the truck to the last free pose."""
     state: LocalPlannerState
-    """With the new band."""
+    """Return the state with the new band."""
 
 
 class LocalPlannerCore:
     """Route in the window, collision checks and local search of one vehicle.
 
     Args:
-        vehicle: what is driven.
+        vehicle: steered vehicle.
         config: of the local planner.
         search: costs and effort of the local search; the margin is that of ``config``.
     """
@@ -203,7 +203,7 @@ class LocalPlannerCore:
         inside = np.flatnonzero(self._in_window(band.poses, obstacles, 0.0) & free)
         last = int(inside[-1]) if len(inside) else len(band.poses) - 1
         goal = band.poses[last].copy()
-        # headings tried at the goal of a local search, relative to that of the route, rad
+        # headings tried at the goal of a local search, relative to the route, rad
         goal_headings = (0.0, 1.0, -1.0)
         if last < len(band.poses) - 1 or not final:
             # 5: searches without a result before another heading is tried
@@ -262,7 +262,7 @@ class LocalPlannerCore:
         return LocalPlan(reason, after, text=text)
 
     def _approach(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> MotionPath | None:
-        """Motion along the band to 0.5 m before what blocks it; None if the truck is there."""
+        """Return the motion along the band to 0.5 m before the obstacle; None if the truck is there."""
         free = obstacles.free(self.vehicle.footprint, band.poses, self.config.margin)
         broken = len(free) if free.all() else int(np.argmin(free))
         travelled = band.travelled

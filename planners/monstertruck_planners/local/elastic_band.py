@@ -35,7 +35,7 @@ class CoveringDiscs(NamedTuple):
     radius: Array
     """m."""
     reach: float
-    """Greatest distance of a centre from the pose, m."""
+    """Maximum distance of a centre from the pose, m."""
 
 
 class BandParameters(NamedTuple):
@@ -52,7 +52,7 @@ class BandParameters(NamedTuple):
     largest: float
     """Largest radius, m."""
     scale: float
-    """Of a bubble's radius to its clearance: 1; half of it in the published planner."""
+    """Ratio of a bubble's radius to its clearance: 1; 0.5 in the published planner."""
     reach: float
     """Metres per radian between two headings; 0 in the published planner."""
     spacing: float
@@ -379,12 +379,12 @@ def relax_band(
 
 
 def _cusps(path: PosePath) -> NDArray[np.int64]:
-    """Indices of the poses at which the direction changes."""
+    """Return the indices of the poses with a change of direction."""
     return np.asarray(np.flatnonzero(np.diff(path.directions)))
 
 
 def _sideslips(path: PosePath) -> Array:
-    """From the heading to the course, rad, for every pose; small ones are corners of the path, not crab."""
+    """Return the angle from heading to course, rad, for every pose; small angles are corners of the path, not crab."""
     steps = np.diff(path.poses[:, :2], axis=0)
     if not len(steps):
         return np.zeros(len(path.poses))

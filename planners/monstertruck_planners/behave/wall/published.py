@@ -24,13 +24,13 @@ from monstertruck_schemas.topics import ODOMETRY, SONAR, Topic
 DIAGONAL: Final = math.radians(45)
 """Angle between the side sonar and the diagonal one."""
 FOLLOWING: Final = ("follow", "free")
-"""Phases in which a lap may begin: the robot drives along the wall."""
+"""Phases that may start a lap: the robot drives along the wall."""
 
 Phase = Literal["approach", "follow", "turn_away", "free", "turn_back", "stop"]
 
 
 class Ranges(NamedTuple):
-    """What the sonars measure, m, as seen with the wall on the left."""
+    """Ranges of the sonars, m, as seen with the wall on the left."""
 
     side: float
     diagonal: float
@@ -56,7 +56,7 @@ def wall_distance(diagonal: float, side: float, offset: float = 0.0) -> float:
 
 
 def tightest_curvature(body: BehaviourBody) -> float:
-    """Greatest curvature of a body's path, 1/m; inf where it turns on the spot.
+    """Return the maximum curvature of a body's path, 1/m; inf where it turns on the spot.
 
     Raises:
         KinematicsError: it cannot turn.
@@ -74,7 +74,7 @@ def tightest_curvature(body: BehaviourBody) -> float:
 
 
 def ramp(begin: float, start: float, end: float, duration: float) -> TimedRamp:
-    """From ``start`` to ``end`` without acceleration at both ends."""
+    """Ramp from ``start`` to ``end`` without acceleration at both ends."""
     return TimedRamp(begin, CubicRamp(start, end, duration))
 
 
@@ -98,13 +98,13 @@ class WallState:
     """Distance since then or since the last lap, m."""
     laps: int = 0
     turned_before: float = 0.0
-    """``turned`` when the present phase began, rad."""
+    """``turned`` when the current phase began, rad."""
     before: tuple[Ranges, ...] = ()
     """Ranges of the last two steps."""
     gaps: tuple[float | None, float | None] = (None, None)
     """``travelled`` when side and diagonal sonar began to look into a gap."""
     echoes: tuple[tuple[float, float, float], ...] = ()
-    """Newest ones on the wall: x and y by odometry, with the wall on the left, and ``travelled`` when they came, m."""
+    """Latest echoes on the wall: x and y by odometry, with the wall on the left, and their ``travelled``, m."""
     asked: float = 0.0
     """Requested speed at the step before, m/s."""
     moving_since: float | None = None
@@ -142,7 +142,7 @@ class _Wall(ABC):
         state = replace(state, sonars=state.sonars.observe(sonars, self._names, state.turned, t))
         fault = state.sonars.fault(state.turned, t)
         state = _stall_timed(state, odometry.twist.vx, t)
-        # 1.0: seconds of requested but not measured motion after which a motor counts as stalled
+        # 1.0: a motor is stalled after this time of requested but not measured motion, s
         if fault is None and state.moving_since is not None and t - state.moving_since >= 1.0:
             fault = Reason.STUCK, f"{state.asked:.2f} m/s asked for, {odometry.twist.vx:.2f} m/s driven"
         if fault is None and state.phase == "turn_away" and state.turned - state.turned_before > math.tau:
@@ -273,7 +273,7 @@ class WallPd(_Wall):
         return replace(state, echoes=tuple(echoes))
 
     def _along_line(self, state: WallState) -> float:
-        """Yaw rate along the line through the newest echoes, rad/s; straight on if there are too few."""
+        """Yaw rate along the line through the latest echoes, rad/s; straight on if there are too few."""
         if state.pose is None or len(state.echoes) < 4:  # least number of echoes of such a line
             return 0.0
         x, y, yaw = state.pose[0], state.pose[1] * self._mirror, state.pose[2] * self._mirror
