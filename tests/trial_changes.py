@@ -134,7 +134,7 @@ def _sensor() -> Trial:
         f"{DRIVERS}/mb7360/{name}.py": moved(page[f"truck_sonar/{name}.py"]).replace(
             "monstertruck_drivers.mb7360.message", "monstertruck_schemas.sensor"
         )
-        for name in ("__init__", "protocol", "config", "driver", "emulator", "probe")
+        for name in ("__init__", "protocol", "config", "driver", "emulator", "identity")
     }
     plugin = moved(page["truck_sonar/plugin.py"])
     topic = "RANGE: Final = " + plugin.partition("TOPIC = ")[2].partition("\n\n")[0].replace("Writer.", "W.") + "\n"
@@ -196,7 +196,7 @@ class TwinConfig(EposConfig):
         settings="monstertruck_drivers.twin.config:TwinConfig",
         implementation="monstertruck_drivers.epos.driver:EposDriver",
         emulator="monstertruck_drivers.epos.emulator:emulated",
-        probe="monstertruck_drivers.epos.probe:probe",
+        identity="monstertruck_drivers.epos.identity:identify",
         baud=EPOS_BAUD,
     ),
 """

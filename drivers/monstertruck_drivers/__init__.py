@@ -1,1 +1,1 @@
-"""Device drivers: one folder per device with its codec, driver, emulator and probe."""
+"""Device drivers: one folder per device with its codec, driver, emulator and identification."""

@@ -24,6 +24,7 @@ from monstertruck_drivers.receiver.protocol import CRSF_BAUD, SBUS_BAUD
 from monstertruck_drivers.steppers.protocol import STEPPERS_BAUD
 from monstertruck_drivers.vesc.protocol import VESC_BAUD
 from monstertruck_drivers.wt61.protocol import WT61_BAUD
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.plugins import Catalog, Plugin, load
 from monstertruck_schemas import topics
@@ -31,8 +32,9 @@ from monstertruck_schemas.base import Schema
 from monstertruck_schemas.roles import SHAFTS, DeviceRole, ServiceName
 from monstertruck_schemas.topics import CMD_DRIVES, DRIVES, Topic, Writer
 
-Probe = Callable[..., Awaitable[dict[str, Any]]]
-"""Identifies a device; takes what the driver opens, the clock, and the driver's settings (None = defaults)."""
+Identify = Callable[..., Awaitable[dict[str, Any]]]
+"""Identifies a device without motion; takes what ``DeviceKind.identify`` opens, the clock, and the driver's settings.
+Returns JSON-able facts."""
 
 
 class Duty(StrEnum):
@@ -246,14 +248,13 @@ class DeviceKind(Plugin):
     """Roles it can take."""
     emulator: str
     """Place ``module:function`` of its ``EmulatorFactory``."""
-    probe: str
-    """Place ``module:function`` of its ``Probe``."""
+    identity: str
+    """Place ``module:function`` of its ``Identify``."""
     also: Mapping[str, Topic[Any]] = field(default_factory=dict)
     """Topics written in addition to the role's topics, by the driver's parameter. The driver gets None if the topic is
     the main topic of another configured device."""
     opens: Literal["serial", "i2c", "video", "computer"] = "serial"
-    """What driver and probe get: the ``Port`` of a serial line or of an I2C bus, a ``FrameSource`` (the probe: a path),
-    or the ``Computer``."""
+    """What the driver gets: the ``Port`` of a serial line or of an I2C bus, a ``FrameSource``, or the ``Computer``."""
     baud: int | None = None
     """Baud rate of its serial line; None = USB from end to end, any rate works."""
     framing: Framing | None = None
@@ -269,9 +270,31 @@ class DeviceKind(Plugin):
         """Makes an emulated device; loads its module."""
         return cast("EmulatorFactory", load(self.emulator))
 
-    def probe_function(self) -> Probe:
-        """Identifies a device; loads its module."""
-        return cast("Probe", load(self.probe))
+    async def identify(self, where: Any, clock: Clock, settings: Schema | None = None) -> dict[str, Any]:
+        """Identify the device at a place, without motion.
+
+        Args:
+            where: ``Port`` of a serial line or of an I2C bus, path of a video device, or the ``Computer``.
+            clock: time.
+            settings: settings of the driver; None = defaults.
+
+        Returns:
+            JSON-able: what the device says of itself; of a device on a port first ``device`` and ``port``.
+
+        Raises:
+            DeviceLostError: not plugged in.
+            DeviceTimeoutError: silence.
+            ProtocolError: an answer against the protocol.
+            WrongDeviceError: another device.
+            PortBusyError: another process holds the port.
+        """
+        ask = cast("Identify", load(self.identity))
+        settings = settings or self.settings_class()()
+        if self.opens not in ("serial", "i2c"):
+            return await ask(where, clock, settings)
+        async with await where.open() as link:
+            facts = await ask(link, clock, settings)
+        return {"device": self.doc, "port": where.name, **facts}
 
 
 RESERVED: Final = frozenset(
@@ -342,7 +365,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.hokuyo_urg.config:HokuyoConfig",
         implementation="monstertruck_drivers.hokuyo_urg.driver:HokuyoDriver",
         emulator="monstertruck_drivers.hokuyo_urg.emulator:emulated",
-        probe="monstertruck_drivers.hokuyo_urg.probe:probe",
+        identity="monstertruck_drivers.hokuyo_urg.identity:identify",
         usb=UsbIdentity("15d1:0000", "URG-Series USB Driver", "ttyACM"),
     ),
     DeviceKind(
@@ -352,7 +375,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.hokuyo_urg.config:HokuyoLxConfig",
         implementation="monstertruck_drivers.hokuyo_urg.driver:HokuyoDriver",
         emulator="monstertruck_drivers.hokuyo_urg.lx_emulator:emulated",
-        probe="monstertruck_drivers.hokuyo_urg.probe:probe_lx",
+        identity="monstertruck_drivers.hokuyo_urg.identity:identify",
     ),
     DeviceKind(
         name="ld19",
@@ -361,7 +384,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.ld19.config:Ld19Config",
         implementation="monstertruck_drivers.ld19.driver:Ld19Driver",
         emulator="monstertruck_drivers.ld19.emulator:emulated",
-        probe="monstertruck_drivers.ld19.probe:probe",
+        identity="monstertruck_drivers.ld19.driver:identify",
         baud=LD19_BAUD,
         usb=UsbIdentity("10c4:ea60", "CP2102 USB to UART Bridge Controller", "ttyUSB"),
     ),
@@ -372,7 +395,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.rplidar.config:RplidarConfig",
         implementation="monstertruck_drivers.rplidar.driver:RplidarDriver",
         emulator="monstertruck_drivers.rplidar.emulator:emulated",
-        probe="monstertruck_drivers.rplidar.probe:probe",
+        identity="monstertruck_drivers.rplidar.session:identify",
         usb=UsbIdentity("10c4:ea60", "CP2102 USB to UART Bridge Controller", "ttyUSB"),
     ),
     DeviceKind(
@@ -391,7 +414,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.epos.config:EposConfig",
         implementation="monstertruck_drivers.epos.driver:EposDriver",
         emulator="monstertruck_drivers.epos.emulator:emulated",
-        probe="monstertruck_drivers.epos.probe:probe",
+        identity="monstertruck_drivers.epos.identity:identify",
         baud=EPOS_BAUD,
         usb=UsbIdentity("0403:6001", "FT232R USB UART", "ttyUSB"),
     ),
@@ -402,7 +425,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.steppers.config:StepperConfig",
         implementation="monstertruck_drivers.steppers.driver:StepperDriver",
         emulator="monstertruck_drivers.steppers.emulator:emulated",
-        probe="monstertruck_drivers.steppers.probe:probe",
+        identity="monstertruck_drivers.steppers.session:identify",
         baud=STEPPERS_BAUD,
         usb=UsbIdentity("1a86:7523", "USB Serial", "ttyUSB"),
     ),
@@ -413,7 +436,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.arduino_bridge.config:ArduinoBridgeConfig",
         implementation="monstertruck_drivers.arduino_bridge.driver:ArduinoBridgeDriver",
         emulator="monstertruck_drivers.arduino_bridge.emulator:emulated",
-        probe="monstertruck_drivers.arduino_bridge.probe:probe",
+        identity="monstertruck_drivers.arduino_bridge.session:identify",
         baud=BOARD_BAUD,
         usb=UsbIdentity("1a86:7523", "USB Serial", "ttyUSB"),
     ),
@@ -424,7 +447,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.vesc.config:VescConfig",
         implementation="monstertruck_drivers.vesc.driver:VescDriver",
         emulator="monstertruck_drivers.vesc.emulator:emulated",
-        probe="monstertruck_drivers.vesc.probe:probe",
+        identity="monstertruck_drivers.vesc.session:identify",
         baud=VESC_BAUD,
         usb=UsbIdentity("0483:5740", "ChibiOS/RT Virtual COM Port", "ttyACM"),
     ),
@@ -435,7 +458,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.maestro.esc_config:MaestroEscConfig",
         implementation="monstertruck_drivers.maestro.esc_driver:MaestroEscDriver",
         emulator="monstertruck_drivers.maestro.esc_emulator:emulated",
-        probe="monstertruck_drivers.maestro.probe:probe_esc",
+        identity="monstertruck_drivers.maestro.session:identify",
         usb=UsbIdentity("1ffb:0089", "Pololu Micro Maestro 6-Servo Controller", "ttyACM"),
     ),
     DeviceKind(
@@ -445,7 +468,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.maestro.config:MaestroConfig",
         implementation="monstertruck_drivers.maestro.driver:MaestroDriver",
         emulator="monstertruck_drivers.maestro.emulator:emulated",
-        probe="monstertruck_drivers.maestro.probe:probe",
+        identity="monstertruck_drivers.maestro.session:identify",
         usb=UsbIdentity("1ffb:0089", "Pololu Micro Maestro 6-Servo Controller", "ttyACM"),
     ),
     DeviceKind(
@@ -455,7 +478,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.pca9685.config:Pca9685EscConfig",
         implementation="monstertruck_drivers.pca9685.esc_driver:Pca9685EscDriver",
         emulator="monstertruck_drivers.pca9685.emulator:emulated_esc",
-        probe="monstertruck_drivers.pca9685.probe:probe_esc",
+        identity="monstertruck_drivers.pca9685.session:identify",
         opens="i2c",
     ),
     DeviceKind(
@@ -465,7 +488,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.pca9685.config:Pca9685Config",
         implementation="monstertruck_drivers.pca9685.driver:Pca9685Driver",
         emulator="monstertruck_drivers.pca9685.emulator:emulated",
-        probe="monstertruck_drivers.pca9685.probe:probe",
+        identity="monstertruck_drivers.pca9685.session:identify",
         opens="i2c",
     ),
     DeviceKind(
@@ -475,7 +498,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.ax12.config:Ax12Config",
         implementation="monstertruck_drivers.ax12.driver:Ax12Driver",
         emulator="monstertruck_drivers.ax12.emulator:emulated",
-        probe="monstertruck_drivers.ax12.probe:probe",
+        identity="monstertruck_drivers.ax12.identity:identify",
         baud=AX12_BAUD,
         usb=UsbIdentity("0403:6001", "USB2Dynamixel", "ttyUSB"),
     ),
@@ -486,7 +509,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.webcam.config:WebcamConfig",
         implementation="monstertruck_drivers.webcam.driver:WebcamDriver",
         emulator="monstertruck_drivers.webcam.emulator:emulated",
-        probe="monstertruck_drivers.webcam.probe:probe",
+        identity="monstertruck_drivers.webcam.identity:identify",
         opens="video",
         usb=UsbIdentity("046d:080a", "Webcam C905", "video"),
     ),
@@ -497,7 +520,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.mjpeg.config:MjpegConfig",
         implementation="monstertruck_drivers.mjpeg.driver:MjpegDriver",
         emulator="monstertruck_drivers.mjpeg.emulator:emulated",
-        probe="monstertruck_drivers.mjpeg.probe:probe",
+        identity="monstertruck_drivers.mjpeg.identity:identify",
     ),
     DeviceKind(
         name="srf08",
@@ -506,7 +529,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.srf08.config:Srf08Config",
         implementation="monstertruck_drivers.srf08.driver:Srf08Driver",
         emulator="monstertruck_drivers.srf08.emulator:emulated",
-        probe="monstertruck_drivers.srf08.probe:probe",
+        identity="monstertruck_drivers.srf08.session:identify",
         usb=UsbIdentity("04d8:ffee", "USB-ISS", "ttyACM"),
     ),
     DeviceKind(
@@ -516,7 +539,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.wt61.config:Wt61Config",
         implementation="monstertruck_drivers.wt61.driver:Wt61Driver",
         emulator="monstertruck_drivers.wt61.emulator:emulated",
-        probe="monstertruck_drivers.wt61.probe:probe",
+        identity="monstertruck_drivers.wt61.driver:identify",
         baud=WT61_BAUD,
         usb=UsbIdentity("1a86:7523", "USB2.0-Serial", "ttyUSB"),
     ),
@@ -528,7 +551,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.bno085.config:Bno085Config",
         implementation="monstertruck_drivers.bno085.driver:Bno085Driver",
         emulator="monstertruck_drivers.bno085.emulator:emulated",
-        probe="monstertruck_drivers.bno085.probe:probe",
+        identity="monstertruck_drivers.bno085.driver:identify",
         baud=BNO085_BAUD,
         usb=UsbIdentity("10c4:ea60", "CP2102 USB to UART Bridge Controller", "ttyUSB"),
     ),
@@ -539,7 +562,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.roboclaw.config:RoboclawConfig",
         implementation="monstertruck_drivers.roboclaw.driver:RoboclawDriver",
         emulator="monstertruck_drivers.roboclaw.emulator:emulated",
-        probe="monstertruck_drivers.roboclaw.probe:probe",
+        identity="monstertruck_drivers.roboclaw.session:identify",
         usb=UsbIdentity("03eb:2404", "USB Roboclaw", "ttyACM"),
     ),
     DeviceKind(
@@ -549,7 +572,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.receiver.config:CrsfConfig",
         implementation="monstertruck_drivers.receiver.driver:ReceiverDriver",
         emulator="monstertruck_drivers.receiver.emulator:emulated",
-        probe="monstertruck_drivers.receiver.probe:probe",
+        identity="monstertruck_drivers.receiver.driver:identify",
         baud=CRSF_BAUD,
         usb=UsbIdentity("10c4:ea60", "CP2102N USB to UART Bridge Controller", "ttyUSB"),
     ),
@@ -560,7 +583,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.receiver.config:SbusConfig",
         implementation="monstertruck_drivers.receiver.driver:ReceiverDriver",
         emulator="monstertruck_drivers.receiver.emulator:emulated_sbus",
-        probe="monstertruck_drivers.receiver.probe:probe_sbus",
+        identity="monstertruck_drivers.receiver.driver:identify",
         baud=SBUS_BAUD,
         framing="8E2",
         usb=UsbIdentity("0403:6001", "FT232R USB UART", "ttyUSB"),
@@ -572,7 +595,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.battery.config:IioConfig",
         implementation="monstertruck_drivers.battery.driver:IioBatteryDriver",
         emulator="monstertruck_drivers.battery.emulator:emulated",
-        probe="monstertruck_drivers.battery.probe:probe",
+        identity="monstertruck_drivers.battery.driver:identify",
         opens="computer",
     ),
     DeviceKind(
@@ -582,7 +605,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.link_quality.config:LinkQualityConfig",
         implementation="monstertruck_drivers.link_quality.driver:LinkQualityDriver",
         emulator="monstertruck_drivers.link_quality.emulator:emulated",
-        probe="monstertruck_drivers.link_quality.probe:probe",
+        identity="monstertruck_drivers.link_quality.driver:identify",
         opens="computer",
     ),
     DeviceKind(
@@ -592,7 +615,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.host_health.config:HostHealthConfig",
         implementation="monstertruck_drivers.host_health.driver:HostHealthDriver",
         emulator="monstertruck_drivers.host_health.emulator:emulated",
-        probe="monstertruck_drivers.host_health.probe:probe",
+        identity="monstertruck_drivers.host_health.driver:identify",
         opens="computer",
     ),
     DeviceKind(
@@ -602,7 +625,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.os4000.config:Os4000Config",
         implementation="monstertruck_drivers.os4000.driver:Os4000Driver",
         emulator="monstertruck_drivers.os4000.emulator:emulated",
-        probe="monstertruck_drivers.os4000.probe:probe",
+        identity="monstertruck_drivers.os4000.session:identify",
         baud=OS4000_BAUD,
         usb=UsbIdentity("10c4:ea60", "CP2102 USB to UART Bridge Controller", "ttyUSB"),
     ),

@@ -33,7 +33,7 @@ MOTOR = DeviceKind(
     settings="own_devices:MotorConfig",
     implementation="monstertruck_drivers.epos.driver:EposDriver",
     emulator="monstertruck_drivers.epos.emulator:emulated",
-    probe="monstertruck_drivers.epos.probe:probe",
+    identity="monstertruck_drivers.epos.identity:identify",
 )
 SERVOS = DeviceKind(
     name="own_servos",
@@ -42,7 +42,7 @@ SERVOS = DeviceKind(
     settings="own_devices:ServoConfig",
     implementation="monstertruck_drivers.maestro.driver:MaestroDriver",
     emulator="monstertruck_drivers.maestro.emulator:emulated",
-    probe="monstertruck_drivers.maestro.probe:probe",
+    identity="monstertruck_drivers.maestro.session:identify",
 )
 """
 FILES = {

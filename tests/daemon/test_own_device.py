@@ -88,7 +88,7 @@ async def test_its_emulator_answers_its_probe(target: Path, tmp_path: Path):
         assert emulator.stderr is not None
         assert "ranger" in (await emulator.stderr.readline()).decode()
         probed = json.loads(await asyncio.to_thread(run_with, target, "probe", "ranger", "--port", str(link), "--json"))
-        assert probed["device"] == "MaxBotix MB7360"
+        assert probed["device"] == "MaxBotix MB7360 ultrasonic range finder"
         assert 300 <= probed["distance_mm"] <= 5000
     finally:
         await end(emulator)

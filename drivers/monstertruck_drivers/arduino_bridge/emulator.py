@@ -17,14 +17,14 @@ from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.disobedience import USAGE, DisobedientMotor
 from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ReceivedBytes
 from monstertruck_drivers.epos.firmware import FreeMotor
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice, LateAnswers
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 TO_RPM: Final = 60.0
 
 
-class ArduinoBridgeEmulator:
+class ArduinoBridgeEmulator(FaultyDevice):
     """Board with two motors.
 
     Faults (``inject``): ``silent on|off`` (gives no answers), ``late SECONDS [COUNT]`` (answers), ``noise COUNT``
@@ -48,9 +48,17 @@ class ArduinoBridgeEmulator:
         self._clock = clock
         self._config = settings or ArduinoBridgeConfig()
         self._plants = [*plants, *(FreeMotor() for _ in range(2 - len(plants)))][:2]
-        self._silent = False
-        self._late: list[float] = []
-        self._noise = 0
+        self._late = LateAnswers()
+        self.faults = FaultTable(
+            self.name,
+            {
+                "silent on|off": False,
+                "late SECONDS [COUNT]": self._late.start,
+                "noise COUNT": 0,
+                "reset": self.power_cycle,
+                f"runaway {USAGE}": self._run_away,
+            },
+        )
         self._runaway: DisobedientMotor | None = None
         self._restart()
 
@@ -68,32 +76,9 @@ class ArduinoBridgeEmulator:
         boot = 1500 * MILLISECOND  # from a restart to the first answer: the boot loader waits for a new program
         self._restart(boot)
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault, see the class.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        try:
-            match fault, values:
-                case "silent", (("on" | "off") as word,):
-                    self._silent = word == "on"
-                case "late", (seconds, *count):
-                    self._late = [float(seconds)] * int(*count or ("1",))
-                case "noise", (count,):
-                    self._noise = int(count)
-                case "reset", ():
-                    self.power_cycle()
-                case "runaway", words:
-                    self._runaway = DisobedientMotor.parse(*words)
-                    self._drive()
-                case _:
-                    raise ValueError(fault)
-        except (ValueError, TypeError) as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: silent on|off, late SECONDS "
-                f"[COUNT], noise COUNT, reset, runaway {USAGE}"
-            ) from error
+    def _run_away(self, *words: str) -> None:
+        self._runaway = DisobedientMotor.parse(*words)
+        self._drive()
 
     async def run(self, end: DeviceEnd) -> None:
         """Serve until cancelled."""
@@ -166,13 +151,12 @@ class ArduinoBridgeEmulator:
         return left, right
 
     def _answer(self, end: DeviceEnd, line: bytes) -> None:
-        if self._silent:
+        if self.faults["silent"]:
             return
-        if self._noise > 0:
-            self._noise -= 1
+        if self.faults.strikes("noise"):
             line = bytes((line[0] ^ 0x40,)) + line[1:]
         thinking = 0.001  # seconds from the end of a command to its answer
-        end.write(line + b"\r\n", self._late.pop() if self._late else thinking)
+        end.write(line + b"\r\n", self._late.take(thinking))
 
 
 def _atoi(word: bytes) -> int:

@@ -1,5 +1,6 @@
-"""Commands and answers, with a board over one open link; shared by driver and probe."""
+"""Commands and answers, with a board over one open link; shared by the driver and `identify`."""
 
+from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
 from monstertruck_drivers.arduino_bridge.protocol import (
     BAUD_RATE,
     ENCODERS,
@@ -101,3 +102,17 @@ class BoardSession:
             self._heard = data or self._heard
             found += [line for line in self._lines.feed(data) if line and line != REFUSED]
         return found
+
+
+async def identify(link: Link, clock: Clock, settings: ArduinoBridgeConfig) -> dict[str, object]:
+    """Read both counters; stopping the motors identifies the board.
+
+    Returns:
+        JSON-able: ``counts`` left and right.
+
+    Raises:
+        DeviceError: as the driver's ``run``.
+    """
+    session = BoardSession(link, clock, settings.answer_timeout)
+    await session.identify(settings.boot)
+    return {"counts": list(await session.exchange(speeds(0, 0)))}

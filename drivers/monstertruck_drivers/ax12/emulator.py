@@ -1,8 +1,9 @@
 """The device side of a bus of AX-12A behind a USB2Dynamixel, byte for byte."""
 
 import asyncio
-from collections.abc import Mapping, Sequence
-from typing import Final, Literal
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,22 +14,56 @@ from monstertruck_drivers.ax12.protocol import Alarm, Ax12Parser, Instruction, P
 from monstertruck_drivers.ax12.unit import Load, Unit, Voltage, no_load, steady_voltage, unit_signals
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, Horn, ReceivedBytes
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
 AS_SET: Final = Horn(None, None)
 
-Damage = Literal["late", "double", "truncate", "garble", "mute"]
-
-KNOWN: Final = (
-    "vanish ID, return ID, power on|off, block ID on|off, freeze ID on|off, heat ID CELSIUS, voltage VOLTS|source, "
-    "trip ID, stray ID POSITION|off, reset ID, renumber ID NEW, latch on|off, echo on|off, "
-    "mute|double|truncate|garble [COUNT], late SECONDS [COUNT]"
-)
+DAMAGES: Final = ("mute", "double", "truncate", "garble")
+"""Faults of single answers."""
 
 
-class Ax12Bus:
+def _vanish(unit: Unit) -> None:
+    unit.present = False
+
+
+def _return(unit: Unit) -> None:
+    unit.present = True
+
+
+def _block(unit: Unit, blocked: bool) -> None:
+    unit.blocked = blocked
+
+
+def _freeze(unit: Unit, frozen: bool) -> None:
+    unit.frozen = frozen
+
+
+def _heat(unit: Unit, celsius: str) -> None:
+    unit.temperature = float(celsius)
+
+
+def _stray(unit: Unit, place: str) -> None:
+    unit.stray = None if place == "off" else float(place)
+
+
+UNIT_FAULTS: Final[Mapping[str, Callable[..., None]]] = {
+    "vanish ID": _vanish,
+    "return ID": _return,
+    "block ID on|off": _block,
+    "freeze ID on|off": _freeze,
+    "heat ID CELSIUS": _heat,
+    "trip ID": lambda unit: unit.trip(Alarm.OVERLOAD),
+    "stray ID POSITION|off": _stray,
+    "reset ID": Unit.factory_reset,
+    "renumber ID NEW": lambda unit, number: unit.put(p.ID, int(number)),
+}
+"""Faults of one unit."""
+
+
+class Ax12Bus(FaultyDevice):
     """Up to six units on one half-duplex line; ``end.baud = 1_000_000`` gives exchanges their real duration.
 
     USB powers the adapter, the 12 V rail the units: unplugging does not affect the units, ``power off`` silences them
@@ -77,14 +112,13 @@ class Ax12Bus:
         """Bytes the host sent, for tests."""
         self.latency_s = latency_s
         self._clock = clock
-        self._echo = echo
         self._host_baud = host_baud
         self._answers_damage = answers_damage
         self._source = voltage
         self._volts: float | None = None
         self._rng = np.random.default_rng(seed)
-        self._damage: dict[Damage, int] = {}
-        self._late_s = 0.0
+        self._late_s, self._late = 0.0, 0
+        """Time that answers come later (s), and the number of them."""
         places = positions or {}
         now = clock.now()
         kinds: dict[str, SignalKind] = {}
@@ -95,6 +129,18 @@ class Ax12Bus:
             Unit(ident, places.get(ident, 512), now, load, self._voltage, self.signals, number)
             for number, ident in enumerate(ids, 1)
         ]
+        self.faults = FaultTable(
+            self.name,
+            {
+                "power on|off": lambda on: self._power(on=on),
+                "voltage VOLTS|source": self._set_voltage,
+                "latch on|off": self._latch,
+                "echo on|off": echo,
+                f"{'|'.join(DAMAGES)} [COUNT]": 0,
+                "late SECONDS [COUNT]": self._delay,
+                **{usage: partial(self._unit_fault, start) for usage, start in UNIT_FAULTS.items()},
+            },
+        )
 
     # Interface to the simulated world
 
@@ -111,70 +157,21 @@ class Ax12Bus:
         self._power(on=False)
         self._power(on=True)
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start a fault, see the class.
+    def _set_voltage(self, volts: str) -> None:
+        self._volts = None if volts == "source" else float(volts)
 
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        try:
-            if not self._inject_bus(fault, values) and not self._inject_unit(fault, values):
-                raise ValueError("unknown")
-        except ValueError as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: {KNOWN}"
-            ) from error
+    def _latch(self, latched: bool) -> None:
+        for unit in self.units:
+            unit.latched = latched
 
-    def _inject_bus(self, fault: str, values: tuple[str, ...]) -> bool:
-        match fault, values:
-            case "power", (("on" | "off") as state,):
-                self._power(on=state == "on")
-            case "voltage", ("source",):
-                self._volts = None
-            case "voltage", (volts,):
-                self._volts = float(volts)
-            case "latch", (("on" | "off") as state,):
-                for unit in self.units:
-                    unit.latched = state == "on"
-            case "echo", (("on" | "off") as state,):
-                self._echo = state == "on"
-            case "late", (seconds, *count):
-                self._late_s = float(seconds)
-                self._damage["late"] = int(*count or ("1",))
-            case ("mute" | "double" | "truncate" | "garble") as damage, (*count,):
-                self._damage[damage] = int(*count or ("1",))
-            case _:
-                return False
-        return True
+    def _delay(self, seconds: str, count: str = "1") -> None:
+        self._late_s = float(seconds)
+        self._late = int(count)
 
-    def _inject_unit(self, fault: str, values: tuple[str, ...]) -> bool:
-        if not values:
-            return False
-        unit = self._find(int(values[0]))
-        now = self._clock.now()
-        unit.advance(now)
-        match fault, values[1:]:
-            case "vanish", ():
-                unit.present = False
-            case "return", ():
-                unit.present = True
-            case "block", (("on" | "off") as state,):
-                unit.blocked = state == "on"
-            case "freeze", (("on" | "off") as state,):
-                unit.frozen = state == "on"
-            case "heat", (celsius,):
-                unit.temperature = float(celsius)
-            case "trip", ():
-                unit.trip(Alarm.OVERLOAD)
-            case "stray", (place,):
-                unit.stray = None if place == "off" else float(place)
-            case "reset", ():
-                unit.factory_reset()
-            case "renumber", (number,):
-                unit.put(p.ID, int(number))
-            case _:
-                return False
-        return True
+    def _unit_fault(self, start: Callable[..., None], number: str, *values: str | bool) -> None:
+        unit = self._find(int(number))
+        unit.advance(self._clock.now())
+        start(unit, *values)
 
     def _find(self, ident: int) -> Unit:
         for unit in self.units:
@@ -202,7 +199,7 @@ class Ax12Bus:
                 parser = Ax12Parser()
             heard = now
             self.received.extend(data)
-            if self._echo:
+            if self.faults["echo"]:
                 end.write(data, self.latency_s)
             for packet in parser.feed(data):
                 self._obey(end, packet)
@@ -269,8 +266,7 @@ class Ax12Bus:
         if len(answers) > 1:
             wire = self._garbled(wire)
         delay = min(unit.get(p.RETURN_DELAY) for unit in units) * p.DELAY_UNIT
-        for damage in [damage for damage, count in self._damage.items() if count]:
-            self._damage[damage] -= 1
+        for damage in filter(self.faults.strikes, DAMAGES):
             match damage:
                 case "mute":
                     return
@@ -280,9 +276,10 @@ class Ax12Bus:
                     wire = self._garbled(wire)
                 case "double":
                     wire += wire
-                case "late":
-                    asyncio.get_running_loop().call_later(self._late_s, end.write, wire)
-                    return
+        if self._late:
+            self._late -= 1
+            asyncio.get_running_loop().call_later(self._late_s, end.write, wire)
+            return
         end.write(wire, self.latency_s + delay + 10 / p.AX12_BAUD)
 
     def _garbled(self, wire: bytes) -> bytes:

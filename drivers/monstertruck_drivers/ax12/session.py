@@ -1,4 +1,4 @@
-"""Requests and replies on the half-duplex bus over one open link; shared by driver and probe."""
+"""Requests and replies on the half-duplex bus over one open link; shared by the driver and `identify`."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

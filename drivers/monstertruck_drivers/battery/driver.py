@@ -1,11 +1,14 @@
 """Battery driver on a Linux IIO converter."""
 
+from typing import Any
+
 from monstertruck_drivers.battery import iio
 from monstertruck_drivers.battery.config import IioConfig
 from monstertruck_drivers.battery.monitor import BatteryMonitor
 from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.transaction import Misses
 from monstertruck_runtime.clock import IN_THREADS, Clock, Schedule
+from monstertruck_runtime.errors import DeviceError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas.sensor import Battery, DriveFeedback
 
@@ -68,3 +71,32 @@ class IioBatteryDriver:
     def _find(self) -> iio.Channel:
         converter = iio.find(self._root, self._config.device)
         return iio.channel(converter, self._config.channel, self._config.full_scale)
+
+
+async def identify(computer: Computer, clock: Clock, settings: IioConfig) -> dict[str, Any]:
+    """Read every voltage input of every converter once.
+
+    Returns:
+        JSON-able: ``converters``: name, path, and per channel the reading and the volts at the pin, or why not.
+    """
+    root = computer.root / iio.CONVERTERS
+    return await computer.machine.offload(
+        lambda: {"converters": [_described(converter) for converter in iio.converters(root)]}
+    )
+
+
+def _described(converter: iio.Converter) -> dict[str, Any]:
+    return {
+        "name": converter.name,
+        "path": str(converter.path),
+        "channels": [_reading(converter, number) for number in converter.channels()],
+    }
+
+
+def _reading(converter: iio.Converter, number: int) -> dict[str, Any]:
+    try:
+        channel = iio.channel(converter, number)
+        raw = channel.read()
+    except DeviceError as error:
+        return {"channel": number, "error": str(error)}
+    return {"channel": number, "raw": raw, "volts": round(channel.volts(raw), 4), "full_scale": channel.full_scale}

@@ -1,6 +1,7 @@
 """The sysfs files of a converter with the battery's divider on one channel."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -9,16 +10,16 @@ import numpy as np
 from monstertruck_drivers.battery.config import IioConfig
 from monstertruck_drivers.battery.iio import CONVERTERS
 from monstertruck_drivers.emulation import EmulatorSetup, FileTree
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 FOLDER: Final = "iio:device0"
 COUNTS: Final = "counts"
 """Signal: converted voltage, LSB."""
 
 
-class IioEmulator:
+class IioEmulator(FaultyDevice):
     """A 12-bit converter, 1 mV a count, as the kernel shows it.
 
     Faults (``inject``): ``zero on|off`` (upper resistor open), ``full on|off`` (lower resistor open), ``freeze
@@ -56,8 +57,20 @@ class IioEmulator:
         self.signals = Signals(clock.now, {COUNTS: SignalKind.NUMBER}, self._rng)
         self._stem = f"in_voltage{channel}"
         self._device = device
-        self._noise = 1.0
-        """Standard deviation, LSB."""
+        self.faults = FaultTable(
+            self.name,
+            {
+                "zero on|off": partial(self._force, "0"),
+                "full on|off": partial(self._force, str(self.FULL_SCALE)),
+                "garbage on|off": partial(self._force, "-"),
+                "freeze on|off": partial(self._force, "frozen"),
+                "bounce [SECONDS]": self._bounce,
+                "noise LSB": 1.0,
+                "volts V": self._fix,
+                "unplug": self.unplug,
+                "plug": self.plug,
+            },
+        )
         self._forced: str | None = None
         self._bounce_until = 0
         self.plug()
@@ -91,46 +104,19 @@ class IioEmulator:
         if text == "frozen":
             return
         if text is None:
-            counts = self._source(now) * 1000 + self._noise * float(self._rng.standard_normal())
+            counts = self._source(now) * 1000 + self.faults["noise"] * float(self._rng.standard_normal())
             text = str(int(np.clip(self.signals.report(COUNTS, round(counts)), 0, self.FULL_SCALE)))
         self._files.put(f"{FOLDER}/{self._stem}_raw", text)
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault, see the class.
+    def _force(self, text: str, on: bool) -> None:
+        self._forced = text if on else None
 
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        forced = {"zero": "0", "full": str(self.FULL_SCALE), "garbage": "-", "freeze": "frozen"}
-        try:
-            match fault, values:
-                case (("zero" | "full" | "garbage" | "freeze"), ("on",)):
-                    self._forced = forced[fault]
-                case (("zero" | "full" | "garbage" | "freeze"), ("off",)):
-                    self._forced = None
-                case "bounce", ():
-                    self._bounce(0.05)
-                case "bounce", (seconds,):
-                    self._bounce(float(seconds))
-                case "noise", (lsb,):
-                    self._noise = float(lsb)
-                case "volts", (volts,):
-                    level = float(volts)
-                    self._source = lambda _: level
-                case "unplug", ():
-                    self.unplug()
-                case "plug", ():
-                    self.plug()
-                case _:
-                    raise ValueError("unknown")
-        except ValueError as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: zero|full|freeze|garbage "
-                "on|off, bounce [SECONDS], noise LSB, volts V, unplug, plug"
-            ) from error
+    def _fix(self, volts: str) -> None:
+        level = float(volts)
+        self._source = lambda _: level
 
-    def _bounce(self, seconds: float) -> None:
-        self._bounce_until = self._clock.now() + round(seconds * SECOND)
+    def _bounce(self, seconds: str = "0.05") -> None:
+        self._bounce_until = self._clock.now() + round(float(seconds) * SECOND)
 
 
 def emulated(setup: EmulatorSetup) -> IioEmulator:

@@ -1,12 +1,12 @@
 """Driver of the BNO085: frames become tilt, turn rates and specific forces."""
 
-from math import cos, hypot, pi, sin, tau
+from math import cos, degrees, hypot, pi, sin, tau
 from typing import Final
 
 from monstertruck_drivers.bno085.config import Bno085Config
 from monstertruck_drivers.bno085.protocol import INDICES, RATE, RvcFrame, RvcParser
 from monstertruck_drivers.inertial import Xyz, corrected_force, corrected_rate, mean
-from monstertruck_drivers.link import Port
+from monstertruck_drivers.link import Link, Port
 from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import ProtocolError
@@ -149,3 +149,17 @@ async def first_frames(stream: DeviceStream[RvcFrame]) -> list[RvcFrame]:
     return await stream.first(
         listen, "of a BNO085 in UART-RVC mode: another device, another baud rate, or PS0 and PS1 set for another mode"
     )
+
+
+async def identify(link: Link, clock: Clock, settings: Bno085Config) -> dict[str, object]:
+    """Wait for one frame.
+
+    Returns:
+        JSON-able: ``yaw_deg`` since power-up, ``pitch_deg``, ``roll_deg``, ``acceleration`` (m/s^2).
+
+    Raises:
+        DeviceError: as the driver's ``run``.
+    """
+    frame = (await first_frames(DeviceStream(link, clock, RvcParser().feed)))[-1]
+    yaw, pitch, roll = (round(degrees(angle), 2) for angle in frame.angles)
+    return {"yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll, "acceleration": frame.acceleration}

@@ -12,16 +12,16 @@ import numpy as np
 from monstertruck_drivers.bno085.protocol import BNO085_BAUD, INDICES, RATE, RvcFrame, build, measured
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ImuSource, ReceivedBytes
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 ACCELERATION_NOISE: Final = 4.0
 """Standard deviation of the accelerometer, 0.001 g."""
 REPORTED: Final = ("yaw", "pitch", "roll", "x", "y", "z")
 
 
-class Bno085Emulator:
+class Bno085Emulator(FaultyDevice):
     """Streaming unit.
 
     Faults (``inject``): ``frozen on|off`` (repeats one measurement, the index continues), ``silent on|off``,
@@ -43,8 +43,15 @@ class Bno085Emulator:
         self.signals = Signals(clock.now, dict.fromkeys(REPORTED, SignalKind.NUMBER), self._rng)
         drift = radians(0.5) / 60  # of the heading, rad/s, greatest
         self._drift = float(self._rng.uniform(-drift, drift))
-        self._faults = {"frozen": False, "silent": False}
-        self._bad_checksums = self._skip = 0
+        self.faults = FaultTable(
+            self.name,
+            {
+                "frozen|silent on|off": False,
+                "bad_checksum|skip N": 0,
+                "half_frame": 0,
+                "reset": self.power_cycle,
+            },
+        )
         self.power_cycle()
 
     def power_cycle(self) -> None:
@@ -54,31 +61,8 @@ class Bno085Emulator:
         """Latest turn rate (rad/s)."""
         self._tilt: tuple[float, float] | None = None
         self._last: RvcFrame | None = None
-        self._torn = True
+        self.faults["half_frame"] = 1
         self._awake_at = self._clock.now() + 300_000_000  # nanoseconds from power-up to the first frame
-
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        match fault, values:
-            case _, (("on" | "off") as state,) if fault in self._faults:
-                self._faults[fault] = state == "on"
-            case "bad_checksum", (count,) if count.isdigit():
-                self._bad_checksums = int(count)
-            case "skip", (count,) if count.isdigit():
-                self._skip = int(count)
-            case "half_frame", ():
-                self._torn = True
-            case "reset", ():
-                self.power_cycle()
-            case _:
-                raise InputError(
-                    f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: frozen on|off, "
-                    "silent on|off, bad_checksum N, skip N, half_frame, reset"
-                )
 
     async def run(self, end: DeviceEnd) -> None:
         """DeviceStream until cancelled."""
@@ -93,17 +77,15 @@ class Bno085Emulator:
                 continue
             frame = self._frame(due)
             self._index += 1
-            if self._faults["silent"]:
+            if self.faults["silent"]:
                 continue
-            if self._skip:
-                self._skip -= 1
+            if self.faults.strikes("skip"):
                 continue
             data = build(frame)
-            if self._bad_checksums:
-                self._bad_checksums -= 1
+            if self.faults.strikes("bad_checksum"):
                 data = data[:9] + bytes((data[9] ^ 0x10,)) + data[10:]
-            if self._torn:
-                self._torn, data = False, data[5:]
+            if self.faults.strikes("half_frame"):
+                data = data[5:]
             end.write(data, 0.004)  # seconds from a measurement to the first byte of its frame
 
     def _frame(self, now: int) -> RvcFrame:
@@ -123,7 +105,7 @@ class Bno085Emulator:
         noise = np.rint(ACCELERATION_NOISE * self._rng.standard_normal(3)).astype(int).tolist()
         numbers = dict(zip(REPORTED, (*true[1:4], *(a + b for a, b in zip(true[4:], noise, strict=True))), strict=True))
         shown = {name: max(-32767, min(32767, self.signals.report(name, value))) for name, value in numbers.items()}
-        if self._faults["frozen"] and self._last is not None:
+        if self.faults["frozen"] and self._last is not None:
             return self._last._replace(number=self._index % INDICES)
         self._last = RvcFrame(self._index % INDICES, **shown)
         return self._last

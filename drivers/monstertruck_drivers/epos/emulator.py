@@ -5,7 +5,6 @@ Keeps its last speed when the host goes silent: nothing on RS232 watches the hos
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -33,8 +32,8 @@ from monstertruck_drivers.epos.protocol import (
     join,
     split,
 )
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.roles import SHAFTS, DeviceRole
 
 FAULT_NAMES = {
@@ -46,8 +45,17 @@ FAULT_NAMES = {
 }
 
 
-class EposEmulator:
+class EposEmulator(FaultyDevice):
     """Emulated controller; set ``end.baud = 38400`` for exchanges of real duration.
+
+    Faults (``inject``): ``fault CODE|NAME [passing]``: into FAULT; the cause stays until ``clear`` unless passing.
+    ``busy``, ``refuse``, ``flip``, ``stray`` ``[COUNT]``: opcodes refused, frames refused, answers with a wrong bit,
+    bytes before acknowledges. ``acknowledge``, ``length`` ``[COUNT]``: acknowledges, and length bytes from the host,
+    damaged on the line. ``restart [COUNT]``: the supply fails for a moment before the next answers.
+    ``delay MS [COUNT]``: late answers. ``silent``, ``power``, ``line`` (quick stop input),
+    ``strict`` (impossible controlwords are errors), ``repeat`` (refused answers come again), ``latch`` (quick stop
+    is left through power stage off only): ``on|off``.
+    ``supply_limit VOLTS``: over-voltage above that. ``runaway``: see ``DisobedientMotor``.
 
     Args:
         clock: time.
@@ -72,32 +80,26 @@ class EposEmulator:
         self._power = True
         self._powered: asyncio.Timeout | None = None
         self._booted_at = 0
-        self._silent = False
-        self._counts = dict.fromkeys(
-            ("busy", "refuse", "delay", "flip", "stray", "restart", "acknowledge", "length"), 0
-        )
-        self._delay = 0.0
+        self._delay, self._delayed = 0.0, 0
+        """Time that answers come later (s), and the number of them."""
         self._long: tuple[bytes, bool] = (b"", False)
-        self._faults: dict[str, tuple[str, Callable[..., None]]] = {
-            "fault": ("CODE|NAME [passing]", self._inject_fault),
-            "clear": ("", self._inject_clear),
-            "power": ("on|off", lambda word: self._switch_power(_flag(word))),
-            "busy": ("COUNT", lambda n="1": self._count("busy", n)),
-            "refuse": ("COUNT", lambda n="1": self._count("refuse", n)),
-            "delay": ("MILLISECONDS [COUNT]", self._inject_delay),
-            "flip": ("COUNT", lambda n="1": self._count("flip", n)),
-            "stray": ("COUNT", lambda n="1": self._count("stray", n)),
-            "acknowledge": ("COUNT", lambda n="1": self._count("acknowledge", n)),
-            "length": ("COUNT", lambda n="1": self._count("length", n)),
-            "restart": ("COUNT", lambda n="1": self._count("restart", n)),
-            "silent": ("on|off", self._inject_silent),
-            "line": ("on|off", lambda word: self.set_quick_stop_input(_flag(word))),
-            "supply_limit": ("VOLTS", self._inject_supply_limit),
-            "strict": ("on|off", self._inject_strict),
-            "repeat": ("on|off", self._inject_repeat),
-            "latch": ("on|off", self._inject_latch),
-            "runaway": (USAGE, lambda *words: self.firmware.run_away(DisobedientMotor.parse(*words))),
-        }
+        self.faults = FaultTable(
+            self.name,
+            {
+                "fault CODE|NAME [passing]": self._inject_fault,
+                "clear": self._inject_clear,
+                "power on|off": self._switch_power,
+                "busy|refuse|flip|stray|acknowledge|length|restart [COUNT]": 0,
+                "delay MILLISECONDS [COUNT]": self._inject_delay,
+                "silent on|off": False,
+                "line on|off": self.set_quick_stop_input,
+                "supply_limit VOLTS": self._inject_supply_limit,
+                "strict on|off": self._inject_strict,
+                "repeat on|off": self._inject_repeat,
+                "latch on|off": self._inject_latch,
+                f"runaway {USAGE}": lambda *words: self.firmware.run_away(DisobedientMotor.parse(*words)),
+            },
+        )
 
     # Faults and switches
 
@@ -109,32 +111,6 @@ class EposEmulator:
     def set_quick_stop_input(self, active: bool) -> None:
         """The hardware deadman line on a digital input: while active the controller stops by itself."""
         self.firmware.set_quick_stop_input(active)
-
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a device fault.
-
-        ``fault CODE|NAME [passing]``: into FAULT; the cause stays until ``clear`` unless passing. ``busy``,
-        ``refuse``, ``flip``, ``stray`` ``[COUNT]``: opcodes refused, frames refused, answers with a wrong bit, bytes
-        before acknowledges. ``acknowledge``, ``length`` ``[COUNT]``: acknowledges, and length bytes from the host,
-        damaged on the line. ``restart [COUNT]``: the supply fails for a moment before the next answers.
-        ``delay MS [COUNT]``: late answers. ``silent``, ``power``, ``line`` (quick stop input),
-        ``strict`` (impossible controlwords are errors), ``repeat`` (refused answers come again), ``latch`` (quick stop
-        is left through power stage off only): ``on|off``.
-        ``supply_limit VOLTS``: over-voltage above that. ``runaway``: see ``DisobedientMotor``.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        usage, act = self._faults.get(fault, ("", None))
-        if act is None:
-            raise InputError(f"{self.name}: unknown fault {fault!r}; known: {', '.join(self._faults)}")
-        try:
-            act(*values)
-        except (LookupError, ValueError, TypeError) as error:
-            raise InputError(f"{self.name}: expected '{fault} {usage}', got {' '.join((fault, *values))!r}") from error
-
-    def _count(self, what: str, count: str) -> None:
-        self._counts[what] = int(count)
 
     def _inject_fault(self, name: str, *passing: str) -> None:
         code = FAULT_NAMES[name] if name in FAULT_NAMES else int(name, 16)
@@ -151,22 +127,19 @@ class EposEmulator:
 
     def _inject_delay(self, milliseconds: str, count: str | None = None) -> None:
         self._delay = float(milliseconds) / 1000
-        self._counts["delay"] = 1 << 62 if count is None else int(count)
-
-    def _inject_silent(self, word: str) -> None:
-        self._silent = _flag(word)
+        self._delayed = 1 << 62 if count is None else int(count)
 
     def _inject_supply_limit(self, volts: str) -> None:
         self.firmware.over_voltage_above = float(volts)
 
-    def _inject_strict(self, word: str) -> None:
-        self.firmware.strict_transitions = _flag(word)
+    def _inject_strict(self, on: bool) -> None:
+        self.firmware.strict_transitions = on
 
-    def _inject_repeat(self, word: str) -> None:
-        self.repeat_refused = _flag(word)
+    def _inject_repeat(self, on: bool) -> None:
+        self.repeat_refused = on
 
-    def _inject_latch(self, word: str) -> None:
-        self.firmware.latched_quick_stop = _flag(word)
+    def _inject_latch(self, on: bool) -> None:
+        self.firmware.latched_quick_stop = on
 
     def _switch_power(self, on: bool) -> None:
         if self._power and not on:
@@ -178,11 +151,10 @@ class EposEmulator:
         if self._powered is not None and not self._powered.expired():  # whatever exchange is under way ends here
             self._powered.reschedule(0)
 
-    def _due(self, what: str) -> bool:
-        """Use up one of the counted faults."""
-        if self._counts[what] <= 0:
+    def _delays(self) -> bool:
+        if self._delayed <= 0:
             return False
-        self._counts[what] -= 1
+        self._delayed -= 1
         return True
 
     # The line
@@ -218,19 +190,19 @@ class EposEmulator:
                 self._inbox.clear()
 
     async def _exchange(self, end: DeviceEnd, opcode: int) -> None:
-        if self._due("busy"):
+        if self.faults.strikes("busy"):
             self._send(end, bytes((REFUSED,)))
             return
         self._acknowledge(end)
         head = await self._within(end, 1)
-        if self._due("length"):
+        if self.faults.strikes("length"):
             head = bytes((head[0] ^ 0x20,))
         body = head + await self._within(end, body_size(head[0]))
         try:
             request = decode_body(opcode, body)
         except FrameError:
             request = None
-        if request is None or len(request.words) > MAX_WORDS or self._due("refuse"):
+        if request is None or len(request.words) > MAX_WORDS or self.faults.strikes("refuse"):
             self._send(end, bytes((REFUSED,)))
             return
         self.frames.append((self._clock.now(), request))
@@ -243,15 +215,15 @@ class EposEmulator:
         await self._reply(end, reply)
 
     async def _reply(self, end: DeviceEnd, reply: Frame) -> None:
-        if self._due("restart"):
+        if self.faults.strikes("restart"):
             self.power_cycle()
-        if self._due("delay"):
+        if self._delays():
             await self._clock.sleep(self._delay)
         end.write(bytes((ANSWER,)))
         if (await self._within(end, 1))[0] != READY:
             return
         body = reply.body
-        if self._due("flip"):
+        if self.faults.strikes("flip"):
             body = body[:-3] + bytes((body[-3] ^ 0x10,)) + body[-2:]
         self._send(end, body)
         if (await self._within(end, 1))[0] == REFUSED and self.repeat_refused:
@@ -259,9 +231,9 @@ class EposEmulator:
             await self._within(end, 1)
 
     def _acknowledge(self, end: DeviceEnd) -> None:
-        if self._due("stray"):
+        if self.faults.strikes("stray"):
             end.write(b"\xa5")
-        self._send(end, bytes((READY ^ 0x10 if self._due("acknowledge") else READY,)))
+        self._send(end, bytes((READY ^ 0x10 if self.faults.strikes("acknowledge") else READY,)))
 
     def _send(self, end: DeviceEnd, data: bytes) -> None:
         # Seconds from the last byte received to the first one sent; most of it is the host's USB converter.
@@ -275,7 +247,7 @@ class EposEmulator:
     async def _take(self, end: DeviceEnd, count: int, pause: float | None = None) -> bytes:
         while len(self._inbox) < count:
             data = await end.read(pause)
-            if self._power and not self._silent and self._clock.now() >= self._booted_at:
+            if self._power and not self.faults["silent"] and self._clock.now() >= self._booted_at:
                 self.received.append((self._clock.now(), data))
                 self._inbox += data
         taken = bytes(self._inbox[:count])
@@ -322,10 +294,6 @@ class EposEmulator:
     def state(self) -> State:
         """Power state at the latest update."""
         return self.firmware.state
-
-
-def _flag(word: str) -> bool:
-    return {"on": True, "off": False}[word]
 
 
 def emulated(setup: EmulatorSetup) -> EposEmulator:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, RangeSource
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.hokuyo_urg.models import URG_04LX, ScannerModel
 from monstertruck_drivers.hokuyo_urg.protocol import (
     COUNTER_MASK,
@@ -34,7 +35,6 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
 )
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,10 +131,6 @@ def _clustered(values: NDArray[np.int32], cluster: int) -> NDArray[np.int32]:
 DEFAULT_BAUD: Final = 19200
 
 StartState = Literal["scip1", "scip2", "streaming", "time_adjust"]
-FAULTS: Final = (
-    "status 21..98 | deaf [on|off] | fragile [on|off] | cut | laser [on|off] | seri [on|off] | tm [on|off] | "
-    "timer MILLISECONDS | drift PPM | cover FROM TO VALUE [SHARE] | cover off | mirror FROM TO"
-)
 ORDERED: Final = {"BM": "laser_on", "MD": "stream", "MS": "stream", "QT": "quit", "RS": "reset", "TM": "adjust"}
 """Requests that change the sensor's state, with the names of their signals."""
 RANGE: Final = "range"
@@ -148,8 +144,18 @@ Cover = Callable[[NDArray[np.int32]], NDArray[np.int32]]
 """Maps the values (n,) of the covered steps."""
 
 
-class HokuyoEmulator:
+class HokuyoEmulator(FaultyDevice):
     """Emulated scanner.
+
+    Faults (``inject``): ``status N`` sends that status with the next revolution of a stream: 21-49 hold the stream
+    until 98, 50-97 end it. ``deaf`` ignores requests; ``fragile`` makes an unknown command cause that. ``cut`` ends the
+    next scan in the middle of a line. ``laser`` keeps the laser from lighting. ``seri`` puts a wrong sum on SERI and an
+    empty line into VV. ``tm`` makes it refuse its time-adjust mode. ``timer`` sets the counter, ``drift`` the rate of
+    its clock against the world's.
+
+    ``cover`` puts something over the window between two directions, degrees from straight ahead, left positive: the
+    beams, or a random share of them, give the value (below 20: an error code, otherwise mm). ``mirror`` puts a mirror
+    there: its middle dazzles, the rest shows the room behind the mirror, twice as far away.
 
     Args:
         clock: world time.
@@ -202,7 +208,20 @@ class HokuyoEmulator:
             model.last_step if max_step is None else max_step,
         )
         self._born = clock.now()
-        self._fragile = self._cut = self._laser_broken = self._seri_quirk = self._tm_refused = False
+        self._tm_refused = False
+        self.faults = FaultTable(
+            self.name,
+            {
+                "status 21..98": self._inject_status,
+                "deaf|fragile|laser|seri [on|off]": False,
+                "cut": 0,
+                "tm [on|off]": self._inject_tm,
+                "timer MILLISECONDS": self._inject_timer,
+                "drift PPM": self._inject_drift,
+                "cover FROM TO VALUE [SHARE]|off": self._inject_cover,
+                "mirror FROM TO": self._inject_mirror,
+            },
+        )
         self._elapsed = 0
         """Sensor's own time at ``_born``, ns."""
         self._covers: list[tuple[slice, Cover]] = []
@@ -232,45 +251,13 @@ class HokuyoEmulator:
         self._power_up()
         self._scip2 = self._state == "scip2"
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault.
-
-        ``status N`` sends that status with the next revolution of a stream: 21-49 hold the stream until 98, 50-97 end
-        it. ``deaf`` ignores requests; ``fragile`` makes an unknown command cause that. ``cut`` ends the next scan
-        in the middle of a line. ``laser`` keeps the laser from lighting. ``seri`` puts a wrong sum on SERI and an empty
-        line into VV. ``tm`` makes it refuse its time-adjust mode. ``timer`` sets the counter, ``drift`` the rate of
-        its clock against the world's.
-
-        ``cover`` puts something over the window between two directions, degrees from straight ahead, left positive:
-        the beams, or a random share of them, give the value (below 20: an error code, otherwise mm). ``mirror`` puts
-        a mirror there: its middle dazzles, the rest shows the room behind the mirror, twice as far away.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        known: dict[str, Callable[..., None]] = {
-            "status": self._inject_status,
-            "timer": self._inject_timer,
-            "deaf": lambda word="on": setattr(self, "_deaf", _switch(word)),
-            "fragile": lambda word="on": setattr(self, "_fragile", _switch(word)),
-            "cut": lambda: setattr(self, "_cut", True),
-            "laser": lambda word="on": setattr(self, "_laser_broken", _switch(word)),
-            "seri": lambda word="on": setattr(self, "_seri_quirk", _switch(word)),
-            "tm": lambda word="off": setattr(self, "_tm_refused", not _switch(word)),
-            "drift": self._inject_drift,
-            "cover": self._inject_cover,
-            "mirror": self._inject_mirror,
-        }
-        try:
-            known[fault](*values)
-        except (KeyError, TypeError, ValueError) as error:
-            asked = " ".join((fault, *values))
-            raise InputError(f"{self.name}: cannot inject {asked!r}; known: {FAULTS}") from error
-
     def _inject_status(self, code: str) -> None:
         if not 21 <= int(code) <= 98:
             raise ValueError(code)
         self._statuses.append(int(code))
+
+    def _inject_tm(self, obeys: bool = False) -> None:
+        self._tm_refused = not obeys
 
     def _inject_timer(self, milliseconds: str) -> None:
         self._timer_zero = self._time() - int(milliseconds) * 1_000_000
@@ -316,7 +303,8 @@ class HokuyoEmulator:
     # Supply and time
 
     def _power_up(self) -> None:
-        self._scip2 = self._adjusting = self._laser = self._verifying = self._deaf = False
+        self._scip2 = self._adjusting = self._laser = self._verifying = False
+        self.faults["deaf"] = False
         self._baud = DEFAULT_BAUD
         self._next_baud: int | None = None
         self._order = None
@@ -395,8 +383,8 @@ class HokuyoEmulator:
             order = replace(order, left=order.left - 1)
             self._order = order
         block = build_reply(order.echo, "99", self._data(order, begin))
-        if self._cut:
-            self._cut, block = False, block[: len(block) // 2]
+        if self.faults.strikes("cut"):
+            block = block[: len(block) // 2]
         end.write(block)
         if order.left == 0:
             self._order, self._laser = None, False
@@ -419,7 +407,7 @@ class HokuyoEmulator:
             *lines, self._input = self._input.replace(b"\r", b"\n").split(b"\n")
             for raw in lines:
                 line = raw.decode("latin-1")
-                if line and not self._deaf:
+                if line and not self.faults["deaf"]:
                     self.received.append(line)
                     self._requests.put_nowait((line, line in self._pending))
                     self._pending.append(line)
@@ -441,7 +429,7 @@ class HokuyoEmulator:
             self._scip2 = True
             return build_reply(line, "0")
         if line in ("L0", "L1"):
-            self._laser = line == "L1" and not self._laser_broken
+            self._laser = line == "L1" and not self.faults["laser"]
             return build_reply(line, "0" if self._laser == (line == "L1") else "E")
         if line == "V":
             return build_reply(line, "0", [f"{key}:{value};".encode() for key, value in self._version().items()])
@@ -460,14 +448,14 @@ class HokuyoEmulator:
             return build_reply(line, "0E")
         handler = self._handlers().get(text[:2])
         if handler is None or (len(text) > 2 and text[:2] in ("VV", "PP", "II", "BM", "QT", "RS")):
-            self._deaf = self._fragile
-            return b"" if self._deaf else build_reply(line, "0E")
+            self.faults["deaf"] = self.faults["fragile"]
+            return b"" if self.faults["deaf"] else build_reply(line, "0E")
         request = partial(handler, text)
         name = ORDERED.get(text[:2])
         done = request(tag) if name is None else self.signals.order(name, tag, request)
         status, lines = ("00", list[bytes]()) if done is None else done
         reply = build_reply(line, status, lines)
-        return reply.replace(b"\nFIRM", b"\n\nFIRM") if text == "VV" and self._seri_quirk else reply
+        return reply.replace(b"\nFIRM", b"\n\nFIRM") if text == "VV" and self.faults["seri"] else reply
 
     def _handlers(self) -> dict[str, Handler]:
         """Handlers of requests, by the first two characters."""
@@ -498,7 +486,7 @@ class HokuyoEmulator:
 
     def _vv(self, _text: str, _tag: str) -> tuple[str, list[bytes]]:
         lines = build_fields(self._version())
-        if self._seri_quirk:
+        if self.faults["seri"]:
             lines[-1] = lines[-1][:-1] + bytes(((lines[-1][-1] - 0x30 + 1) % 64 + 0x30,))
         return "00", lines
 
@@ -524,12 +512,12 @@ class HokuyoEmulator:
             "MESM": "CLASSIC" if self._laser else "IDLE",
             "SBPS": f"{self._baud}[bps]" + ("<-Default setting by user" if self._baud == DEFAULT_BAUD else ""),
             "TIME": f"{self._counter(self._time()):06X}",
-            "STAT": "Laser malfunction." if self._laser_broken else "Sensor works well.",
+            "STAT": "Laser malfunction." if self.faults["laser"] else "Sensor works well.",
         }
         return "00", build_fields(fields)
 
     def _bm(self, _text: str, _tag: str) -> tuple[str, list[bytes]]:
-        if self._laser_broken:
+        if self.faults["laser"]:
             return "01", []
         status = "02" if self._laser else "00"
         self._laser = True
@@ -593,14 +581,10 @@ class HokuyoEmulator:
             return order, []
         if self._order is not None:
             return "0B", []
-        if self._laser_broken:
+        if self.faults["laser"]:
             self._statuses.append(50)
         self._order, self._laser, self._skipped, self._ordered = order, True, 0, self._time()
         return "00", []
-
-
-def _switch(word: str) -> bool:
-    return {"on": True, "off": False}[word]
 
 
 def emulated(setup: EmulatorSetup) -> HokuyoEmulator:

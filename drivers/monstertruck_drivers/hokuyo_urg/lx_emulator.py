@@ -60,7 +60,6 @@ class LxEmulator(HokuyoEmulator):
         self, clock: Clock, source: BeamSource, model: ScannerModel, *, seed: int = 0, **options: float
     ) -> None:
         self._rebooting = False
-        self._unstable = 0
         super().__init__(
             clock,
             BeamRanges(source, model),
@@ -71,21 +70,10 @@ class LxEmulator(HokuyoEmulator):
             firmware="2.23.0000",
             **options,  # type: ignore[arg-type]
         )
-
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        if fault == "unstable" and len(values) == 1 and values[0].isdigit():
-            self._unstable = int(values[0])
-            return
-        super().inject(fault, *values)
+        self.faults.add({"unstable N": 0})
 
     def _send_scan(self, end: DeviceEnd, order: ScanOrder, begin: int) -> None:
-        if self._unstable:
-            self._unstable -= 1
+        if self.faults.strikes("unstable"):
             end.write(build_reply(order.echo, "0M"))
         else:
             super()._send_scan(end, order, begin)

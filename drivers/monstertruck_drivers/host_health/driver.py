@@ -1,6 +1,7 @@
 """Host monitor: samples once a second and reports scarce resources."""
 
-from typing import Final
+from dataclasses import asdict
+from typing import Any, Final
 
 from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.host_health.config import HostHealthConfig
@@ -113,3 +114,16 @@ class HostHealthDriver:
                 self._events(reason, SEVERITIES.get(reason, Severity.WARNING), self.name, reason.text, value=value)
             else:
                 self._events(Reason.OK, Severity.INFO, self.name, f"over: {reason.text}", value=value)
+
+
+async def identify(computer: Computer, clock: Clock, settings: HostHealthConfig) -> dict[str, Any]:
+    """Read the computer's health once.
+
+    Returns:
+        JSON-able: the fields of ``Reading``.
+
+    Raises:
+        DeviceError: /proc cannot be read.
+    """
+    disk = computer.disk(settings.disk_path)
+    return asdict(await computer.machine.offload(lambda: read_host(computer.root, disk)))

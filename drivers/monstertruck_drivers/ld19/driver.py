@@ -180,3 +180,20 @@ class Ld19Driver:
         if packets:
             return DeviceTimeoutError(f"{port}: packets, but no whole revolution: its head does not turn")
         return ProtocolError(f"{port}: bytes, but no packet of an LD19")
+
+
+async def identify(link: Link, clock: Clock, settings: Ld19Config) -> dict[str, object]:
+    """Wait for one packet, which does not name the model.
+
+    Returns:
+        JSON-able: ``turns_per_second``, ``stamp_ms``, ``ranges_m``.
+
+    Raises:
+        DeviceError: as the driver's ``run``.
+    """
+    packet = (await Ld19Session(link, clock).start())[-1]
+    return {
+        "turns_per_second": packet.speed / 360,
+        "stamp_ms": packet.stamp,
+        "ranges_m": [distance / 1000 for distance in packet.decoded()["distance"].tolist()],
+    }

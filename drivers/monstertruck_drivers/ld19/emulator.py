@@ -7,6 +7,7 @@ import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import BeamSource, EmulatorSetup, ReceivedBytes
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.ld19.config import Ld19Config
 from monstertruck_drivers.ld19.protocol import (
     FULL_TURN,
@@ -19,11 +20,9 @@ from monstertruck_drivers.ld19.protocol import (
     ModelSheet,
     build,
 )
-from monstertruck_drivers.scanning.head import FAULTS as HEAD_FAULTS
 from monstertruck_drivers.scanning.head import TurningHead
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 RANGE: Final = "range"
 """Distances of a packet, mm."""
@@ -31,7 +30,7 @@ COUNTER: Final = "counter"
 """Time stamp, ms."""
 
 
-class Ld19Emulator:
+class Ld19Emulator(FaultyDevice):
     """LD06, LD19 or STL-19P that streams from power-up on.
 
     Faults (``inject``): ``silent on|off``, ``bad_crc N`` (the next N packets), ``half_packet``, and the faults of
@@ -53,9 +52,15 @@ class Ld19Emulator:
         self.signals = Signals(clock.now, kinds, rng, codes={RANGE: 1})
         self.head = TurningHead(clock, source, sheet.ranges, sheet.frequency, rng)
         self._clock, self._period = clock, SECOND / sheet.rate
-        self._silent = False
-        self._bad_sums = 0
-        self._torn = True
+        self.faults = FaultTable(
+            self.name,
+            {
+                "silent on|off": False,
+                "bad_crc N": 0,
+                "half_packet": 0,
+                **self.head.fault_rows(),
+            },
+        )
         self._powered_at = 0
 
     async def run(self, end: DeviceEnd) -> None:
@@ -71,29 +76,8 @@ class Ld19Emulator:
     def power_cycle(self) -> None:
         """Supply off and on: its clock starts at 0, its head stands."""
         self.head.stop()
-        self._torn = True
+        self.faults["half_packet"] = 1
         self._powered_at = self.head.now()
-
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        match fault, values:
-            case "silent", (("on" | "off") as state,):
-                self._silent = state == "on"
-            case "bad_crc", (count,) if count.isdigit():
-                self._bad_sums = int(count)
-            case "half_packet", ():
-                self._torn = True
-            case _ if self.head.inject(fault, *values):
-                pass
-            case _:
-                raise InputError(
-                    f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: silent on|off | "
-                    f"bad_crc N | half_packet | {HEAD_FAULTS}"
-                )
 
     async def _stream(self, end: DeviceEnd) -> None:
         begin = float(self.head.now())
@@ -106,15 +90,14 @@ class Ld19Emulator:
             late = self.head.now() - last > overslept
             begin = float(self.head.now() if late else begin + self._period * POINTS)
             boot = 500_000_000  # nanoseconds from power-up to the first packet (maker's description of the start-up)
-            if self._silent or last - self._powered_at < boot:
+            if self.faults["silent"] or last - self._powered_at < boot:
                 self.head.turn(times)
                 continue
             data = build(self._packet(times))
-            if self._bad_sums:
-                self._bad_sums -= 1
+            if self.faults.strikes("bad_crc"):
                 data = data[:-1] + bytes((data[-1] ^ 0x10,))
-            if self._torn:
-                self._torn, data = False, data[5:]
+            if self.faults.strikes("half_packet"):
+                data = data[5:]
             end.write(data)
 
     def _packet(self, times: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> Ld19Packet:

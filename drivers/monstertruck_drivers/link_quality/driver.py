@@ -1,7 +1,8 @@
 """Link monitor: reads the interface once a second."""
 
 import math
-from typing import Final
+from dataclasses import asdict
+from typing import Any, Final
 
 from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.link_quality.config import LinkQualityConfig
@@ -163,3 +164,14 @@ class LinkQualityDriver:
             return None, None  # another interface, or its counters started again
         seconds = (stamp - then) / SECOND
         return (sample.received - before.received) / seconds, (sample.sent - before.sent) / seconds
+
+
+async def identify(computer: Computer, clock: Clock, settings: LinkQualityConfig) -> dict[str, Any]:
+    """List the interfaces.
+
+    Returns:
+        JSON-able: ``interfaces``, and ``chosen``: the one that is watched if none is configured.
+    """
+    samples = await computer.machine.offload(lambda: read_interfaces(computer.root))
+    chosen = choose(samples, None)
+    return {"interfaces": [asdict(sample) for sample in samples], "chosen": chosen.name if chosen else None}

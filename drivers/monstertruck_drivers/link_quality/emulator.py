@@ -1,12 +1,13 @@
 """Files of a Wi-Fi and a wired interface, as the kernel writes them."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from monstertruck_drivers.emulation import EmulatorSetup, FileTree
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_runtime.clock import Clock
-from monstertruck_runtime.errors import InputError
 
 HEADER: Final = (
     "Inter-| sta-|   Quality        |   Discarded packets               | Missed | WE\n"
@@ -17,7 +18,7 @@ ON_AIR: Final = 20_000
 """Traffic in each direction while connected (bytes/s)."""
 
 
-class NetworkEmulator:
+class NetworkEmulator(FaultyDevice):
     """``wlan0`` with a signal, ``eth0`` with or without a cable, ``lo``.
 
     Faults (``inject``): ``signal DBM`` (from now on), ``style normal|no_dot|unsigned|header|missing`` (how
@@ -36,8 +37,19 @@ class NetworkEmulator:
         self._signal: Callable[[int], float | None] = lambda _: -55.0
         """dBm at an instant, ns; None = out of reach."""
         self._style = "normal"
-        self._wifi = self._present = True
-        self._cable = False
+        self._present = True
+        self.faults = FaultTable(
+            self.name,
+            {
+                "signal DBM": self._fix,
+                f"style {'|'.join(STYLES)}": self._set_style,
+                "wifi on|off": True,
+                "cable on|off": False,
+                "remove": partial(self._plug, False),
+                "plug": partial(self._plug, True),
+                "reset": self._reset,
+            },
+        )
         self._bytes = 0
         self.write()
 
@@ -51,10 +63,12 @@ class NetworkEmulator:
 
     def write(self) -> None:
         """Bring all files up to date, each at once and whole."""
-        level = self._signal(self._clock.now()) if self._wifi else None
+        level = self._signal(self._clock.now()) if self.faults["wifi"] else None
         self._interface("lo", {"type": "772", "operstate": "unknown", "carrier": "1"})
-        self._interface("eth0", {"type": "1", "speed": "1000" if self._cable else "-1", "device/vendor": "0x8086"})
-        self._carrier("eth0", self._cable)
+        self._interface(
+            "eth0", {"type": "1", "speed": "1000" if self.faults["cable"] else "-1", "device/vendor": "0x8086"}
+        )
+        self._carrier("eth0", bool(self.faults["cable"]))
         if self._present:
             self._interface("wlan0", {"type": "1", "phy80211/index": "0"})
             self._carrier("wlan0", level is not None)
@@ -63,34 +77,24 @@ class NetworkEmulator:
         self._wireless(level)
 
     def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault, see the class.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        try:
-            match fault, values:
-                case "signal", (dbm,):
-                    level = float(dbm)
-                    self._signal = lambda _: level
-                case "style", (style,) if style in STYLES:
-                    self._style = style
-                case "wifi", (("on" | "off") as state,):
-                    self._wifi = state == "on"
-                case "cable", (("on" | "off") as state,):
-                    self._cable = state == "on"
-                case (("remove" | "plug"), ()):
-                    self._present = fault == "plug"
-                case "reset", ():
-                    self._bytes = 0
-                case _:
-                    raise ValueError("unknown")
-        except ValueError as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: signal DBM, "
-                f"style {'|'.join(STYLES)}, wifi on|off, cable on|off, remove, plug, reset"
-            ) from error
+        """Start or end a fault, and update the files; see ``FaultyDevice``."""
+        super().inject(fault, *values)
         self.write()
+
+    def _fix(self, dbm: str) -> None:
+        level = float(dbm)
+        self._signal = lambda _: level
+
+    def _set_style(self, style: str) -> None:
+        if style not in STYLES:
+            raise ValueError(style)
+        self._style = style
+
+    def _plug(self, present: bool) -> None:
+        self._present = present
+
+    def _reset(self) -> None:
+        self._bytes = 0
 
     def _interface(self, name: str, files: dict[str, str]) -> None:
         counters = {"rx_bytes": self._bytes, "tx_bytes": self._bytes // 2, "rx_errors": 1, "tx_dropped": 2}

@@ -10,6 +10,7 @@ import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes, ServoPlant
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice, LateAnswers
 from monstertruck_drivers.maestro.protocol import (
     ADC_MAX,
     CHANNELS,
@@ -21,7 +22,6 @@ from monstertruck_drivers.maestro.protocol import (
 )
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 TICK: Final = 10_000_000
 """Nanoseconds between two steps of a ramp."""
@@ -75,7 +75,7 @@ class Ramp:
             self.position += self.velocity
 
 
-class MaestroEmulator:
+class MaestroEmulator(FaultyDevice):
     """A Micro Maestro 6 powered by USB.
 
     Settings given here live in the unit's non-volatile memory; targets, speeds and accelerations do not.
@@ -144,11 +144,24 @@ class MaestroEmulator:
         self._inputs = inputs
         self._outputs = outputs
         self._limits = (round(limits_us[0] * 4), round(limits_us[1] * 4))
-        self._noise = noise_lsb
+        self._late = LateAnswers()
+        self.faults = FaultTable(
+            self.name,
+            {
+                "brown_out [SECONDS]": self._brown_out,
+                "at_junk": self._receive_junk,
+                "mode dual_port|uart": self._set_mode,
+                "mute on|off": False,
+                "late SECONDS [COUNT]": self._late.start,
+                "pulse CHANNEL MICROSECONDS": self._move,
+                "error BIT": lambda bit: self._fail(Error(1 << int(bit))),
+                "rail VOLTS": self._set_rail,
+                "noise LSB": noise_lsb,
+                "battery VOLTS": self._set_battery,
+            },
+        )
         self._drift = rail_drift_v
         self._decoder = Decoder(device_number, crc)
-        self._mute = False
-        self._late: list[float] = []
         """Delays of the next answers, s."""
         self._powered = True
         self._fed_again = asyncio.Event()
@@ -201,58 +214,28 @@ class MaestroEmulator:
             while True:
                 self._take(end, await end.read())
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start a fault, see the class.
+    def _receive_junk(self) -> None:
+        self._execute(AT_JUNK)  # it answers nothing to it
 
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        try:
-            match fault, values:
-                case "brown_out", ():
-                    self._brown_out(0.5)
-                case "brown_out", (seconds,):
-                    self._brown_out(float(seconds))
-                case "at_junk", ():
-                    self._execute(AT_JUNK)  # it answers nothing to it
-                case "mode", (("dual_port" | "uart") as mode,):
-                    self._mode = mode
-                case "mute", (("on" | "off") as state,):
-                    self._mute = state == "on"
-                case "late", (seconds, *counts):
-                    self._late = [float(seconds)] * int(*counts or ("1",))
-                case "pulse", (channel, pulse):
-                    self._ramps[int(channel)].aim(round(4 * float(pulse)))
-                case _, (number,):
-                    self._set(fault, number)
-                case _:
-                    raise ValueError("unknown")
-        except ValueError as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: brown_out [SECONDS], "
-                "at_junk, mode dual_port|uart, mute on|off, late SECONDS [COUNT], "
-                "pulse CHANNEL MICROSECONDS, error BIT, rail VOLTS, noise LSB, battery VOLTS"
-            ) from error
+    def _set_mode(self, mode: str) -> None:
+        modes: dict[str, Mode] = {"dual_port": "dual_port", "uart": "uart"}
+        self._mode = modes[mode]
 
-    def _set(self, fault: str, number: str) -> None:
-        match fault:
-            case "error":
-                self._fail(Error(1 << int(number)))
-            case "rail":
-                self.rail_v = float(number)
-            case "noise":
-                self._noise = float(number)
-            case "battery":
-                self.analog_v.update(dict.fromkeys(self._inputs, float(number) / 10))
-            case _:
-                raise ValueError("unknown")
+    def _move(self, channel: str, pulse: str) -> None:
+        self._ramps[int(channel)].aim(round(4 * float(pulse)))
+
+    def _set_rail(self, volts: str) -> None:
+        self.rail_v = float(volts)
+
+    def _set_battery(self, volts: str) -> None:
+        self.analog_v.update(dict.fromkeys(self._inputs, float(volts) / 10))
 
     # Serving
 
     def _take(self, end: DeviceEnd, data: bytes) -> None:
         answer = self._execute(data)
-        if answer and not self._mute:
-            end.write(answer, self._late.pop() if self._late else 0.0)
+        if answer and not self.faults["mute"]:
+            end.write(answer, self._late.take(0.0))
 
     def _execute(self, data: bytes) -> bytes:
         self.received.extend(data)
@@ -335,7 +318,7 @@ class MaestroEmulator:
         now = self._clock.now()
         volts = self.analog_v[channel] if self._servos is None else self._servos.analog_volts(channel, now)
         rail = self.rail_v + self._drift * math.sin(2 * math.pi * now / (60 * SECOND))
-        counts = volts / rail * ADC_MAX + self._noise * float(self._rng.standard_normal())
+        counts = volts / rail * ADC_MAX + self.faults["noise"] * float(self._rng.standard_normal())
         return min(max(round(counts), 0), ADC_MAX)
 
     def _fail(self, error: Error) -> None:
@@ -395,13 +378,13 @@ class MaestroEmulator:
         self._powered = plugged
         self.power_cycle()
 
-    def _brown_out(self, seconds: float) -> None:
+    def _brown_out(self, seconds: str = "0.5") -> None:
         """A stalled servo pulled the rail down: gone from USB, back with nothing in mind."""
         if self.usb is None:
             self.power_cycle()
         else:
             self.usb.unplug()
-            asyncio.get_running_loop().call_later(seconds, self.usb.plug)
+            asyncio.get_running_loop().call_later(float(seconds), self.usb.plug)
 
 
 def emulated(setup: EmulatorSetup) -> MaestroEmulator:

@@ -1,9 +1,11 @@
-"""Requests and replies, with a Maestro over one open link; shared by driver and probe."""
+"""Requests and replies, with a Maestro over one open link; shared by the driver and `identify`."""
 
 from typing import Final
 
 from monstertruck_drivers.link import Link
-from monstertruck_drivers.maestro.protocol import ERROR_MASK, POSITION_MAX, Encoder, words
+from monstertruck_drivers.maestro.config import MaestroConfig
+from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
+from monstertruck_drivers.maestro.protocol import CHANNELS, ERROR_MASK, POSITION_MAX, Encoder, error_names, words
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError, WrongDeviceError
 
@@ -140,3 +142,26 @@ class MaestroSession:
         """
         if self._link.is_lost:
             raise DeviceLostError(f"{self._link.name}: unplugged")
+
+
+async def identify(link: Link, clock: Clock, settings: MaestroConfig | MaestroEscConfig) -> dict[str, object]:
+    """Read the error word and all channels by compact commands without CRC; reading clears the errors.
+
+    Returns:
+        JSON-able: ``errors`` that were pending, ``channels``: for each channel the pulse in microseconds if it is a
+        servo (0 = off), and the voltage at the pin if it is an input.
+
+    Raises:
+        DeviceTimeoutError: silence; the text says what to check.
+        WrongDeviceError: another device.
+    """
+    session = MaestroSession(link, clock, Encoder(), timeout=0.3)
+    errors = await session.identify(0, 1)
+    positions = await session.ask(*(session.encode.get_position(channel) for channel in range(CHANNELS)))
+    return {
+        "errors": error_names(errors),
+        "channels": [
+            {"channel": channel, "if_servo_us": word / 4, "if_input_v": round(word * 5 / 1023, 3)}
+            for channel, word in enumerate(positions)
+        ],
+    }

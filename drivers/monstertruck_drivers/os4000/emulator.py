@@ -10,6 +10,7 @@ import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import AttitudeSource, EmulatorSetup, ReceivedBytes
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.os4000.protocol import (
     BAUDS,
     ESC,
@@ -26,7 +27,6 @@ from monstertruck_drivers.os4000.protocol import (
 )
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 VERSION: Final = b"OS4000-T Ver 2.1\r\n"
 
@@ -71,7 +71,7 @@ REPORTED: Final = (
 CALIBRATION_KEYS: Final = (Key.CALIBRATE_LEVEL, Key.CALIBRATE_VERTICAL)
 
 
-class Os4000Emulator:
+class Os4000Emulator(FaultyDevice):
     """OS4000-T that streams from power-up on.
 
     Faults (``inject``): ``frozen on|off`` (repeats one sentence), ``silent on|off``, ``bad_checksum N``,
@@ -117,12 +117,24 @@ class Os4000Emulator:
         self._terminators = terminators
         self._settle = round(settle * SECOND)
         self._pace = pace
-        self._frozen = False
-        self._silent = False
-        self._bad_checksums = 0
+        self.faults = FaultTable(
+            self.name,
+            {
+                "frozen|silent on|off": False,
+                "bad_checksum N": 0,
+                "empty_field TAG|none": lambda tag: self._spoil_field(tag, ""),
+                "nan_field TAG|none": lambda tag: self._spoil_field(tag, "NaN"),
+                "half_sentence": 0,
+                "prompt": self._prompt,
+                "pending [DIGITS]": self._begin_command,
+                "rate N": lambda number: self._change(Key.RATE, number),
+                "format N": lambda number: self._change(Key.FORMAT, number),
+                "disturbance DEGREES": 0.0,
+                "drift SHARE": 0.0,
+                "host_baud N": self._set_host_baud,
+            },
+        )
         self._spoiled: tuple[str, str] | None = None
-        self._disturbance = 0.0
-        self._drift = 0.0
         self._stray = b""
         self._last = b""
         self._end: DeviceEnd | None = None
@@ -133,7 +145,7 @@ class Os4000Emulator:
         self._escaped = False
         self._command: Key | None = None
         self._digits = b""
-        self._torn = True
+        self.faults["half_sentence"] = 1
         self._resume_at = self._clock.now() + 200_000_000  # nanoseconds from power-up to the first sentence
         self._line_free = self._clock.now()
         if self._end is not None and self._pace:
@@ -157,56 +169,21 @@ class Os4000Emulator:
                     if self.host_baud in (None, self._baud):
                         self._take(end, byte)
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start a fault, see the class.
+    def _spoil_field(self, tag: str, value: str) -> None:
+        self._spoiled = None if tag == "none" else (tag, value)
 
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        try:
-            self._inject(fault, values)
-        except ValueError as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: "
-                "frozen on|off, silent on|off, bad_checksum N, empty_field TAG|none, nan_field TAG|none, "
-                "half_sentence, prompt, pending [DIGITS], rate N, format N, disturbance DEGREES, drift SHARE, "
-                "host_baud N"
-            ) from error
+    def _prompt(self) -> None:
+        self._stray = _prompt(Key.MOUNTING)
 
-    def _inject(self, fault: str, values: tuple[str, ...]) -> None:
-        match fault, values:
-            case "frozen", (("on" | "off") as state,):
-                self._frozen = state == "on"
-            case "silent", (("on" | "off") as state,):
-                self._silent = state == "on"
-            case "bad_checksum", (count,):
-                self._bad_checksums = int(count)
-            case (("empty_field" | "nan_field"), (tag,)):
-                self._spoiled = None if tag == "none" else (tag, "" if fault == "empty_field" else "NaN")
-            case "half_sentence", ():
-                self._torn = True
-            case "prompt", ():
-                self._stray = _prompt(Key.MOUNTING)
-            case "pending", digits if len(digits) < 2:
-                self._command, self._digits = Key.RATE, "".join(digits).encode("ascii")
-            case _, (number,):
-                self._set(fault, number)
-            case _:
-                raise ValueError("unknown")
+    def _begin_command(self, digits: str = "") -> None:
+        self._command, self._digits = Key.RATE, digits.encode("ascii")
 
-    def _set(self, fault: str, number: str) -> None:
-        match fault:
-            case "rate" | "format":
-                if not self.settings.store(Key.RATE if fault == "rate" else Key.FORMAT, int(number)):
-                    raise ValueError("out of range")
-            case "disturbance":
-                self._disturbance = float(number)
-            case "drift":
-                self._drift = float(number)
-            case "host_baud":
-                self.host_baud = int(number)
-            case _:
-                raise ValueError("unknown")
+    def _change(self, key: Key, number: str) -> None:
+        if not self.settings.store(key, int(number)):
+            raise ValueError("out of range")
+
+    def _set_host_baud(self, baud: str) -> None:
+        self.host_baud = int(baud)
 
     # Commands
 
@@ -270,13 +247,13 @@ class Os4000Emulator:
         if rate == 0:
             return None
         seconds = 1 / rate if rate > 0 else float(-rate)
-        return round(seconds / (1 + self._drift) * SECOND)
+        return round(seconds / (1 + self.faults["drift"]) * SECOND)
 
     def _emit(self, end: DeviceEnd, now: int) -> None:
         busy = self._escaped or self._command is not None or now < self._resume_at or now < self._line_free
-        if busy or self._silent:
+        if busy or self.faults["silent"]:
             return
-        line = self._last if self._frozen and self._last else self._sentence(now)
+        line = self._last if self.faults["frozen"] and self._last else self._sentence(now)
         self._last = line
         line = self._spoil(line)
         if self._pace:
@@ -286,18 +263,16 @@ class Os4000Emulator:
         end.write(line)
 
     def _spoil(self, line: bytes) -> bytes:
-        if self._torn:
-            self._torn = False
+        if self.faults.strikes("half_sentence"):
             return line[len(line) // 2 :]
-        if self._bad_checksums:
-            self._bad_checksums -= 1
+        if self.faults.strikes("bad_checksum"):
             return line.replace(b"P", b"p", 1)
         stray, self._stray = self._stray, b""
         return stray + line
 
     def _sentence(self, now: int) -> bytes:
         reading, report = self._source.compass(now), self.signals.report
-        heading = round(report("heading", reading.heading_deg + self._disturbance) * 10) % 3600 / 10
+        heading = round(report("heading", reading.heading_deg + self.faults["disturbance"]) * 10) % 3600 / 10
         pitch = round(report("pitch", reading.pitch_deg), 1) + 0.0
         roll = round(report("roll", reading.roll_deg), 1) + 0.0
         form = self.settings.format

@@ -1,4 +1,4 @@
-"""Listening to an OS4000 and setting it up over one open link; shared by driver and probe."""
+"""Listening to an OS4000 and setting it up over one open link; shared by the driver and `identify`."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -6,6 +6,7 @@ from typing import Final
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.os4000 import protocol
+from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.os4000.protocol import FORMAT_TAGGED, Fields, Key, Os4000Parser, Sentence, is_other_format
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, WrongDeviceError
@@ -141,3 +142,34 @@ def observed_rate(heard: list[tuple[int, Sentence]]) -> float | None:
     if len(intervals) < 2 or intervals[len(intervals) // 2] == 0:
         return None
     return SECOND / intervals[len(intervals) // 2]
+
+
+async def identify(link: Link, clock: Clock, settings: Os4000Config) -> dict[str, object]:
+    """Listen, and ask for the firmware version; only a silent unit is set to another rate.
+
+    Returns:
+        JSON-able: ``version`` (lines that the unit prints), ``rate`` (Hz), ``fields`` (names), ``sample`` in the
+        device's units and signs.
+
+    Raises:
+        DeviceTimeoutError: silence.
+        WrongDeviceError: another device, or another baud rate than the port's.
+    """
+    session = Os4000Session(link, clock)
+    heard = await session.start(20)  # rate that a unit gets whose output is off
+    version = await session.ask(Key.VERSION)
+    _, sample = heard[-1]
+    rate, fields = observed_rate(heard), observed_fields(heard)
+    return {
+        "version": version,
+        "rate": None if rate is None else round(rate, 1),
+        "fields": [(bit.name or "").lower() for bit in Fields if bit in fields],
+        "sample": {
+            "heading_deg": sample.heading,
+            "pitch_deg": sample.pitch,
+            "roll_deg": sample.roll,
+            "temperature_c": sample.temperature,
+            "field_mg": sample.field,
+            "acceleration_g": sample.acceleration,
+        },
+    }

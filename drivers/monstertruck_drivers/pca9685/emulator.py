@@ -8,6 +8,7 @@ import numpy as np
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ServoPlant
 from monstertruck_drivers.esc_emulator import EscEmulator
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.i2c.emulator import serve
 from monstertruck_drivers.pca9685.config import Pca9685Config, Pca9685EscConfig
 from monstertruck_drivers.pca9685.protocol import (
@@ -32,7 +33,6 @@ from monstertruck_drivers.pca9685.protocol import (
 )
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 SUB_BITS: Final = (PwmMode1.SUB1, PwmMode1.SUB2, PwmMode1.SUB3, PwmMode1.ALLCALL)
 """Bits that let the chip answer at the addresses of registers 2 to 5."""
@@ -40,7 +40,7 @@ _POSITION: Final = "counts_{}"
 _TARGET: Final = "target_{}"
 
 
-class Pca9685Emulator:
+class Pca9685Emulator(FaultyDevice):
     """A PCA9685 whose supply comes with the bus.
 
     Without the auto-increment bit, every byte of a transfer reads or writes the same register. The prescaler takes
@@ -75,7 +75,14 @@ class Pca9685Emulator:
         kinds = dict.fromkeys((_POSITION.format(channel) for channel in range(CHANNELS)), SignalKind.NUMBER)
         kinds |= dict.fromkeys((_TARGET.format(channel) for channel in range(CHANNELS)), SignalKind.ORDER)
         self.signals = Signals(clock.now, kinds, np.random.default_rng(seed))
-        self._absent = False
+        self.faults = FaultTable(
+            self.name,
+            {
+                "brown_out": self.power_cycle,
+                "absent on|off": False,
+                "oscillator HZ": self._set_oscillator,
+            },
+        )
         self._powered = True
         self._boot()
         if servos is not None:
@@ -119,34 +126,15 @@ class Pca9685Emulator:
         end.on_plug = self._plugged
         await serve(end, self.transfer)
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start a fault, see the class.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        try:
-            match fault, values:
-                case "brown_out", ():
-                    self.power_cycle()
-                case "absent", (("on" | "off") as state,):
-                    self._absent = state == "on"
-                case "oscillator", (hertz,):
-                    self._advance()
-                    self.oscillator = float(hertz)
-                case _:
-                    raise ValueError("unknown")
-        except ValueError as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: brown_out, absent on|off, "
-                "oscillator HZ"
-            ) from error
+    def _set_oscillator(self, hertz: str) -> None:
+        self._advance()
+        self.oscillator = float(hertz)
 
     # The bus
 
     def transfer(self, address: int, data: bytes, count: int) -> bytes | None:
         """Answer one transfer; None = not acknowledged."""
-        if self._absent or not self._powered:
+        if self.faults["absent"] or not self._powered:
             return None
         if address == GENERAL_CALL:
             if data != bytes((RESET_BYTE,)):

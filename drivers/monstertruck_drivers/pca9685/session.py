@@ -1,13 +1,17 @@
-"""Registers of one PCA9685 on an open bus; shared by driver and probe."""
+"""Registers of one PCA9685 on an open bus; shared by the driver and `identify`."""
 
 from monstertruck_drivers.i2c.host import I2cBus
 from monstertruck_drivers.link import Link
+from monstertruck_drivers.pca9685.config import Pca9685Config, Pca9685EscConfig
 from monstertruck_drivers.pca9685.protocol import (
+    CHANNELS,
+    COUNTS,
     MODE2_RESET,
     OWN_ADDRESSES,
     WAKE_UP,
     PwmMode1,
     PwmRegister,
+    count_us,
     counts_of,
     register_of,
 )
@@ -98,3 +102,29 @@ class Pca9685Session:
         """Whether mode and frequency are those of ``set_up``; raises as ``write``."""
         registers = PwmRegister.MODE1, PwmRegister.MODE2, PwmRegister.PRE_SCALE
         return [await self.read(register) for register in registers] == [AWAKE, MODE2_RESET, prescaler]
+
+
+async def identify(link: Link, clock: Clock, settings: Pca9685Config | Pca9685EscConfig) -> dict[str, object]:
+    """Read the registers without writing.
+
+    Returns:
+        JSON-able: ``address``, ``asleep``, ``prescaler``, ``frequency_hz`` by the configured oscillator, ``channels``:
+        pulse by channel in microseconds (0 = off).
+
+    Raises:
+        DeviceTimeoutError: nothing at this address.
+        WrongDeviceError: another device.
+    """
+    config = settings.unit if isinstance(settings, Pca9685EscConfig) else settings
+    session = Pca9685Session(link, clock, config.address, config.answer_timeout)
+    mode, prescaler = await session.identify()
+    # One by one: after power-up the chip does not increment the register.
+    values = [[await session.read(register_of(channel) + i) for i in range(4)] for channel in range(CHANNELS)]
+    count = count_us(prescaler, config.oscillator)
+    return {
+        "address": f"0x{config.address:02x}",
+        "asleep": bool(mode & PwmMode1.SLEEP),
+        "prescaler": prescaler,
+        "frequency_hz": round(1e6 / (COUNTS * count), 2),
+        "channels": [round(counts_of(bytes(one)) * count, 1) for one in values],
+    }

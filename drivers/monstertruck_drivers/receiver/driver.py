@@ -3,7 +3,7 @@
 from collections import deque
 from typing import Final
 
-from monstertruck_drivers.link import Port
+from monstertruck_drivers.link import Link, Port
 from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig
 from monstertruck_drivers.receiver.crsf import CrsfParser
 from monstertruck_drivers.receiver.frames import ReceiverFrame, ReceiverParser
@@ -182,3 +182,31 @@ async def first_frames(stream: DeviceStream[ReceiverFrame], config: ReceiverConf
     listen = 1.0
     hint = "another protocol or baud rate" if isinstance(config, CrsfConfig) else "is the line inverted back?"
     return await stream.first(listen, f"of a receiver: {hint}")
+
+
+async def identify(link: Link, clock: Clock, settings: ReceiverConfig) -> dict[str, object]:
+    """Listen for half a second.
+
+    Returns:
+        JSON-able: ``channels`` -1 to 1 (None without a transmitter), ``failsafe``, ``link_quality``, ``rssi_dbm``.
+
+    Raises:
+        DeviceError: as the driver's ``run``.
+    """
+    look = 0.5  # duration of the frame collection (s)
+    stream = DeviceStream(link, clock, parser_of(settings).feed)
+    frames = await first_frames(stream, settings)
+    until = clock.now() + round(look * SECOND)
+    while clock.now() < until:
+        try:
+            frames += await stream.receive(look)
+        except (DeviceTimeoutError, ProtocolError):
+            break
+    channels = next((frame.channels for frame in reversed(frames) if frame.channels is not None), None)
+    link_frame = next((frame for frame in reversed(frames) if frame.quality is not None), None)
+    return {
+        "channels": None if channels is None else [round(position(raw), 3) for raw in channels],
+        "failsafe": frames[-1].failsafe,
+        "link_quality": None if link_frame is None else link_frame.quality,
+        "rssi_dbm": None if link_frame is None else link_frame.rssi,
+    }

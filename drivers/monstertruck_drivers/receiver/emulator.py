@@ -10,18 +10,18 @@ import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.receiver import crsf, sbus
 from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig, SbusConfig
 from monstertruck_drivers.receiver.protocol import CENTRE, CHANNELS, CRSF_BAUD, LOW, SBUS_BAUD, SBUS_PERIOD, raw
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 FAILSAFE_AFTER: Final = SECOND
 """Time after which an SBUS receiver reports the loss of its transmitter (ns)."""
 
 
-class ReceiverEmulator:
+class ReceiverEmulator(FaultyDevice):
     """A receiver and its transmitter: sticks in the middle, switches off.
 
     Faults (``inject``): ``move CHANNEL POSITION`` (by the operator), ``transmitter on|off``, ``quality SHARE``,
@@ -43,10 +43,17 @@ class ReceiverEmulator:
         names = [f"channel_{i}" for i in range(1, CHANNELS + 1)]
         self.signals = Signals(clock.now, dict.fromkeys([*names, "quality"], SignalKind.NUMBER), self._rng)
         self._positions = [CENTRE] * 4 + [LOW] * (CHANNELS - 4)
-        self._silent = False
+        self.faults = FaultTable(
+            self.name,
+            {
+                "move CHANNEL POSITION": lambda channel, position: self.move(int(channel), float(position)),
+                "transmitter on|off": self._set_transmitter,
+                "quality SHARE": 1.0,
+                "silent on|off": False,
+                "damage N": 0,
+            },
+        )
         self._transmitter = True
-        self._quality = 1.0
-        self._damage = 0
         self._lost_at = 0
         self._packets = 0
         self._sent = tuple(self._positions)
@@ -58,31 +65,8 @@ class ReceiverEmulator:
     def power_cycle(self) -> None:
         """Switch the supply off and on: the receiver finds its transmitter again if that is on."""
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault, see the class.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        try:
-            match fault, values:
-                case "move", (channel, position):
-                    self.move(int(channel), float(position))
-                case "transmitter", (("on" | "off") as word,):
-                    self._transmitter, self._lost_at = word == "on", self._clock.now()
-                case "quality", (share,):
-                    self._quality = float(share)
-                case "silent", (("on" | "off") as word,):
-                    self._silent = word == "on"
-                case "damage", (count,):
-                    self._damage = int(count)
-                case _:
-                    raise ValueError(fault)
-        except (ValueError, IndexError) as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: move CHANNEL POSITION, "
-                "transmitter on|off, quality SHARE, silent on|off, damage N"
-            ) from error
+    def _set_transmitter(self, on: bool) -> None:
+        self._transmitter, self._lost_at = on, self._clock.now()
 
     async def run(self, end: DeviceEnd) -> None:
         """Stream frames until cancelled."""
@@ -94,19 +78,18 @@ class ReceiverEmulator:
             due += period
             await self._clock.sleep_until(due)
             for data in self._frames():
-                if self._silent:
+                if self.faults["silent"]:
                     continue
                 end.write(self._damaged(data))
 
     def _damaged(self, data: bytes) -> bytes:
-        if not self._damage:
+        if not self.faults.strikes("damage"):
             return data
-        self._damage -= 1
         return data[:4] + bytes((data[4] ^ 0x08,)) + data[5:-1] + bytes((data[-1] ^ 0x03,))
 
     def _frames(self) -> list[bytes]:
         self._packets += 1
-        arrives = self._transmitter and float(self._rng.random()) < self._quality
+        arrives = self._transmitter and float(self._rng.random()) < self.faults["quality"]
         if arrives:
             shown = (self.signals.report(f"channel_{i}", value) for i, value in enumerate(self._positions, 1))
             self._sent = tuple(max(0, min(2047, value)) for value in shown)
@@ -115,7 +98,7 @@ class ReceiverEmulator:
             return [sbus.frame(self._sent, lost=not arrives, failsafe=gone)]
         frames = [crsf.channels_frame(self._sent)] if arrives else []
         if self._packets % 20 == 0:  # packets for each frame of link statistics
-            quality = self._quality if self._transmitter else 0.0
+            quality = self.faults["quality"] if self._transmitter else 0.0
             quality = max(0.0, min(1.0, self.signals.report("quality", quality)))
             signal = -60.0  # dBm
             frames.append(crsf.link_frame(quality, signal if self._transmitter else 0.0))

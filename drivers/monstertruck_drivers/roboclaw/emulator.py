@@ -4,6 +4,7 @@ Habits of the real thing: it is silent unless asked, and to a request with anoth
 10 ms; counts from 0 after every power-up; an encoder that is not wired counts nothing, without a word.
 """
 
+from functools import partial
 from math import floor, tau
 from typing import Final
 
@@ -11,18 +12,18 @@ import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes, WheelSource
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.roboclaw.config import RoboclawConfig
 from monstertruck_drivers.roboclaw.protocol import PACKET_GAP, RoboclawCommand, counted, signed
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 VERSION: Final = b"USB RoboClaw 2x7a v4.3.6\n\x00"
 THINKING: Final = MILLISECOND
 """Ns from a request to its answer."""
 
 
-class RoboclawEmulator:
+class RoboclawEmulator(FaultyDevice):
     """Unit with its encoders wired according to the settings.
 
     Faults (``inject``): ``stuck left|right on|off`` (an encoder's disc slips on its shaft), ``mirrored left|right
@@ -45,8 +46,16 @@ class RoboclawEmulator:
         self._settings = settings or RoboclawConfig()
         self._stuck = {"left": False, "right": False}
         self._mirrored = {"left": False, "right": False}
-        self._silent = False
-        self._noise = 0
+        self.faults = FaultTable(
+            self.name,
+            {
+                "stuck left|right on|off": partial(self._set_wiring, self._stuck),
+                "mirrored left|right on|off": partial(self._set_wiring, self._mirrored),
+                "silent on|off": False,
+                "noise COUNT": 0,
+                "reset": self.power_cycle,
+            },
+        )
         self._angles: tuple[float, float] | None = None
         """Angles of the wheels at the last reading (rad)."""
         self._counted = [0.0, 0.0]
@@ -57,29 +66,11 @@ class RoboclawEmulator:
         self._look()
         self._counted = [0.0, 0.0]
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault, see the class.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
+    def _set_wiring(self, faulty: dict[str, bool], side: str, on: bool) -> None:
         self._look()
-        match fault, values:
-            case "stuck", (("left" | "right") as side, ("on" | "off") as word):
-                self._stuck[side] = word == "on"
-            case "mirrored", (("left" | "right") as side, ("on" | "off") as word):
-                self._mirrored[side] = word == "on"
-            case "silent", (("on" | "off") as word,):
-                self._silent = word == "on"
-            case "noise", (count,) if count.isdigit():
-                self._noise = int(count)
-            case "reset", ():
-                self.power_cycle()
-            case _:
-                raise InputError(
-                    f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: stuck left|right on|off,"
-                    " mirrored left|right on|off, silent on|off, noise COUNT, reset"
-                )
+        if side not in faulty:
+            raise LookupError(side)
+        faulty[side] = on
 
     async def run(self, end: DeviceEnd) -> None:
         """Answer until cancelled."""
@@ -98,7 +89,7 @@ class RoboclawEmulator:
 
     def _answer(self, end: DeviceEnd, asked: bytes) -> None:
         address, command = asked
-        if address != self._settings.address or self._silent:
+        if address != self._settings.address or self.faults["silent"]:
             return
         if command == RoboclawCommand.VERSION:
             data = VERSION
@@ -109,8 +100,7 @@ class RoboclawEmulator:
         else:
             return
         answer = signed(asked, data)
-        if self._noise > 0:
-            self._noise -= 1
+        if self.faults.strikes("noise"):
             answer = answer[:3] + bytes((answer[3] ^ 0x10,)) + answer[4:]
         end.write(answer)
 

@@ -1,6 +1,7 @@
-"""Requests and answers of one RoboClaw; shared by driver and probe."""
+"""Requests and answers of one RoboClaw; shared by the driver and `identify`."""
 
 from monstertruck_drivers.link import Link
+from monstertruck_drivers.roboclaw.config import RoboclawConfig
 from monstertruck_drivers.roboclaw.protocol import (
     COUNTS_SIZE,
     LONGEST_NAME,
@@ -82,3 +83,16 @@ class RoboclawSession:
             except TimeoutError:
                 break
         return answer
+
+
+async def identify(link: Link, clock: Clock, settings: RoboclawConfig) -> dict[str, object]:
+    """Read the version and both counters.
+
+    Returns:
+        JSON-able: ``version``, ``counts`` of inputs 1 and 2.
+
+    Raises:
+        DeviceError: as the driver's ``run``.
+    """
+    session = RoboclawSession(link, clock, settings.address, settings.answer_timeout)
+    return {"version": await session.identify(), "counts": list(await session.counts())}

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import Array, BeamSource, EmulatorSetup, ReceivedBytes
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.rplidar.config import RplidarConfig
 from monstertruck_drivers.rplidar.protocol import (
     COUNTS,
@@ -32,11 +33,9 @@ from monstertruck_drivers.rplidar.protocol import (
     build_ultra,
     ultra_offset,
 )
-from monstertruck_drivers.scanning.head import FAULTS as HEAD_FAULTS
 from monstertruck_drivers.scanning.head import TURNING, TurningHead
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 GREETING: Final = b"RP LIDAR System.\r\nFirmware Ver 1.29 - rc7, HW Ver 7\r\nModel: 18\r\n"
 """Startup message of an A1."""
@@ -45,7 +44,7 @@ RANGE: Final = "range"
 SCAN: Final = "scan"
 
 
-class RplidarEmulator:
+class RplidarEmulator(FaultyDevice):
     """RPLIDAR with its rotating head.
 
     Faults (``inject``): ``silent on|off`` and ``deaf on|off``, ``health 0|1|2 CODE`` (2: protects itself until it is
@@ -81,10 +80,20 @@ class RplidarEmulator:
         self.head = TurningHead(clock, source, model.ranges, model.frequency, rng)
         self._clock, self._model = clock, model
         self._identity = RplidarIdentity(model.number, firmware, 7, serial)
-        self._switches = {"silent": False, "deaf": False, "broken": False}
+        self.faults = FaultTable(
+            self.name,
+            {
+                "silent|deaf on|off": False,
+                "health 0|1|2 [CODE]": self._set_health,
+                "broken on|off": self._break,
+                "bad_checksum N": 0,
+                "torn": 0,
+                **self.head.fault_rows(),
+            },
+        )
+        self._broken = False
         self._health = (0, 0)
-        self._bad_sums = 0
-        self._torn = self._forced = self._greeting = False
+        self._forced = self._greeting = False
         self._input = b""
         self._ready_at = 0
         self._angle = 0.0
@@ -101,7 +110,7 @@ class RplidarEmulator:
             while True:
                 data = await end.read()
                 self.received.extend(data)
-                if self._switches["deaf"] or self._clock.now() < self._ready_at:
+                if self.faults["deaf"] or self._clock.now() < self._ready_at:
                     continue
                 self._input += data
                 while (taken := self._request()) is not None:
@@ -117,35 +126,20 @@ class RplidarEmulator:
 
     def _restart(self) -> None:
         self.mode, self._input = None, b""
-        self._health = (2, 0x8001) if self._switches["broken"] else (0, 0)
+        self._health = (2, 0x8001) if self._broken else (0, 0)
         boot = SECOND // 2  # nanoseconds after power-up and reset without an answer
         self._ready_at = self._clock.now() + boot
         self._greeting = self._model.number == MODELS["a1"].number
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault.
+    def _set_health(self, status: str, code: str = "0") -> None:
+        if status not in ("0", "1", "2"):
+            raise ValueError(status)
+        self._health = int(status), int(code, base=0)
 
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        match fault, values:
-            case _, (("on" | "off") as state,) if fault in self._switches:
-                self._switches[fault] = state == "on"
-                if fault == "broken" and state == "on":
-                    self._health = (2, 0x8001)
-            case "health", (status, *code) if status in ("0", "1", "2"):
-                self._health = int(status), int(code[0], base=0) if code else 0
-            case "bad_checksum", (count,) if count.isdigit():
-                self._bad_sums = int(count)
-            case "torn", ():
-                self._torn = True
-            case _ if self.head.inject(fault, *values):
-                pass
-            case _:
-                raise InputError(
-                    f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: silent on|off | "
-                    f"deaf on|off | health 0|1|2 CODE | broken on|off | bad_checksum N | torn | {HEAD_FAULTS}"
-                )
+    def _break(self, broken: bool) -> None:
+        self._broken = broken
+        if broken:
+            self._health = (2, 0x8001)
 
     # Requests
 
@@ -209,12 +203,12 @@ class RplidarEmulator:
     def _begin(self, end: DeviceEnd, mode: ScanMode, *, forced: bool) -> None:
         if self._health[0] == 2:  # protects itself
             return
-        if not self._switches["silent"]:
+        if not self.faults["silent"]:
             end.write(build_descriptor(Descriptor(SIZES[mode.answer], True, mode.answer)))
         self.mode, self._forced = mode, forced
 
     def _single(self, end: DeviceEnd, kind: DataType, data: bytes) -> None:
-        if not self._switches["silent"]:
+        if not self.faults["silent"]:
             end.write(build_descriptor(Descriptor(len(data), False, kind)) + data)
 
     def _property(self, payload: bytes) -> bytes | None:
@@ -265,14 +259,13 @@ class RplidarEmulator:
                 continue
             data = self._record(mode, times, fresh=fresh)
             ready = self._forced or self.head.speed > TURNING * max(self._model.frequency, 0.1)
-            if not ready or self._switches["silent"]:
+            if not ready or self.faults["silent"]:
                 continue
             fresh = False
-            if self._bad_sums:
-                self._bad_sums -= 1
+            if self.faults.strikes("bad_checksum"):
                 data = bytes((data[0] ^ 3,)) + data[1:]
-            if self._torn:
-                self._torn, data = False, data[len(data) // 2 :]
+            if self.faults.strikes("torn"):
+                data = data[len(data) // 2 :]
             end.write(data)
 
     def _record(self, mode: ScanMode, times: NDArray[np.int64], *, fresh: bool) -> bytes:

@@ -226,3 +226,24 @@ class RplidarSession:
         except TimeoutError:
             raise DeviceTimeoutError(f"{self._link.name}: no answer to {what}") from None
         return data
+
+
+async def identify(link: Link, clock: Clock, settings: RplidarConfig) -> dict[str, object]:
+    """Perform the handshake; the unit is idle afterwards.
+
+    Returns:
+        JSON-able: ``device`` with the model's number, ``serial``, ``firmware``, ``health``, ``modes`` by name (samples
+        per second), ``typical``.
+
+    Raises:
+        DeviceError: as the driver's ``run``.
+    """
+    unit = await RplidarSession(link, clock, settings).handshake()
+    return {
+        "device": f"SLAMTEC RPLIDAR, model 0x{unit.identity.model:02x}",
+        "serial": unit.identity.serial,
+        "firmware": ".".join(map(str, unit.identity.firmware)),
+        "health": unit.health.status,
+        "modes": {mode.name: round(1.0 / mode.sample_time) for mode in unit.modes},
+        "typical": next((mode.name for mode in unit.modes if mode.number == unit.typical), None),
+    }

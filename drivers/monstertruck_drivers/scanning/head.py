@@ -8,18 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_drivers.emulation import Array, BeamSource, RangeSheet
+from monstertruck_drivers.fault_table import FaultRows
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 TURNING: Final = 0.5
 """Minimum speed for measurements, as a fraction of the set speed."""
-FAULTS: Final = "cover FROM TO VALUE [SHARE] | cover off | mirror FROM TO | drift PPM | blocked on|off | frequency HZ"
 
 
 class TurningHead:
     """Clockwise turning head with a separate clock, queried at increasing instants of that clock.
 
-    Faults (``inject``): ``cover`` covers the window between two directions (degrees from straight ahead, left
+    Faults (``fault_rows``): ``cover`` covers the window between two directions (degrees from straight ahead, left
     positive): all beams there, or a random fraction of them, return the value (below 20: no return, otherwise mm).
     ``mirror`` puts a mirror there. ``drift`` sets the rate of its clock relative to the world clock. ``blocked`` holds
     the head. ``frequency`` changes its speed.
@@ -99,35 +98,32 @@ class TurningHead:
 
     # Faults
 
-    def inject(self, fault: str, *values: str) -> bool:
-        """Start or end a fault.
+    def fault_rows(self) -> FaultRows:
+        """Return the head's faults, for the table of its scanner."""
+        return {
+            "cover FROM TO VALUE [SHARE]|off": self._set_cover,
+            "mirror FROM TO": lambda begin, end: self._cover(begin, end, self._mirrored),
+            "drift PPM": self._set_drift,
+            "blocked on|off": self._block,
+            "frequency HZ": self._set_frequency,
+        }
 
-        Returns:
-            Whether the head knows this fault.
+    def _set_cover(self, begin: str, end: str = "", value: str = "", share: str = "1") -> None:
+        if begin == "off":
+            self._covers.clear()
+        else:
+            self._cover(begin, end, self._covered(int(value), float(share)))
 
-        Raises:
-            InputError: a value is invalid.
-        """
-        try:
-            match fault, values:
-                case "cover", ("off",):
-                    self._covers.clear()
-                case "cover", (begin, end, value, *share):
-                    self._cover(begin, end, self._covered(int(value), *map(float, share)))
-                case "mirror", (begin, end):
-                    self._cover(begin, end, self._mirrored)
-                case "drift", (ppm,):
-                    self._elapsed, self._born = self.now(), self._clock.now()
-                    self._rate = 1.0 + float(ppm) * 1e-6
-                case "blocked", (("on" | "off") as state,):
-                    self._blocked = state == "on"
-                case "frequency", (hertz,):
-                    self.frequency = float(hertz)
-                case _:
-                    return False
-        except (TypeError, ValueError) as error:
-            raise InputError(f"cannot inject {' '.join((fault, *values))!r}; known: {FAULTS}") from error
-        return True
+    def _set_drift(self, ppm: str) -> None:
+        rate = 1.0 + float(ppm) * 1e-6
+        self._elapsed, self._born = self.now(), self._clock.now()
+        self._rate = rate
+
+    def _block(self, blocked: bool) -> None:
+        self._blocked = blocked
+
+    def _set_frequency(self, hertz: str) -> None:
+        self.frequency = float(hertz)
 
     def _cover(self, begin: str, end: str, cover: Callable[[Array], Array]) -> None:
         first, last = math.radians(float(begin)), math.radians(float(end))
@@ -135,7 +131,7 @@ class TurningHead:
             raise ValueError(f"{begin}..{end} degrees")
         self._covers.append((first, last - first, cover))
 
-    def _covered(self, value: int, share: float = 1.0) -> Callable[[Array], Array]:
+    def _covered(self, value: int, share: float) -> Callable[[Array], Array]:
         least_code = 20  # ``cover`` values below are URG codes: no return; others are millimetres
         shown = 0.0 if value < least_code else value / 1000
         return lambda ranges: np.where(self._rng.random(len(ranges)) < share, shown, ranges)

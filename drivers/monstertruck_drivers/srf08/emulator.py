@@ -8,6 +8,7 @@ import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes, SonarSource
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_drivers.srf08.config import Srf08Config
 from monstertruck_drivers.srf08.protocol import (
@@ -21,7 +22,6 @@ from monstertruck_drivers.srf08.protocol import (
     ranging_time,
 )
 from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 ANSWER: Final = MILLISECOND
 """Duration of a command on USB and I2C (ns)."""
@@ -44,7 +44,7 @@ class Module:
     ghost: int | None = None
 
 
-class Srf08Emulator:
+class Srf08Emulator(FaultyDevice):
     """A USB-ISS with one SRF08 for each sonar of the settings.
 
     Faults (`inject`): ``silent on|off`` (the USB-ISS), ``dead NAME on|off`` (off the bus), ``stuck NAME on|off`` (the
@@ -73,7 +73,18 @@ class Srf08Emulator:
         kinds |= dict.fromkeys([f"{order}_{name}" for order in ("gain", "range") for name in names], SignalKind.ORDER)
         kinds |= dict.fromkeys([f"ping_{name}" for name in names], SignalKind.SWITCH)
         self.signals = Signals(clock.now, kinds, self._rng)
-        self._silent = False
+        known = "|".join(names)
+        self.faults = FaultTable(
+            self.name,
+            {
+                "silent on|off": False,
+                f"dead {known} on|off": self._kill,
+                f"stuck {known} on|off": self._stick,
+                f"ghost {known} METRES|off": self._haunt,
+                f"brownout {known}": self._brown_out,
+                "extra": self._send_extra,
+            },
+        )
         self._i2c = False
         self._end: DeviceEnd | None = None
 
@@ -93,7 +104,7 @@ class Srf08Emulator:
                 command, buffer = buffer[:size], buffer[size:]
                 await self._clock.sleep_until(self._clock.now() + ANSWER)
                 answer = self._answer(command)
-                if not self._silent:
+                if not self.faults["silent"]:
                     end.write(answer)
 
     def power_cycle(self) -> None:
@@ -102,35 +113,27 @@ class Srf08Emulator:
         for module in self.modules.values():
             module.gain, module.range, module.busy_until, module.pending = 31, 255, 0, False
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault.
+    def _module(self, name: str) -> Module:
+        return {module.name: module for module in self.modules.values()}[name]
 
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        by_name = {module.name: module for module in self.modules.values()}
-        try:
-            match fault, values:
-                case "silent", (("on" | "off") as state,):
-                    self._silent = state == "on"
-                case "dead", (name, ("on" | "off") as state):
-                    by_name[name].dead = state == "on"
-                case "stuck", (name, ("on" | "off") as state):
-                    by_name[name].stuck = by_name[name].microseconds if state == "on" else None
-                case "ghost", (name, metres):
-                    by_name[name].ghost = None if metres == "off" else round(float(metres) * 2e6 / SOUND)
-                case "brownout", (name,):
-                    by_name[name].gain, by_name[name].range = 31, 255
-                case "extra", () if self._end is not None:
-                    self._end.write(b"\x00")
-                case _:
-                    raise ValueError("unknown")
-        except (ValueError, KeyError) as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: silent on|off, "
-                "dead NAME on|off, stuck NAME on|off, ghost NAME METRES|off, brownout NAME, extra; "
-                f"names: {', '.join(by_name)}"
-            ) from error
+    def _kill(self, name: str, dead: bool) -> None:
+        self._module(name).dead = dead
+
+    def _stick(self, name: str, stuck: bool) -> None:
+        module = self._module(name)
+        module.stuck = module.microseconds if stuck else None
+
+    def _haunt(self, name: str, metres: str) -> None:
+        self._module(name).ghost = None if metres == "off" else round(float(metres) * 2e6 / SOUND)
+
+    def _brown_out(self, name: str) -> None:
+        module = self._module(name)
+        module.gain, module.range = 31, 255
+
+    def _send_extra(self) -> None:
+        if self._end is None:
+            raise ValueError("no host")
+        self._end.write(b"\x00")
 
     def _answer(self, command: bytes) -> bytes:
         if command[0] == ISS:

@@ -1,8 +1,10 @@
-"""Requests and replies, with a USB-ISS and the sonars behind it; shared by driver and probe."""
+"""Requests and replies, with a USB-ISS and the sonars behind it; shared by the driver and `identify`."""
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.srf08 import protocol
-from monstertruck_drivers.srf08.protocol import ACK, MODULE, READ_SIZE, Srf08Reading
+from monstertruck_drivers.srf08.config import Srf08Config
+from monstertruck_drivers.srf08.protocol import ACK, ADDRESSES, MODULE, READ_SIZE, Srf08Reading
+from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 
 
@@ -70,3 +72,21 @@ class Srf08Session:
     async def read(self, address: int) -> Srf08Reading:
         """Registers of a module."""
         return protocol.parse_reading(await self.ask(protocol.read(address), READ_SIZE))
+
+
+async def identify(link: Link, clock: Clock, settings: Srf08Config) -> dict[str, object]:
+    """Ask the USB-ISS for its version, and every address for its software revision.
+
+    Returns:
+        JSON-able: ``firmware`` of the USB-ISS, ``sonars`` (address to software revision).
+
+    Raises:
+        DeviceError: as the driver's ``run``.
+    """
+    session = Srf08Session(link, settings.timeout)
+    firmware = await session.start()
+    readings = {address: await session.read(address) for address in ADDRESSES}
+    return {
+        "firmware": firmware,
+        "sonars": {str(address): reading.revision for address, reading in readings.items() if reading.present},
+    }

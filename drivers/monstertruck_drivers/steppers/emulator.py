@@ -15,6 +15,7 @@ from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.disobedience import USAGE, DisobedientMotor
 from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ReceivedBytes
 from monstertruck_drivers.epos.firmware import FreeMotor
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice, LateAnswers
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_drivers.steppers.protocol import (
     MAX_RATE,
@@ -32,7 +33,6 @@ from monstertruck_drivers.steppers.protocol import (
     wrapped,
 )
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 TICK_US: Final = 10
 """Timer period, microseconds."""
@@ -40,7 +40,7 @@ COASTING: Final = 1e6
 """Deceleration of a rotor without current, from friction of its gear and wheel (rpm/s)."""
 
 
-class StepperEmulator:
+class StepperEmulator(FaultyDevice):
     """The controller with its motors.
 
     Faults (``inject``): ``overload MOTOR on|off`` (the rotor blocks), ``silent on|off`` (gives no answers), ``late
@@ -74,9 +74,18 @@ class StepperEmulator:
         self._identity = Identity(NAME, VERSION, motors, steps_per_turn, TICK_US)
         self._plants = [*plants, *(FreeMotor() for _ in range(motors - len(plants)))][:motors]
         self._held = [False] * motors
-        self._silent = False
-        self._late: list[float] = []
-        self._noise = 0
+        self._late = LateAnswers()
+        self.faults = FaultTable(
+            self.name,
+            {
+                "overload MOTOR on|off": self._overload,
+                "silent on|off": False,
+                "late SECONDS [COUNT]": self._late.start,
+                "noise COUNT": 0,
+                "reset": self.power_cycle,
+                f"runaway {USAGE}": self._run_away,
+            },
+        )
         self._runaway: DisobedientMotor | None = None
         self._fed_again = asyncio.Event()
         self._boot()
@@ -102,35 +111,13 @@ class StepperEmulator:
         self._boot()
         self._fed_again.set()
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault, see the class.
+    def _overload(self, motor: str, held: bool) -> None:
+        self._held[int(motor) - 1] = held
+        self._drive()
 
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        try:
-            match fault, values:
-                case "overload", (motor, ("on" | "off") as word):
-                    self._held[int(motor) - 1] = word == "on"
-                    self._drive()
-                case "silent", (("on" | "off") as word,):
-                    self._silent = word == "on"
-                case "late", (seconds, *count):
-                    self._late = [float(seconds)] * int(*count or ("1",))
-                case "noise", (count,):
-                    self._noise = int(count)
-                case "reset", ():
-                    self.power_cycle()
-                case "runaway", words:
-                    self._runaway = DisobedientMotor.parse(*words)
-                    self._turn(self._asked, self._acceleration)
-                case _:
-                    raise ValueError(fault)
-        except (ValueError, IndexError, TypeError) as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: overload MOTOR on|off, "
-                f"silent on|off, late SECONDS [COUNT], noise COUNT, reset, runaway {USAGE}"
-            ) from error
+    def _run_away(self, *words: str) -> None:
+        self._runaway = DisobedientMotor.parse(*words)
+        self._turn(self._asked, self._acceleration)
 
     async def run(self, end: DeviceEnd) -> None:
         """Serve until cancelled."""
@@ -147,13 +134,12 @@ class StepperEmulator:
             reply = self._obey(line)
         except LineError:
             reply = Line("e", line.seq, (str(int(RefusalCode.ARGUMENTS)),))
-        if self._silent:
+        if self.faults["silent"]:
             return
         data = bytes(reply)
-        if self._noise > 0:
-            self._noise -= 1
+        if self.faults.strikes("noise"):
             data = data[:3] + bytes((data[3] ^ 0x04,)) + data[4:]
-        end.write(data, self._late.pop() if self._late else 0.0005)  # seconds from the end of a line to its answer
+        end.write(data, self._late.take(0.0005))  # seconds from the end of a line to its answer
 
     def _obey(self, line: Line) -> Line:
         verbs: dict[str, Callable[[Line], RefusalCode | None]] = {

@@ -1,8 +1,9 @@
-"""Requests and replies, with the controller over one open link; shared by driver and probe."""
+"""Requests and replies, with the controller over one open link; shared by the driver and `identify`."""
 
 from typing import Final
 
 from monstertruck_drivers.link import Link
+from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_drivers.steppers.protocol import (
     NAME,
     SEQUENCES,
@@ -131,3 +132,28 @@ def _reason(answer: Line) -> tuple[int, str]:
     except ValueError:
         return 0, " ".join(answer.words)
     return code, code.name.lower()
+
+
+async def identify(link: Link, clock: Clock, settings: StepperConfig) -> dict[str, object]:
+    """Read the identity and one status, without moving or changing anything.
+
+    Returns:
+        JSON-able: ``version``, ``motors``, ``steps_per_turn``, ``state``, ``bad_lines``, ``uptime_s``, ``positions``
+        (steps), ``rates`` (steps/s).
+
+    Raises:
+        DeviceError: as the driver's ``run``.
+    """
+    session = StepperSession(link, clock, settings.answer_timeout)
+    identity = await session.identify()
+    status = await session.status("S", identity.motors, attempts=ASK_ATTEMPTS)
+    return {
+        "version": identity.version,
+        "motors": identity.motors,
+        "steps_per_turn": identity.steps_per_turn,
+        "state": status.state.name.lower(),
+        "bad_lines": status.bad_lines,
+        "uptime_s": status.uptime_ms / 1000,
+        "positions": list(status.positions),
+        "rates": [rate / 1000 for rate in status.rates],
+    }

@@ -17,6 +17,7 @@ from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.disobedience import USAGE, DisobedientMotor
 from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ReceivedBytes, ServoPlant
 from monstertruck_drivers.epos.firmware import FreeMotor
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice, LateAnswers
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_drivers.vesc.config import VescConfig
 from monstertruck_drivers.vesc.protocol import (
@@ -32,7 +33,6 @@ from monstertruck_drivers.vesc.protocol import (
     wrapped,
 )
 from monstertruck_runtime.clock import MILLISECOND, SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 FACTORY: Final = WatchdogSetting(1000, 0.0)
 """Watchdog as delivered."""
@@ -175,7 +175,7 @@ class EmulatedController:
         self._plant.command(now, rpm, acceleration)
 
 
-class VescEmulator:
+class VescEmulator(FaultyDevice):
     """All controllers on one port.
 
     Faults (``inject``): ``silent on|off`` (gives no answers), ``late SECONDS [COUNT]`` (answers), ``noise COUNT`` (the
@@ -214,9 +214,19 @@ class VescEmulator:
         """Position of the servo output; None = no pulses yet."""
         self._clock = clock
         self._servos = servos
-        self._silent, self._no_store = False, False
-        self._late: list[float] = []
-        self._noise = 0
+        self._late = LateAnswers()
+        self.faults = FaultTable(
+            self.name,
+            {
+                "silent|no_store on|off": False,
+                "late SECONDS [COUNT]": self._late.start,
+                "noise COUNT": 0,
+                "reset": self.power_cycle,
+                "fault CODE [MOTOR]": self._fail,
+                "firmware MAJOR MINOR": self._set_version,
+                f"runaway {USAGE}": self._run_away,
+            },
+        )
         self._version = (6, 5)
         self._awake_at = 0
         self._deframer = Deframer()
@@ -250,41 +260,17 @@ class VescEmulator:
         for controller in self.controllers:
             controller.restart()
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault, see the class.
+    def _fail(self, code: str, motor: str = "1") -> None:
+        self.controllers[int(motor) - 1].fail(int(code))
 
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        try:
-            match fault, values:
-                case "silent", (("on" | "off") as word,):
-                    self._silent = word == "on"
-                case "no_store", (("on" | "off") as word,):
-                    self._no_store = word == "on"
-                case "late", (seconds, *count):
-                    self._late = [float(seconds)] * int(*count or ("1",))
-                case "noise", (count,):
-                    self._noise = int(count)
-                case "fault", (code, *motor):
-                    self.controllers[int(*motor or ("1",)) - 1].fail(int(code))
-                case "firmware", (major, minor):
-                    self._version = int(major), int(minor)
-                case "reset", ():
-                    self.power_cycle()
-                case "runaway", words:
-                    runaway = DisobedientMotor.parse(*words)
-                    for controller in self.controllers:
-                        controller.runaway = runaway
-                        controller.obey_again()
-                case _:
-                    raise ValueError(fault)
-        except (ValueError, IndexError, TypeError) as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: silent on|off, late SECONDS "
-                "[COUNT], noise COUNT, reset, fault CODE [MOTOR], no_store on|off, firmware MAJOR MINOR, runaway "
-                f"{USAGE}"
-            ) from error
+    def _set_version(self, major: str, minor: str) -> None:
+        self._version = int(major), int(minor)
+
+    def _run_away(self, *words: str) -> None:
+        runaway = DisobedientMotor.parse(*words)
+        for controller in self.controllers:
+            controller.runaway = runaway
+            controller.obey_again()
 
     async def run(self, end: DeviceEnd) -> None:
         """Serve until cancelled."""
@@ -338,7 +324,7 @@ class VescEmulator:
             case PacketId.GET_APPCONF:
                 return controller.settings()
             case PacketId.SET_APPCONF_NO_STORE:
-                taken = not self._no_store and controller.apply(payload)
+                taken = not self.faults["no_store"] and controller.apply(payload)
                 return bytes((PacketId.SET_APPCONF_NO_STORE,)) if taken else None
             case PacketId.ALIVE:
                 controller.feed()
@@ -364,13 +350,12 @@ class VescEmulator:
         controller.feed()
 
     def _send(self, end: DeviceEnd, answer: bytes, delay: float) -> None:
-        if self._silent:
+        if self.faults["silent"]:
             return
         data = frame(answer)
-        if self._noise > 0:
-            self._noise -= 1
+        if self.faults.strikes("noise"):
             data = data[:-4] + bytes((data[-4] ^ 0x10,)) + data[-3:]
-        end.write(data, self._late.pop() if self._late else delay)
+        end.write(data, self._late.take(delay))
 
 
 def _limited(value: float, limit: float) -> float:

@@ -1,9 +1,10 @@
-"""Requests and answers, with VESCs over one open link; shared by driver and probe."""
+"""Requests and answers, with VESCs over one open link; shared by the driver and `identify`."""
 
 from collections.abc import Callable
 from typing import Final
 
 from monstertruck_drivers.link import Link
+from monstertruck_drivers.vesc.config import VescConfig
 from monstertruck_drivers.vesc.protocol import (
     OLDEST_FIRMWARE,
     Deframer,
@@ -12,6 +13,7 @@ from monstertruck_drivers.vesc.protocol import (
     PacketError,
     PacketId,
     WatchdogSetting,
+    fault_text,
     forwarded,
     frame,
     request,
@@ -166,3 +168,33 @@ def _equal(found: WatchdogSetting, wanted: WatchdogSetting) -> bool:
     """Whether settings are the same, as single-precision numbers carry them."""
     close = abs(found.brake_current - wanted.brake_current) < 1e-3 * wanted.brake_current
     return found.milliseconds == wanted.milliseconds and close
+
+
+async def identify(link: Link, clock: Clock, settings: VescConfig) -> dict[str, object]:
+    """Read identity and values of every configured controller, without moving or changing anything.
+
+    Returns:
+        JSON-able: for each of ``motors`` its ``can_id``, ``hardware``, ``firmware``, ``serial``, ``erpm``,
+        ``tachometer``, ``volts``, ``fault``.
+
+    Raises:
+        DeviceError: as the driver's ``run``.
+    """
+    session = VescSession(link, clock, settings.answer_timeout)
+    found = []
+    for motor in settings.motors:
+        identity = await session.identify(motor.can_id)
+        values = await session.values(motor.can_id, ATTEMPTS)
+        found.append(
+            {
+                "can_id": values.controller_id,
+                "hardware": identity.hardware,
+                "firmware": f"{identity.major}.{identity.minor:02}",
+                "serial": identity.serial.hex(),
+                "erpm": values.erpm,
+                "tachometer": values.tachometer,
+                "volts": values.volts,
+                "fault": fault_text(values.fault),
+            }
+        )
+    return {"motors": found}

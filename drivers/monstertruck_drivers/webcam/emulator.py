@@ -12,11 +12,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from monstertruck_drivers.cable import DeviceEnd, EmulatedPort
 from monstertruck_drivers.emulation import EmulatorSetup, ViewSource
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_drivers.webcam.packets import CameraPacket, PacketKind, encode_mode
 from monstertruck_drivers.webcam.source import Mode
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
-from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.threads import Offload, in_thread
 
 FONT_SIZE: Final = 20
@@ -52,7 +52,7 @@ SIGNALS: Final = {
 REFUSALS: Final = {"EINVAL": errno.EINVAL, "EBUSY": errno.EBUSY, "ENOSPC": errno.ENOSPC, "off": 0}
 
 
-class WebcamEmulator:
+class WebcamEmulator(FaultyDevice):
     """Camera that streams rendered JPEGs while a host requests them.
 
     The world is asked on the loop; drawing and compressing happens in ``offload``.
@@ -84,10 +84,16 @@ class WebcamEmulator:
         self._view = view
         self._offload = offload
         self._wanted = asyncio.Event()
-        self._to_damage = {"drop": 0, "corrupt": 0, "truncate": 0}
-        self._bare = False
-        self._stuck = False
-        self._jump = 0
+        self.faults = FaultTable(
+            self.name,
+            {
+                "drop|corrupt|truncate N": 0,
+                "bare|stuck on|off": False,
+                "jump SECONDS": 0.0,
+                "refuse EINVAL|EBUSY|ENOSPC|off": self._refuse,
+                "vanish [SECONDS]": self._vanish,
+            },
+        )
         self._refusal = 0
         self.power_cycle()
 
@@ -106,35 +112,8 @@ class WebcamEmulator:
             group.create_task(self._listen(end))
             group.create_task(self._stream(end))
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start a fault, see the class.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        try:
-            match fault, values:
-                case (("drop" | "corrupt" | "truncate"), (count,)):
-                    self._to_damage[fault] = int(count)
-                case "bare", (("on" | "off") as state,):
-                    self._bare = state == "on"
-                case "stuck", (("on" | "off") as state,):
-                    self._stuck = state == "on"
-                case "jump", (seconds,):
-                    self._jump = round(float(seconds) * SECOND)
-                case "refuse", (("EINVAL" | "EBUSY" | "ENOSPC" | "off") as how,):
-                    self._refusal = REFUSALS[how]
-                case "vanish", ():
-                    self._vanish(0.5)
-                case "vanish", (seconds,):
-                    self._vanish(float(seconds))
-                case _:
-                    raise ValueError("unknown")
-        except ValueError as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: drop|corrupt|truncate N, "
-                "bare|stuck on|off, jump SECONDS, refuse EINVAL|EBUSY|ENOSPC|off, vanish [SECONDS]"
-            ) from error
+    def _refuse(self, how: str) -> None:
+        self._refusal = REFUSALS[how]
 
     # Serving
 
@@ -180,43 +159,38 @@ class WebcamEmulator:
                     await self._expose(end, stamp)
 
     async def _expose(self, end: DeviceEnd, stamp: int) -> None:
-        if self._stuck:
+        if self.faults["stuck"]:
             return
         number = self._sequence
         self._sequence += 1
-        if self._uses_up("drop"):
+        if self.faults.strikes("drop"):
             return
         draw = self.signals.report("image", self._view.exposure(stamp, self._size))
         stamp = self.signals.report("stamp", stamp)
         data = self._damaged(await self._offload(lambda: jpeg(draw(), number)))
-        packet = CameraPacket(PacketKind.PICTURE, number, stamp + self._jump, data).encode()
+        packet = CameraPacket(PacketKind.PICTURE, number, stamp + round(self.faults["jump"] * SECOND), data).encode()
         chunk = 4095  # bytes written at a time: as many as the reader of a pty gets in one go
         for at in range(0, len(packet), chunk):
             await self._clock.sleep(0.0002)  # s
             end.write(packet[at : at + chunk])
 
     def _damaged(self, data: bytes) -> bytes:
-        if self._bare:
+        if self.faults["bare"]:
             # Four segments, of one table each, as the encoder writes them.
             head, _, tail = data.partition(b"\xff\xc4")
             data = head + tail[tail.index(b"\xff\xda") :]
-        if self._uses_up("corrupt"):
+        if self.faults.strikes("corrupt"):
             data = bytes(4) + data[4:]
-        if self._uses_up("truncate"):
+        if self.faults.strikes("truncate"):
             data = data[: len(data) // 2]
         return data
 
-    def _uses_up(self, fault: str) -> bool:
-        left = self._to_damage[fault]
-        self._to_damage[fault] = max(0, left - 1)
-        return left > 0
-
-    def _vanish(self, seconds: float) -> None:
+    def _vanish(self, seconds: str = "0.5") -> None:
         if self.usb is None:
             self.power_cycle()
         else:
             self.usb.unplug()
-            asyncio.get_running_loop().call_later(seconds, self.usb.plug)
+            asyncio.get_running_loop().call_later(float(seconds), self.usb.plug)
 
 
 def emulated(setup: EmulatorSetup) -> WebcamEmulator:

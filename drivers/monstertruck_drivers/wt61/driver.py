@@ -137,3 +137,20 @@ class Wt61Driver:
                 temperature=samples[-1][0].celsius,
             )
         )
+
+
+async def identify(link: Link, clock: Clock, settings: Wt61Config) -> dict[str, object]:
+    """Wait for one measurement.
+
+    Returns:
+        JSON-able: ``angular_velocity`` (rad/s), ``acceleration`` (m/s^2), ``temperature_c``.
+
+    Raises:
+        DeviceError: as the driver's ``run``.
+    """
+    force, rate = (await Wt61Session(link, clock).start())[-1]
+    return {
+        "angular_velocity": rate.angular_velocity,
+        "acceleration": force.acceleration,
+        "temperature_c": force.celsius,
+    }

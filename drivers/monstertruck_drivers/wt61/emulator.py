@@ -7,10 +7,10 @@ import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ImuSource, ReceivedBytes
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_drivers.wt61.protocol import RATE, TOGGLE_SLEEP, WT61_BAUD, Wt61Kind, Wt61Packet, build, measured
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 REPORTED: Final = (
     *(f"{kind.name.lower()}_{axis}" for kind in (Wt61Kind.ACCELERATION, Wt61Kind.ANGULAR_VELOCITY) for axis in "xyz"),
@@ -20,7 +20,7 @@ REPORTED: Final = (
 SLEEP: Final = "toggle_sleep"
 
 
-class Wt61Emulator:
+class Wt61Emulator(FaultyDevice):
     """WT61 that streams from power-up on.
 
     Faults (`inject`): ``frozen on|off`` (repeats the same packets), ``silent on|off``, ``asleep on|off``
@@ -42,9 +42,14 @@ class Wt61Emulator:
         self._rng = np.random.default_rng(seed)
         kinds = dict.fromkeys(REPORTED, SignalKind.NUMBER) | {SLEEP: SignalKind.SWITCH}
         self.signals = Signals(clock.now, kinds, self._rng)
-        self._faults = {"frozen": False, "silent": False, "inverted": False, "asleep": False}
-        self._bad_checksums = 0
-        self._torn = True
+        self.faults = FaultTable(
+            self.name,
+            {
+                "frozen|silent|inverted|asleep on|off": False,
+                "bad_checksum N": 0,
+                "half_packet": 0,
+            },
+        )
         self._last = b""
         self._awake_at = 0
 
@@ -61,54 +66,34 @@ class Wt61Emulator:
                     self.signals.order(SLEEP, None, self._toggle_sleep)
 
     def _toggle_sleep(self, _: None) -> None:
-        self._faults["asleep"] = not self._faults["asleep"]
+        self.faults["asleep"] = not self.faults["asleep"]
 
     def power_cycle(self) -> None:
         """Supply off and on: it is awake again."""
-        self._faults["asleep"] = False
-        self._torn = True
+        self.faults["asleep"] = False
+        self.faults["half_packet"] = 1
         self._awake_at = self._clock.now() + 300_000_000  # nanoseconds from power-up to the first packet
-
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        match fault, values:
-            case _, (("on" | "off") as state,) if fault in self._faults:
-                self._faults[fault] = state == "on"
-            case "bad_checksum", (count,) if count.isdigit():
-                self._bad_checksums = int(count)
-            case "half_packet", ():
-                self._torn = True
-            case _:
-                raise InputError(
-                    f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: frozen on|off, "
-                    "silent on|off, asleep on|off, inverted on|off, bad_checksum N, half_packet"
-                )
 
     async def _stream(self, end: DeviceEnd) -> None:
         due = self._clock.now()
         while True:
             due += SECOND // RATE
             await self._clock.sleep_until(due)
-            if due < self._awake_at or self._faults["silent"] or self._faults["asleep"]:
+            if due < self._awake_at or self.faults["silent"] or self.faults["asleep"]:
                 continue
-            if not (self._faults["frozen"] and self._last):
+            if not (self.faults["frozen"] and self._last):
                 self._last = self._packets(due)
             data = self._last
-            if self._bad_checksums:
-                self._bad_checksums -= 1
+            if self.faults.strikes("bad_checksum"):
                 data = data[:15] + bytes((data[15] ^ 0x10,)) + data[16:]
-            if self._torn:
-                self._torn, data = False, data[5:]
+            if self.faults.strikes("half_packet"):
+                data = data[5:]
             end.write(data)
 
     def _packets(self, now: int) -> bytes:
         reading = self._source.imu(now)
         x, y, z = reading.angular_velocity
-        if self._faults["inverted"]:
+        if self.faults["inverted"]:
             z = -z
         force = measured(Wt61Kind.ACCELERATION, reading.acceleration, reading.temperature_c)
         rate = measured(Wt61Kind.ANGULAR_VELOCITY, (x, y, z), reading.temperature_c)

@@ -117,7 +117,7 @@ def probe(
             where = TcpPort(*address)
         elif port is not None:
             where = SerialPort(port, baud or kind.baud or BAUD, framing=kind.framing or "8N1")
-        return await kind.probe_function()(where, clock, None)
+        return await kind.identify(where, clock)
 
     report = run_wall(main)
     found = [entry for entries in report.values() if isinstance(entries, list) for entry in entries]

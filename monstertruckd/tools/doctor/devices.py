@@ -157,7 +157,7 @@ async def _handshake(context: HostContext, role: str, device: Device[Schema], pl
     timeout = 15.0  # seconds for one device's whole answer; a scanner that measures has to be stopped first
     try:
         async with context.computer.machine.clock.deadline(timeout):
-            answer = await _probe(context, role, device, kind, place)
+            answer = await _identify(context, role, device, kind, place)
     except TimeoutError:
         return fail(check, Reason.DEVICE_TIMEOUT, f"no complete answer within {timeout:g} s", again)
     except PortBusyError as error:
@@ -171,12 +171,12 @@ async def _handshake(context: HostContext, role: str, device: Device[Schema], pl
     return fine(check, f"{kind.doc} answers")
 
 
-async def _probe(
+async def _identify(
     context: HostContext, role: str, device: Device[Schema], kind: DeviceKind, place: str
 ) -> dict[str, Any]:
     port, machine = device.port, context.computer.machine
     if kind.opens == "video":
-        return await kind.probe_function()(place, machine.clock, device.driver)
+        return await kind.identify(place, machine.clock, device.driver)
     line: Port
     match port:
         case PortConfig() if kind.opens == "i2c":
@@ -190,4 +190,4 @@ async def _probe(
         case _:
             framing = port.framing or "8N1"
             line = machine.serial(Path(place), port.baud or BAUD, dtr=port.dtr, rts=port.rts, framing=framing)
-    return await kind.probe_function()(line, machine.clock, device.driver)
+    return await kind.identify(line, machine.clock, device.driver)

@@ -14,6 +14,7 @@ from monstertruck_drivers.catalog import DEVICES, LIDAR, RESERVED, DeviceKind, D
 from monstertruck_drivers.config import Device, Devices, Monitors, _Devices, _Monitors
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_runtime.errors import ConfigError, InputError
+from monstertruck_runtime.plugins import load
 from monstertruck_runtime.ports import Publisher, Subscription
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Schema, field_docs
@@ -44,11 +45,12 @@ def test_a_driver_takes_the_ends_of_its_roles_topics(kind: DeviceKind):
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
-def test_every_kind_has_an_emulator_and_a_probe(kind: DeviceKind):
+def test_every_kind_has_an_emulator_and_identifies_its_device(kind: DeviceKind):
     emulator = get_type_hints(kind.emulator_factory())["return"]
     assert hasattr(emulator, "run")
     assert hasattr(emulator, "inject")
-    assert "settings" in kind.probe_function().__annotations__
+    taken = get_type_hints(load(kind.identity))["settings"]
+    assert issubclass(kind.settings_class(), taken)
 
 
 def test_devices_start_behind_a_hub_in_the_order_of_their_rows():

@@ -9,8 +9,8 @@ from pydantic import ValidationError
 from monstertruck_drivers.arduino_bridge.config import ArduinoBridgeConfig
 from monstertruck_drivers.arduino_bridge.driver import ArduinoBridgeDriver, setpoint_of
 from monstertruck_drivers.arduino_bridge.emulator import ArduinoBridgeEmulator
-from monstertruck_drivers.arduino_bridge.probe import probe
 from monstertruck_drivers.arduino_bridge.protocol import BOARD_BAUD, pwm, speeds
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import (
@@ -277,7 +277,7 @@ def test_one_byte_at_a_time_and_half_a_command_of_a_dead_host():
         rig.port.device.faults.chunk = 1
         async with rig.driving():
             await rig.outs[0].count(20)
-        assert (await probe(rig.port, rig.clock, QUICK))["counts"] == [0, 0]
+        assert (await DEVICES["arduino_bridge"].identify(rig.port, rig.clock, QUICK))["counts"] == [0, 0]
 
     on_bench(test)
 

@@ -6,8 +6,8 @@ import pytest
 
 from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import AlarmConfig
-from monstertruck_drivers.ax12.probe import probe
 from monstertruck_drivers.cable import MemoryPort
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import (
     DeviceLostError,
@@ -360,7 +360,7 @@ def test_a_bit_that_comes_and_goes_is_reported_once():
 def test_probe_describes_and_moves_nothing(echo: bool):
     async def test(rig: Rig) -> None:
         rig.unit(4).put(p.STATUS_LEVEL, 0)
-        found = await probe(rig.port, rig.clock)
+        found = await DEVICES["ax12"].identify(rig.port, rig.clock)
         assert found["echo"] is echo
         assert [unit["id"] for unit in found["units"]] == [1, 2, 4]
         assert found["units"][0] == {
@@ -385,11 +385,11 @@ def test_probe_describes_and_moves_nothing(echo: bool):
 def test_probe_of_nothing_and_of_others():
     async def silent(rig: Rig) -> None:
         with pytest.raises(DeviceTimeoutError, match="silence"):
-            await probe(rig.port, rig.clock)
+            await DEVICES["ax12"].identify(rig.port, rig.clock)
 
     async def other(rig: Rig) -> None:
         with pytest.raises(WrongDeviceError, match="bytes, but no answer"):
-            await probe(rig.port, rig.clock)
+            await DEVICES["ax12"].identify(rig.port, rig.clock)
 
     on_bench(silent, ids=())
     on_bench(other, ids=(1, 1, 1))
@@ -400,7 +400,7 @@ def test_the_port_has_one_owner():
         async with rig.driving():
             await rig.settle(0.1)
             with pytest.raises(PortBusyError):
-                await probe(rig.port, rig.clock)
+                await DEVICES["ax12"].identify(rig.port, rig.clock)
 
     on_bench(test)
 
@@ -408,6 +408,6 @@ def test_the_port_has_one_owner():
 def test_nothing_plugged_in():
     async def main(clock: VirtualClock) -> None:
         with pytest.raises(DeviceLostError, match="not plugged in"):
-            await probe(MemoryPort("/dev/test"), clock)
+            await DEVICES["ax12"].identify(MemoryPort("/dev/test"), clock)
 
     run_virtual(main)

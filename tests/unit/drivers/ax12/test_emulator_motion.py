@@ -237,11 +237,20 @@ def test_the_past_of_a_shaft_can_be_asked_for():
 
 
 @pytest.mark.parametrize(
-    "fault", [("nonsense",), ("block", "1"), ("block",), ("vanish", "x"), ("voltage", "much"), ("late",), ("power",)]
+    ("fault", "message"),
+    [
+        (("nonsense",), r"unknown fault 'nonsense'; known: power on\|off, "),
+        (("block", "1"), r"expected 'block ID on\|off', got 'block 1'"),
+        (("block",), "expected 'block ID"),
+        (("vanish", "x"), "expected 'vanish ID', got 'vanish x'"),
+        (("voltage", "much"), "expected 'voltage VOLTS"),
+        (("late",), "expected 'late SECONDS"),
+        (("power",), r"expected 'power on\|off', got 'power'"),
+    ],
 )
-def test_unknown_faults_are_refused_with_what_is_known(fault: tuple[str, ...]):
+def test_bad_faults_are_refused_with_what_was_expected(fault: tuple[str, ...], message: str):
     async def test(bus: Ax12Bus, _host, _clock) -> None:
-        with pytest.raises(InputError, match="not understood; known: vanish ID"):
+        with pytest.raises(InputError, match=message):
             bus.inject(*fault)
 
     on_wire(test)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from monstertruck_drivers.battery import iio
-from monstertruck_drivers.battery.probe import probe
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import (
     DeviceError,
@@ -116,7 +116,7 @@ def test_garbage_is_no_number(tmp_path: Path):
 
 async def test_the_probe_lists_readings_and_what_is_wrong(tmp_path: Path):
     converter(tmp_path / iio.CONVERTERS, in_voltage0_raw="500", in_voltage_scale="2", in_voltage3_raw="-")
-    found = await probe(emulated_computer(tmp_path, WallClock()), WallClock())
+    found = await DEVICES["iio"].identify(emulated_computer(tmp_path, WallClock()), WallClock())
     (one,) = found["converters"]
     assert one["name"] == "ads1015"
     good, bad = one["channels"]

@@ -11,9 +11,9 @@ from adafruit_bno08x_rvc import BNO08x_RVC
 from monstertruck_drivers.bno085.config import Bno085Config
 from monstertruck_drivers.bno085.driver import Bno085Driver, body_rates
 from monstertruck_drivers.bno085.emulator import Bno085Emulator
-from monstertruck_drivers.bno085.probe import probe
 from monstertruck_drivers.bno085.protocol import BNO085_BAUD, measured
 from monstertruck_drivers.cable import PtyPort
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.emulation import ImuReading
 from monstertruck_drivers.inertial import ImuCorrection
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
@@ -190,7 +190,7 @@ def test_a_stranger_and_an_unknown_fault_are_refused():
 
 def test_the_probe_says_what_it_measures():
     async def test(rig):
-        found = await probe(rig.port, rig.clock)
+        found = await DEVICES["bno085"].identify(rig.port, rig.clock)
         assert found["pitch_deg"] == pytest.approx(degrees(TILT), abs=0.5)
 
     on_bench(test)

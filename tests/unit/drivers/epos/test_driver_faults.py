@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from monstertruck_drivers.cable import DeviceEnd, PtyPort
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
-from monstertruck_drivers.epos.probe import probe
 from monstertruck_drivers.epos.protocol import Control, Opcode, State
 from monstertruck_drivers.tty import SerialPort
 from monstertruck_runtime.clock import VirtualClock, WallClock, run_virtual
@@ -128,7 +128,7 @@ def test_another_device_on_the_port():
                 with pytest.raises(WrongDeviceError, match=r"no EPOS, sends"):
                     await rig.session()
                 with pytest.raises(WrongDeviceError, match=r"no EPOS, sends"):
-                    await probe(rig.port, clock)
+                    await DEVICES["epos"].identify(rig.port, clock)
             assert rig.ready_at == []
 
     run_virtual(main)
@@ -140,7 +140,7 @@ def test_a_device_that_never_answers():
         with pytest.raises(DeviceTimeoutError):
             await rig.session()
         with pytest.raises(DeviceTimeoutError):
-            await probe(rig.port, rig.clock)
+            await DEVICES["epos"].identify(rig.port, rig.clock)
 
     on_bench(test)
 
@@ -209,7 +209,7 @@ def test_probe_reports_and_changes_nothing():
     async def test(rig: Rig) -> None:
         rig.emulator.inject("fault", "over_voltage", "passing")
         await rig.settle(0.1)
-        report = await probe(rig.port, rig.clock)
+        report = await DEVICES["epos"].identify(rig.port, rig.clock)
         assert report["identity"]["software"] == 0x2024
         assert report["identity"]["serial_number"] == "6301602400001234"
         assert report["state"] == "FAULT"
@@ -228,7 +228,7 @@ def test_probe_copes_without_a_serial_number(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delitem(od.OBJECTS, (od.SERIAL_NUMBER.index, 0))
 
     async def test(rig: Rig) -> None:
-        assert (await probe(rig.port, rig.clock))["identity"]["serial_number"] is None
+        assert (await DEVICES["epos"].identify(rig.port, rig.clock))["identity"]["serial_number"] is None
 
     on_bench(test)
 

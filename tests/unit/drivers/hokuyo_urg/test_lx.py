@@ -14,12 +14,12 @@ import pytest
 from hokuyolx.exceptions import HokuyoStatusException
 
 from monstertruck_drivers.cable import SocketPort
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig, HokuyoLxConfig
 from monstertruck_drivers.hokuyo_urg.driver import HokuyoDriver
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
 from monstertruck_drivers.hokuyo_urg.lx_emulator import LxEmulator
 from monstertruck_drivers.hokuyo_urg.models import LX, UNRETURNED
-from monstertruck_drivers.hokuyo_urg.probe import probe_lx
 from monstertruck_drivers.hokuyo_urg.protocol import split_lx_ranges
 from monstertruck_drivers.tcp import PATIENCE, TcpPort, parse_address
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
@@ -162,8 +162,8 @@ def test_it_is_probed():
     async def main(clock: VirtualClock) -> None:
         rig = LxRig(clock)
         async with rig.plugged_in(rig.emulator.run(rig.port.device)):
-            said: Any = await probe_lx(rig.port, clock)
-        assert (said["device"], said["dialect"]) == ("hokuyo_lx", "SCIP 2.0")
+            said: Any = await DEVICES["hokuyo_lx"].identify(rig.port, clock)
+        assert said["dialect"] == "SCIP 2.0"
         assert said["identity"]["product"] == "UST-10LX"
         assert (said["scan"]["beams"], said["scan"]["valid"]) == (1081, 1081)
 
@@ -222,7 +222,7 @@ async def test_it_serves_one_client():
     async with served() as (rig, cable), rig.driving():
         await rig.out.count(1)
         with pytest.raises(DeviceError):
-            await probe_lx(TcpPort(*cable.address), WallClock())
+            await DEVICES["hokuyo_lx"].identify(TcpPort(*cable.address), WallClock())
         await rig.out.count(5)
         with pytest.raises(BusyError, match="another program serves"):
             SocketPort(*cable.address)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.cable import PtyPort
-from monstertruck_drivers.hokuyo_urg.probe import probe
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.tty import SerialPort
 from monstertruck_runtime.clock import VirtualClock, WallClock, run_virtual, run_wall
 from monstertruck_runtime.errors import DeviceTimeoutError
@@ -19,12 +19,12 @@ from tests.unit.drivers.hokuyo_urg.rig import Rig, bench
 def test_probe(state: str):
     async def main(clock: VirtualClock) -> tuple[dict[str, object], list[str]]:
         async with bench(clock, state=state) as rig:
-            found = await probe(rig.port, clock)
+            found = await DEVICES["hokuyo_urg"].identify(rig.port, clock)
             return found, list(rig.emulator.received)
 
     found, received = run_virtual(main)
     reported = json.loads(json.dumps(found))
-    assert reported["device"] == "hokuyo_urg"
+    assert reported["device"] == DEVICES["hokuyo_urg"].doc
     assert reported["dialect"] == "SCIP 2.0"
     assert reported["identity"]["serial"] == "H0706400"
     assert reported["parameters"]["last_step"] == 725
@@ -38,7 +38,7 @@ def test_probe(state: str):
 def test_probe_of_an_old_unit():
     async def main(clock: VirtualClock) -> tuple[dict[str, object], list[str]]:
         async with bench(clock, firmware="2.2.5") as rig:
-            return await probe(rig.port, clock), list(rig.emulator.received)
+            return await DEVICES["hokuyo_urg"].identify(rig.port, clock), list(rig.emulator.received)
 
     found, received = run_virtual(main)
     reported = json.loads(json.dumps(found))
@@ -55,7 +55,7 @@ def test_probe_where_nothing_is_seen():
 
     async def main(clock: VirtualClock) -> dict[str, object]:
         async with bench(clock, Blind()) as rig:
-            return await probe(rig.port, clock)
+            return await DEVICES["hokuyo_urg"].identify(rig.port, clock)
 
     scan = json.loads(json.dumps(run_virtual(main)))["scan"]
     assert (scan["valid"], scan["nearest_m"], scan["farthest_m"]) == (0, None, None)
@@ -65,7 +65,7 @@ def test_probe_of_silence():
     async def main(clock: VirtualClock) -> None:
         async with bench(clock) as rig:
             rig.port.device.faults.deaf = True
-            await probe(rig.port, clock)
+            await DEVICES["hokuyo_urg"].identify(rig.port, clock)
 
     with pytest.raises(DeviceTimeoutError):
         run_virtual(main)
@@ -76,7 +76,7 @@ def test_probe_then_drive_over_a_real_pty(tmp_path: Path):
         port = PtyPort(tmp_path / "lidar")
         async with bench(clock, port=port) as rig:
             rig.driver._port = SerialPort(tmp_path / "lidar")
-            found = await probe(rig.driver._port, clock)
+            found = await DEVICES["hokuyo_urg"].identify(rig.driver._port, clock)
             assert found["dialect"] == "SCIP 2.0"
             async with rig.driving(), asyncio.timeout(5):
                 await rig.out.total(3)

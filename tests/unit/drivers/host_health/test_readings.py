@@ -7,9 +7,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.computer import ROOT, Computer, disk_of
 from monstertruck_drivers.host_health.emulator import HostEmulator
-from monstertruck_drivers.host_health.probe import probe
 from monstertruck_drivers.host_health.readings import (
     Times,
     busy_share,
@@ -101,7 +101,7 @@ def test_a_disk_path_that_does_not_exist_yet_counts_as_its_parent(tmp_path: Path
 
 
 async def test_the_probe_on_this_computer():
-    found = await probe(Computer.at(ROOT, WallClock()), WallClock())
+    found = await DEVICES["host_health"].identify(Computer.at(ROOT, WallClock()), WallClock())
     assert found["cores"] >= 1
     assert found["daemon_memory"] > 1_000_000
     assert found["daemon_files"] > 2

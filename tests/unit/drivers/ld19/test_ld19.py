@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.ld19.config import Ld19Config
 from monstertruck_drivers.ld19.driver import Ld19Driver
 from monstertruck_drivers.ld19.emulator import Ld19Emulator
-from monstertruck_drivers.ld19.probe import probe
 from monstertruck_drivers.ld19.protocol import FULL_TURN, MODELS, POINTS
 from monstertruck_drivers.scanning.turns import MISSING
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
@@ -241,7 +241,7 @@ def test_another_device_is_refused(chatter):
 
 def test_probe_and_unknown_faults():
     async def test(rig: Rig) -> None:
-        found = await probe(rig.port, rig.clock)
+        found = await DEVICES["ld19"].identify(rig.port, rig.clock)
         assert "LD19" in found["device"]
         assert len(found["ranges_m"]) == POINTS
         with pytest.raises(InputError, match="known: silent"):

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.link_quality.emulator import HEADER, NetworkEmulator
 from monstertruck_drivers.link_quality.interfaces import Signal, choose, parse_wireless, read_interfaces
-from monstertruck_drivers.link_quality.probe import probe
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.health import LinkMedium
@@ -86,7 +86,7 @@ def test_the_choice(tmp_path: Path):
 
 async def test_the_probe(tmp_path: Path):
     NetworkEmulator(tmp_path, WallClock())
-    found = await probe(emulated_computer(tmp_path, WallClock()), WallClock())
+    found = await DEVICES["link_quality"].identify(emulated_computer(tmp_path, WallClock()), WallClock())
     assert found["chosen"] == "wlan0"
     assert [row["name"] for row in found["interfaces"]] == ["eth0", "wlan0"]
 

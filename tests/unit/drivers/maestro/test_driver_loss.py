@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.cable import DeviceEnd, MemoryPort, PtyPort
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.maestro.driver import MaestroDriver
 from monstertruck_drivers.maestro.emulator import MaestroEmulator
-from monstertruck_drivers.maestro.probe import probe
 from monstertruck_drivers.tty import SerialPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import (
@@ -220,7 +220,7 @@ def test_probe_reads_and_moves_nothing():
     async def test(rig: Rig) -> None:
         rig.emulator.inject("noise", "0")
         rig.gate.talking = False
-        found = await probe(rig.port, rig.clock)
+        found = await DEVICES["maestro"].identify(rig.port, rig.clock)
         assert found["errors"] == ["serial_signal"]
         assert found["channels"][5] == {"channel": 5, "if_servo_us": 122.75, "if_input_v": 2.4}
         assert b"\x84" not in bytes(rig.emulator.received)

@@ -6,12 +6,12 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.maestro.esc_config import EscConfig, MaestroEscConfig
 from monstertruck_drivers.maestro.esc_driver import MaestroEscDriver
 from monstertruck_drivers.maestro.esc_emulator import MaestroEscEmulator
-from monstertruck_drivers.maestro.probe import probe_esc
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import ConfigError, DeviceLostError, DeviceTimeoutError
 from monstertruck_runtime.mailbox import Mailbox, latest
@@ -173,7 +173,9 @@ def test_unplugged_it_starts_again_with_neutral_pulses():
 
 def test_the_probe_finds_the_unit():
     async def test(rig):
-        assert (await probe_esc(rig.port, rig.clock, CONFIG))["device"] == "Pololu Micro Maestro"
+        assert (await DEVICES["maestro_esc"].identify(rig.port, rig.clock, CONFIG))["device"] == DEVICES[
+            "maestro_esc"
+        ].doc
 
     on_bench(test)
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.cable import MemoryPort, SocketPort
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.command import CommandPort
 from monstertruck_drivers.mjpeg.config import MjpegConfig
 from monstertruck_drivers.mjpeg.driver import MjpegDriver
 from monstertruck_drivers.mjpeg.emulator import MjpegEmulator
-from monstertruck_drivers.mjpeg.probe import probe
 from monstertruck_drivers.tcp import TcpPort
 from monstertruck_runtime.clock import SECOND, WallClock, run_virtual
 from monstertruck_runtime.errors import (
@@ -158,7 +158,7 @@ def test_a_size_that_differs_is_reported_once():
         ((reason, _, text, _),) = rig.events.kept
         assert reason is Reason.DEVICE_MISMATCH
         assert "the camera gives 320x240 at 15 Hz, configured is 160x120" in text
-        assert (await probe(rig.port, rig.clock, rig.config))["width"] == 320
+        assert (await DEVICES["mjpeg"].identify(rig.port, rig.clock, rig.config))["width"] == 320
 
     on_bench(test, emulated=MjpegConfig(width=320, height=240))
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.cable import DeviceEnd, MemoryPort, PtyPort
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.os4000.driver import Os4000Driver
 from monstertruck_drivers.os4000.emulator import Os4000Emulator
-from monstertruck_drivers.os4000.probe import probe
 from monstertruck_drivers.os4000.protocol import frame
 from monstertruck_drivers.tty import SerialPort
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
@@ -340,7 +340,7 @@ def test_back_within_two_seconds_of_being_plugged_in_again():
 
 def test_probe_tells_what_is_there():
     async def test(rig: Rig) -> None:
-        found = json.loads(json.dumps(await probe(rig.port, rig.clock)))
+        found = json.loads(json.dumps(await DEVICES["os4000"].identify(rig.port, rig.clock)))
         assert found["rate"] == pytest.approx(20, abs=1)
         assert found["fields"] == ["heading", "pitch", "roll", "temperature", "field", "acceleration"]
         assert found["sample"]["heading_deg"] == 123.4

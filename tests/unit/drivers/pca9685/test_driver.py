@@ -4,10 +4,10 @@ import math
 
 import pytest
 
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.pca9685.config import Pca9685Config, Pca9685EscConfig
 from monstertruck_drivers.pca9685.emulator import Pca9685Emulator
 from monstertruck_drivers.pca9685.esc_driver import Pca9685EscDriver
-from monstertruck_drivers.pca9685.probe import probe, probe_esc
 from monstertruck_drivers.pca9685.protocol import PwmMode1, PwmRegister, pulse
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import ConfigError, DeviceLostError, DeviceTimeoutError, WrongDeviceError
@@ -177,12 +177,12 @@ def test_a_wrong_oscillator_moves_the_pulse_and_the_setting_puts_it_right():
 
 def test_the_probe_reads_and_changes_nothing():
     async def test(rig):
-        found = await probe(rig.port, rig.clock)
-        assert (found["device"], found["asleep"], found["prescaler"]) == ("NXP PCA9685", True, 30)
+        found = await DEVICES["pca9685"].identify(rig.port, rig.clock)
+        assert (found["asleep"], found["prescaler"]) == (True, 30)
         assert rig.emulator.transfer(0x40, bytes((PwmRegister.MODE1,)), 1)[0] & PwmMode1.SLEEP
         async with rig.driving():
             await rig.settle(4.0)
-        found = await probe_esc(rig.port, rig.clock, ESC)
+        found = await DEVICES["pca9685_esc"].identify(rig.port, rig.clock, ESC)
         assert found["frequency_hz"] == pytest.approx(50, abs=0.3)
         assert found["channels"][MOTOR] == pytest.approx(1500, abs=3)
 

@@ -14,7 +14,6 @@ from monstertruck_drivers.receiver.crsf import CrsfParser
 from monstertruck_drivers.receiver.driver import ReceiverDriver
 from monstertruck_drivers.receiver.emulator import ReceiverEmulator
 from monstertruck_drivers.receiver.frames import ReceiverFrame
-from monstertruck_drivers.receiver.probe import probe
 from monstertruck_drivers.receiver.protocol import (
     CENTRE,
     CHANNELS,
@@ -288,7 +287,7 @@ def test_a_stranger_and_an_unknown_fault_are_refused():
 def test_the_probe_says_what_the_receiver_hears(config):
     async def test(rig):
         rig.emulator.move(STICK, 1.0)
-        found = await probe(rig.port, rig.clock, config)
+        found = await DEVICES[config.kind].identify(rig.port, rig.clock, config)
         assert found["channels"][STICK - 1] == pytest.approx(1.0, abs=0.01)
         assert not found["failsafe"]
 
@@ -304,7 +303,7 @@ def test_without_settings_emulator_and_probe_of_a_kind_speak_its_protocol(name):
         emulator = kind.emulator_factory()(EmulatorSetup("hand", None, clock, None, port=port))
         async with background(emulator.run(port.device)):
             port.plug()
-            found = await kind.probe_function()(port, clock, None)
+            found = await kind.identify(port, clock)
         assert name.upper() in found["device"]
         assert found["channels"] is not None
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.roboclaw.config import RoboclawConfig
 from monstertruck_drivers.roboclaw.driver import RoboclawDriver
 from monstertruck_drivers.roboclaw.emulator import VERSION, RoboclawEmulator
-from monstertruck_drivers.roboclaw.probe import probe
 from monstertruck_drivers.roboclaw.protocol import (
     COUNTER,
     RoboclawCommand,
@@ -209,7 +209,7 @@ def test_half_a_request_of_a_dead_host_does_no_harm():
         async with await rig.port.open() as link:
             link.write(b"\x80")
             await asyncio.sleep(0.001)
-        found = await probe(rig.port, rig.clock)
+        found = await DEVICES["roboclaw"].identify(rig.port, rig.clock)
         assert found["version"] == VERSION.decode().partition("\n")[0]
         assert len(found["counts"]) == 2
 

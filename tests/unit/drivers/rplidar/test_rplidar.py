@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.config import Device
 from monstertruck_drivers.rplidar.config import RplidarConfig
 from monstertruck_drivers.rplidar.driver import RplidarDriver
 from monstertruck_drivers.rplidar.emulator import RplidarEmulator
-from monstertruck_drivers.rplidar.probe import probe
 from monstertruck_drivers.rplidar.protocol import (
     COUNTS,
     MODELS,
@@ -271,7 +271,7 @@ def test_another_device_is_refused(chatter):
 
 def test_another_unit_is_refused_probe_and_unknown_faults():
     async def test(rig: Rig) -> None:
-        found = await probe(rig.port, rig.clock)
+        found = await DEVICES["rplidar"].identify(rig.port, rig.clock)
         assert found["device"] == "SLAMTEC RPLIDAR, model 0x61"
         assert found["modes"] == {"Standard": 4608, "DenseBoost": 9217}
         assert found["typical"] == "DenseBoost"

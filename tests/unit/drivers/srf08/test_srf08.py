@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.srf08 import protocol
 from monstertruck_drivers.srf08.config import SonarConfig, Srf08Config, five_sonars
 from monstertruck_drivers.srf08.driver import Srf08Driver
 from monstertruck_drivers.srf08.emulator import Srf08Emulator
-from monstertruck_drivers.srf08.probe import probe
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import (
     DeviceLostError,
@@ -276,8 +276,9 @@ def test_another_device_is_refused():
 
 def test_probe_names_the_sonars_and_inject_the_faults():
     async def test(rig):
-        assert (await probe(rig.port, rig.clock))["sonars"] == dict.fromkeys(map(str, range(224, 234, 2)), 10)
-        with pytest.raises(InputError, match=r"known: silent .* names: l, fl"):
+        found = await DEVICES["srf08"].identify(rig.port, rig.clock)
+        assert found["sonars"] == dict.fromkeys(map(str, range(224, 234, 2)), 10)
+        with pytest.raises(InputError, match=r"expected 'dead l\|fl"):
             rig.emulator.inject("dead", "x", "on")
 
     on_bench(test)

@@ -7,9 +7,9 @@ import math
 import pytest
 
 from monstertruck_drivers.cable import MemoryPort
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.steppers.config import StepperConfig
 from monstertruck_drivers.steppers.driver import setpoint_of
-from monstertruck_drivers.steppers.probe import probe
 from monstertruck_drivers.steppers.protocol import Line, MotorState, Splitter, Status
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import (
@@ -171,7 +171,7 @@ def test_a_session_ends_with_motors_at_rest_and_off():
             await rig.settle(1.0)
         await rig.settle(0.1)
         assert rig.rotor(0) == 0
-        assert (await probe(rig.port, rig.clock))["state"] == "off"
+        assert (await DEVICES["steppers"].identify(rig.port, rig.clock))["state"] == "off"
 
     on_bench(test)
 
@@ -438,7 +438,7 @@ def test_unknown_faults_are_listed():
 
 def test_probe_tells_who_answers():
     async def test(rig):
-        report = await probe(rig.port, rig.clock)
+        report = await DEVICES["steppers"].identify(rig.port, rig.clock)
         assert (report["motors"], report["steps_per_turn"], report["positions"]) == (4, 400, [0, 0, 0, 0])
 
     on_bench(test)

@@ -7,10 +7,10 @@ import pytest
 from pydantic import ValidationError
 
 from monstertruck_drivers.battery.config import PackConfig
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.vesc.config import VescConfig, VescMotorConfig, VescServoConfig
 from monstertruck_drivers.vesc.driver import payload_of, setpoint_of
 from monstertruck_drivers.vesc.emulator import VescEmulator
-from monstertruck_drivers.vesc.probe import probe
 from monstertruck_drivers.vesc.protocol import WatchdogSetting, set_brake
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import (
@@ -436,7 +436,7 @@ def test_half_a_packet_of_a_dead_host_does_no_harm():
         async with await rig.port.open() as link:
             link.write(b"\x02\x05\x08\x00")
             await asyncio.sleep(0.01)
-        found = await probe(rig.port, rig.clock, rig.config)
+        found = await DEVICES["vesc"].identify(rig.port, rig.clock, rig.config)
         assert found["motors"][0]["firmware"] == "6.05"
         assert [motor["can_id"] for motor in found["motors"]] == [100, 7]
 

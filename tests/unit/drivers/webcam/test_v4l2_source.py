@@ -7,7 +7,8 @@ import threading
 import pytest
 
 from monstertruck_drivers.webcam import v4l2, v4l2_source
-from monstertruck_drivers.webcam.probe import probe
+from monstertruck_drivers.webcam.config import WebcamConfig
+from monstertruck_drivers.webcam.identity import identify
 from monstertruck_drivers.webcam.rendered_source import PathSource
 from monstertruck_drivers.webcam.source import Mode
 from monstertruck_drivers.webcam.v4l2_source import V4l2Source, find_node
@@ -156,7 +157,7 @@ async def test_the_nearest_mode_is_granted_and_a_fixed_rate_is_no_error():
 
 async def test_the_probe_lists_nodes_modes_and_errors():
     kernel = FakeKernel(video0=Node(), video1=metadata(), video2=Node(open_error=errno.EBUSY))
-    found = await probe("/dev/video*", WallClock(), None, kernel, inline)
+    found = await identify("/dev/video*", WallClock(), WebcamConfig(), kernel, inline)
     camera, meta, busy = found["nodes"]
     assert camera["card"] == "UVC Camera (046d:080a)"
     assert camera["formats"] == ["YUYV", "MJPG"]
@@ -174,9 +175,9 @@ async def test_an_enumeration_that_never_ends_is_cut_off():
         def _enum_fmt(self, node: Node, data: bytes) -> bytes:
             return data
 
-    assert (await probe("/dev/video*", WallClock(), None, Endless(video0=Node()), inline))["nodes"][0]["formats"] == [
-        ""
-    ] * 256
+    assert (await identify("/dev/video*", WallClock(), WebcamConfig(), Endless(video0=Node()), inline))["nodes"][0][
+        "formats"
+    ] == [""] * 256
 
 
 async def test_cancelled_while_the_kernel_is_slow_the_camera_is_let_go():

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from monstertruck_drivers.cable import DeviceEnd
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.emulation import ImuReading
 from monstertruck_drivers.wt61.config import Wt61Config
 from monstertruck_drivers.wt61.driver import Wt61Driver
 from monstertruck_drivers.wt61.emulator import Wt61Emulator
-from monstertruck_drivers.wt61.probe import probe
 from monstertruck_drivers.wt61.protocol import TOGGLE_SLEEP, Wt61Kind, Wt61Packet, Wt61Parser, build, measured
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import (
@@ -197,8 +197,8 @@ def test_another_device_is_refused():
 
 def test_probe_and_unknown_faults():
     async def test(rig: Rig) -> None:
-        found = await probe(rig.port, rig.clock)
-        assert found["device"] == "WitMotion WT61"
+        found = await DEVICES["wt61"].identify(rig.port, rig.clock)
+        assert found["device"] == "WitMotion WT61 inertial measurement unit"
         assert found["angular_velocity"][2] == pytest.approx(1.0, abs=0.02)
         with pytest.raises(InputError, match="known: frozen"):
             rig.emulator.inject("smoke")

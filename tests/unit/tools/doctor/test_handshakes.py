@@ -152,9 +152,9 @@ async def test_a_port_is_probed_with_the_control_lines_of_its_settings():
     """An RPLIDAR's motor stops while DTR is raised."""
     serial, node = Mock(), Path("/dev/ttyUSB0")
     context = Mock(computer=Mock(machine=Mock(serial=serial)))
-    kind = Mock(opens="serial", probe_function=lambda: AsyncMock())
+    kind = Mock(opens="serial", identify=AsyncMock())
     device = Mock(port=PortConfig(path=node, baud=9600, dtr=False, rts=False))
-    await module._probe(context, "lidar", device, kind, str(node))
+    await module._identify(context, "lidar", device, kind, str(node))
     serial.assert_called_once_with(node, 9600, dtr=False, rts=False, framing="8N1")
 
 

@@ -4,7 +4,7 @@ from monstertruck_drivers.ax12 import protocol as p
 from monstertruck_drivers.ax12.config import Ax12Config
 from monstertruck_drivers.ax12.protocol import Present, alarm_names, word
 from monstertruck_drivers.ax12.session import Ax12Session
-from monstertruck_drivers.link import Port
+from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 
@@ -13,30 +13,27 @@ IDS = range(1, 7)
 STORED = 19
 
 
-async def probe(port: Port, clock: Clock, settings: Ax12Config | None = None) -> dict[str, object]:
+async def identify(link: Link, clock: Clock, settings: Ax12Config) -> dict[str, object]:
     """Ping units 1 to 6 at 1 Mbaud and read settings and state of the units that answer.
 
     Returns:
-        JSON-able: ``device``, ``port``, ``echo`` of the adapter, ``units``: per unit its id, model, firmware, limits,
+        JSON-able: ``echo`` of the adapter, ``units``: per unit its id, model, firmware, limits,
         status level, error names, position in steps, voltage, temperature and torque settings.
 
     Raises:
-        DeviceLostError: not plugged in.
         DeviceTimeoutError: silence; the text says what to check.
         WrongDeviceError: bytes, but no unit.
-        PortBusyError: another process holds the port.
     """
-    async with await port.open() as link:
-        session = Ax12Session(link, clock, (settings or Ax12Config()).timeout)
-        await session.find_echo(*IDS)
-        units = [found for unit in IDS if (found := await _describe(session, unit)) is not None]
+    session = Ax12Session(link, clock, settings.timeout)
+    await session.find_echo(*IDS)
+    units = [found for unit in IDS if (found := await _describe(session, unit)) is not None]
     if not units and session.strange:
-        raise WrongDeviceError(f"{port.name}: {session.strange} bytes, but no answer of an AX-12A")
+        raise WrongDeviceError(f"{link.name}: {session.strange} bytes, but no answer of an AX-12A")
     if not units:
         raise DeviceTimeoutError(
-            f"{port.name}: silence; expected AX-12A units: is the 12 V rail up, the adapter at TTL?"
+            f"{link.name}: silence; expected AX-12A units: is the 12 V rail up, the adapter at TTL?"
         )
-    return {"device": "Dynamixel AX-12A", "port": port.name, "echo": session.echo, "units": units}
+    return {"echo": session.echo, "units": units}
 
 
 async def _describe(session: Ax12Session, unit: int) -> dict[str, object] | None:

@@ -6,18 +6,18 @@ from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.config import EposConfig
 from monstertruck_drivers.epos.exchange import ATTEMPTS, Exchanger, read_identity
 from monstertruck_drivers.epos.protocol import state_of
-from monstertruck_drivers.link import Port
+from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 
 SAMPLES = 5
 
 
-async def probe(port: Port, clock: Clock, settings: EposConfig | None = None) -> dict[str, Any]:
+async def identify(link: Link, clock: Clock, settings: EposConfig) -> dict[str, Any]:
     """Handshake, identity, state, fault history and first samples; only reads.
 
     Args:
-        port: where the controller hangs.
+        link: open line to the controller.
         clock: time.
         settings: with its node id.
 
@@ -25,20 +25,19 @@ async def probe(port: Port, clock: Clock, settings: EposConfig | None = None) ->
         JSON-able report in the controller's own units and sign.
 
     Raises:
-        DeviceLostError, PortBusyError: the port cannot be opened, or the link went down.
+        DeviceLostError: the link went down.
         DeviceTimeoutError, ProtocolError: no usable answers.
         WrongDeviceError: something else answers.
     """
-    async with await port.open() as link:
-        line = Exchanger(link, clock, (settings or EposConfig()).node)
-        try:
-            return await _report(line, clock)
-        except (DeviceTimeoutError, ProtocolError) as error:
-            if line.strange and not line.acknowledged:
-                raise WrongDeviceError(f"no EPOS, sends {line.strange[:20]!r}: {error}") from error
-            raise
-        finally:
-            await line.close()
+    line = Exchanger(link, clock, settings.node)
+    try:
+        return await _report(line, clock)
+    except (DeviceTimeoutError, ProtocolError) as error:
+        if line.strange and not line.acknowledged:
+            raise WrongDeviceError(f"no EPOS, sends {line.strange[:20]!r}: {error}") from error
+        raise
+    finally:
+        await line.close()
 
 
 async def _report(line: Exchanger, clock: Clock) -> dict[str, Any]:
@@ -57,7 +56,6 @@ async def _report(line: Exchanger, clock: Clock) -> dict[str, Any]:
         )
         await clock.sleep(0.05)
     return {
-        "device": "maxon EPOS 24/1",
         "identity": {**identity.as_values(), "serial_number": await _serial_number(line)},
         "state": state_of(statusword).name,
         "statusword": statusword,

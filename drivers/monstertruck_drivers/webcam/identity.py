@@ -10,10 +10,10 @@ from monstertruck_runtime.errors import DeviceError
 from monstertruck_runtime.threads import Offload, in_thread
 
 
-async def probe(
+async def identify(
     pattern: str,
     clock: Clock,
-    settings: WebcamConfig | None = None,
+    settings: WebcamConfig,
     kernel: v4l2.Kernel | None = None,
     offload: Offload = in_thread,
 ) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig, HokuyoLxConfig, ScipConfig
+from monstertruck_drivers.hokuyo_urg.config import ScipConfig
 from monstertruck_drivers.hokuyo_urg.driver import Dialect, ScipSession, Sensor, split
 from monstertruck_drivers.hokuyo_urg.protocol import (
     Parameters,
@@ -13,35 +13,26 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
     scan_command,
     scip1_scan_command,
 )
-from monstertruck_drivers.link import Port
+from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import Clock
 
 
-async def probe(port: Port, clock: Clock, settings: HokuyoConfig | None = None) -> dict[str, object]:
-    """Handshake, identity, state and a summary of the first scan, ready for JSON; the laser is off afterwards.
+async def identify(link: Link, clock: Clock, settings: ScipConfig) -> dict[str, object]:
+    """Perform the handshake and take one scan; the laser is off afterwards.
+
+    Returns:
+        JSON-able: ``dialect``, ``identity``, ``parameters``, ``state`` and a summary of the ``scan``.
 
     Raises:
         DeviceError: as the driver's ``run``.
     """
-    return await _probe(port, clock, settings or HokuyoConfig())
-
-
-async def probe_lx(port: Port, clock: Clock, settings: HokuyoLxConfig | None = None) -> dict[str, object]:
-    """Probe a UST or UTM; see ``probe``."""
-    return await _probe(port, clock, settings or HokuyoLxConfig())
-
-
-async def _probe(port: Port, clock: Clock, settings: HokuyoConfig | HokuyoLxConfig) -> dict[str, object]:
-    async with await port.open() as link:
-        session = ScipSession(link, clock, settings)
-        sensor = await session.handshake()
-        try:
-            block = await _one_scan(session, sensor)
-        finally:
-            await session.stop()
+    session = ScipSession(link, clock, settings)
+    sensor = await session.handshake()
+    try:
+        block = await _one_scan(session, sensor)
+    finally:
+        await session.stop()
     return {
-        "device": settings.kind,
-        "port": port.name,
         "dialect": sensor.dialect.value,
         "identity": asdict(sensor.identity),
         "parameters": asdict(sensor.parameters),
