@@ -17,13 +17,35 @@ class DeviceStream(Generic[T]):
         link: open link.
         clock: time.
         parse: takes the bytes that came, however they are cut, and returns the messages that became complete.
+        batch: number of bytes worth waking up for.
     """
 
-    def __init__(self, link: Link, clock: Clock, parse: Callable[[bytes], list[T]]) -> None:
+    def __init__(self, link: Link, clock: Clock, parse: Callable[[bytes], list[T]], batch: int = 1) -> None:
         self.bytes_heard = 0
+        self.arrival = 0
+        """Arrival time of the latest bytes (ns); already set when they are parsed."""
         self._link = link
         self._clock = clock
         self._parse = parse
+        self._batch = batch
+
+    async def next(self, within: float | None = None) -> list[T]:
+        """Return the messages that became complete with the next bytes, perhaps none.
+
+        Args:
+            within: seconds to wait for the bytes; None = no limit.
+
+        Raises:
+            DeviceLostError: unplugged.
+            DeviceTimeoutError: silence.
+        """
+        try:
+            data = await self._link.read(within, least=self._batch)
+        except TimeoutError:
+            raise DeviceTimeoutError(f"{self._link.name}: silent for {within:.1f} s") from None
+        self.arrival = self._clock.now()
+        self.bytes_heard += len(data)
+        return self._parse(data)
 
     async def receive(self, within: float) -> list[T]:
         """Return the messages that became complete, at least one.
@@ -40,13 +62,13 @@ class DeviceStream(Generic[T]):
         until = self._clock.now() + round(within * SECOND)
         while True:
             try:
-                data = await self._link.read(max(until - self._clock.now(), 0) / SECOND)
-            except TimeoutError:
+                messages = await self.next(max(until - self._clock.now(), 0) / SECOND)
+            except DeviceTimeoutError:
+                self.bytes_heard += self._link.discard()
                 if self.bytes_heard == heard:
                     raise DeviceTimeoutError(f"{name}: silent for {within} s") from None
                 raise ProtocolError(f"{name}: {self.bytes_heard - heard} bytes, but no measurement") from None
-            self.bytes_heard += len(data)
-            if messages := self._parse(data):
+            if messages:
                 return messages
             if self._clock.now() >= until:
                 raise ProtocolError(f"{name}: {self.bytes_heard - heard} bytes, but no measurement")

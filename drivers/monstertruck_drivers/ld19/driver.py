@@ -19,69 +19,24 @@ from monstertruck_drivers.scanning.clock_map import ClockMap
 from monstertruck_drivers.scanning.clock_watch import ClockWatch
 from monstertruck_drivers.scanning.publishing import publish
 from monstertruck_drivers.scanning.turns import BeamSamples, TurnCutter, on_equal_steps
+from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
+from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
 
 
-class Ld19Session:
-    """Listening to one unit.
+def packet_stream(link: Link, clock: Clock) -> DeviceStream[Ld19Packet]:
+    """Return the packets of one session."""
+    return DeviceStream(link, clock, Ld19Parser().feed, batch=4 * LD19_SIZE)
 
-    Args:
-        link: open link.
-        clock: time.
-    """
 
-    def __init__(self, link: Link, clock: Clock) -> None:
-        self.parser = Ld19Parser()
-        self.arrival = 0
-        """Arrival time of the latest bytes (ns)."""
-        self.packets = 0
-        """Packets received so far."""
-        self._link, self._clock = link, clock
-
-    async def receive(self, within: float) -> list[Ld19Packet]:
-        """Packets that became complete, perhaps none.
-
-        Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence.
-        """
-        try:
-            batch = 4 * LD19_SIZE  # bytes worth waking for
-            data = await self._link.read(within, least=batch)
-        except TimeoutError:
-            raise DeviceTimeoutError(f"{self._link.name}: silent for {within:.1f} s") from None
-        self.arrival = self._clock.now()
-        packets = self.parser.feed(data)
-        self.packets += len(packets)
-        return packets
-
-    async def start(self) -> list[Ld19Packet]:
-        """First packets.
-
-        Raises:
-            DeviceLostError: unplugged.
-            DeviceTimeoutError: silence to the end.
-            WrongDeviceError: bytes, but none of an LD19.
-        """
-        listen = 1.5  # seconds to find a packet of a unit that was powered just now; it is silent for half a second
-        until = self._clock.now() + round(listen * SECOND)
-        while (left := until - self._clock.now()) > 0:
-            try:
-                packets = await self.receive(left / SECOND)
-            except DeviceTimeoutError:
-                if self._link.discard() or self.parser.refused:
-                    break
-                raise
-            if packets:
-                return packets
-        raise WrongDeviceError(
-            f"{self._link.name}: {self.parser.refused} bytes, none of an LD19: another device, or another baud rate"
-        )
+async def first_packets(stream: DeviceStream[Ld19Packet]) -> list[Ld19Packet]:
+    """Wait for the first packets of a session; raises as ``DeviceStream.first``."""
+    listen = 1.5  # seconds to find a packet of a unit that was powered just now; it is silent for half a second
+    return await stream.first(listen, "of an LD19: another device, or another baud rate")
 
 
 class PacketSamples:
@@ -156,12 +111,11 @@ class Ld19Driver:
         """
         config, limits = self._config, MODELS[self._config.model].ranges
         async with await self._port.open() as link:
-            session, cutter, samples = Ld19Session(link, self._clock), TurnCutter(), PacketSamples()
+            stream, cutter, samples = packet_stream(link, self._clock), TurnCutter(), PacketSamples()
             transfer = 0.001  # seconds assumed from the end of a packet on the line to its arrival
             mapping = ClockMap(round((LD19_SIZE * 10 / LD19_BAUD + transfer) * SECOND), turn=STAMP_TURN)
             due, first = self._clock.now() + round(config.first_scan * SECOND), True
-            packets = await session.start()
-            heard = session.packets
+            packets, usable = await first_packets(stream), False
             while True:
                 for revolution in cutter.add(samples.of(packets)) if packets else ():
                     if (turn := on_equal_steps(revolution)) is None:
@@ -169,12 +123,13 @@ class Ld19Driver:
                     if first:
                         ready()
                         self._events(Reason.DEVICE_READY, Severity.INFO, self.name, MODELS[config.model].title)
-                    due, first, heard = self._clock.now() + round(config.stale * SECOND), False, session.packets
-                    stamp = self._watch.stamp(mapping, packets[-1].stamp, session.arrival, link.name)
-                    publish(turn, stamp - samples.elapsed, session.arrival, limits[:2], config, self._out)
+                    due, first, usable = self._clock.now() + round(config.stale * SECOND), False, False
+                    stamp = self._watch.stamp(mapping, packets[-1].stamp, stream.arrival, link.name)
+                    publish(turn, stamp - samples.elapsed, stream.arrival, limits[:2], config, self._out)
                 if self._clock.now() >= due:
-                    raise self._stale(link.name, session.packets > heard)
-                packets = await session.receive(config.silence)
+                    raise self._stale(link.name, usable)
+                packets = await stream.next(config.silence)
+                usable = usable or bool(packets)
 
     def _stale(self, port: str, packets: bool) -> Exception:
         if packets:
@@ -191,7 +146,7 @@ async def identify(link: Link, clock: Clock, settings: Ld19Config) -> dict[str, 
     Raises:
         DeviceError: as the driver's ``run``.
     """
-    packet = (await Ld19Session(link, clock).start())[-1]
+    packet = (await first_packets(packet_stream(link, clock)))[-1]
     return {
         "turns_per_second": packet.speed / 360,
         "stamp_ms": packet.stamp,

@@ -113,19 +113,20 @@ class Os4000Driver:
 
     async def _serve(self, session: Os4000Session) -> None:
         timeout = round(self._config.timeout * SECOND)
-        limit, heard = self._clock.now() + timeout, session.bytes_heard
+        stream = session.stream
+        limit, heard = self._clock.now() + timeout, stream.bytes_heard
         while True:
             try:
-                sentences = await session.receive(max(limit - self._clock.now(), 0) / SECOND)
-            except TimeoutError:
-                if session.bytes_heard == heard:
+                sentences = await stream.next(max(limit - self._clock.now(), 0) / SECOND)
+            except DeviceTimeoutError:
+                if stream.bytes_heard == heard:
                     raise DeviceTimeoutError(f"{self._port.name}: silent for {self._config.timeout} s") from None
                 raise ProtocolError(
-                    f"{self._port.name}: {session.bytes_heard - heard} bytes, but no usable sentence "
+                    f"{self._port.name}: {stream.bytes_heard - heard} bytes, but no usable sentence "
                     f"for {self._config.timeout} s"
                 ) from None
             if self._publish(sentences):
-                limit, heard = self._clock.now() + timeout, session.bytes_heard
+                limit, heard = self._clock.now() + timeout, stream.bytes_heard
 
     def _publish(self, sentences: list[Sentence]) -> bool:
         """Publish the usable sentences; space sentences from one burst by the period."""

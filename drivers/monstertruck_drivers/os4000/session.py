@@ -8,6 +8,7 @@ from monstertruck_drivers.link import Link
 from monstertruck_drivers.os4000 import protocol
 from monstertruck_drivers.os4000.config import Os4000Config
 from monstertruck_drivers.os4000.protocol import FORMAT_TAGGED, Fields, Key, Os4000Parser, Sentence, is_other_format
+from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, WrongDeviceError
 
@@ -29,23 +30,10 @@ class Os4000Session:
 
     def __init__(self, link: Link, clock: Clock) -> None:
         self.parser = Os4000Parser()
-        self.bytes_heard = 0
+        self.stream = DeviceStream(link, clock, self.parser.feed)
+        """Sentences."""
         self._link = link
         self._clock = clock
-
-    async def receive(self, within: float | None = None) -> list[Sentence]:
-        """Sentences that became complete with the next bytes.
-
-        Args:
-            within: seconds to wait for the bytes; None = no limit.
-
-        Raises:
-            DeviceLostError: unplugged.
-            TimeoutError: nothing came in time.
-        """
-        data = await self._link.read(within)
-        self.bytes_heard += len(data)
-        return self.parser.feed(data)
 
     async def listen(self, seconds: float, count: int = SAMPLES) -> list[tuple[int, Sentence]]:
         """Collect sentences with their arrival times until ``count`` came or ``seconds`` passed."""
@@ -53,7 +41,7 @@ class Os4000Session:
         try:
             async with self._clock.deadline(seconds):
                 while len(heard) < count:
-                    heard += [(self._clock.now(), sentence) for sentence in await self.receive()]
+                    heard += [(self._clock.now(), sentence) for sentence in await self.stream.next()]
         except TimeoutError:
             pass
         return heard
@@ -85,7 +73,7 @@ class Os4000Session:
             if may_set(Key.FORMAT):
                 await self.set(Key.FORMAT, FORMAT_TAGGED)
             heard = await self.listen(LISTEN)
-        silent = self.bytes_heard == 0
+        silent = self.stream.bytes_heard == 0
         while not heard and remedies and silent:
             remedy = remedies.pop(0)
             if remedy is not set_rate or may_set(Key.RATE):
@@ -94,9 +82,9 @@ class Os4000Session:
         if heard:
             return heard
         name = self._link.name
-        if self.bytes_heard:
+        if heard_bytes := self.stream.bytes_heard:
             raise WrongDeviceError(
-                f"{name}: {self.bytes_heard} bytes, but no OS4000 sentence: another device, or another baud rate "
+                f"{name}: {heard_bytes} bytes, but no OS4000 sentence: another device, or another baud rate "
                 f"than the unit's ({', '.join(map(str, protocol.BAUDS))}; {protocol.FACTORY_BAUD} from the factory)"
             )
         raise DeviceTimeoutError(

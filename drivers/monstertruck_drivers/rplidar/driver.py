@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_drivers.emulation import Array
-from monstertruck_drivers.link import Port
+from monstertruck_drivers.link import Link, Port
 from monstertruck_drivers.rplidar.config import RplidarConfig
 from monstertruck_drivers.rplidar.protocol import (
     COUNTS,
@@ -23,6 +23,7 @@ from monstertruck_drivers.rplidar.protocol import (
 from monstertruck_drivers.rplidar.session import RplidarSession, ScannerUnit
 from monstertruck_drivers.scanning.publishing import publish
 from monstertruck_drivers.scanning.turns import ArrivalTimes, BeamSamples, TurnCutter, on_equal_steps
+from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
@@ -33,7 +34,7 @@ from monstertruck_schemas.sensor import LaserScan
 STANDS: Final = ": its motor does not turn (an A1's turns with port.dtr false)"
 
 
-class SampleStream:
+class SampleDecoder:
     """Decodes the bytes of a stream into samples, each with its measurement time assuming immediate arrival.
 
     Args:
@@ -132,7 +133,7 @@ class RplidarDriver:
                 if unit.pwm:
                     session.turn_motor(self._config.motor_pwm)
                 await session.start(mode)
-                await self._stream(session, unit, mode, link.baud, ready)
+                await self._stream(link, unit, mode, ready)
             finally:
                 if not link.is_lost:
                     session.end()
@@ -149,25 +150,27 @@ class RplidarDriver:
         names = ", ".join(mode.name for mode in unit.modes)
         raise ProtocolError(f"{self._port.name}: the unit has no scan mode {wanted!r}; it lists {names}")
 
-    async def _stream(
-        self, session: RplidarSession, unit: ScannerUnit, mode: ScanMode, baud: int | None, ready: Ready
-    ) -> None:
+    async def _stream(self, link: Link, unit: ScannerUnit, mode: ScanMode, ready: Ready) -> None:
         config, clock, begin = self._config, self._clock, self._clock.now()
-        stream, cutter = SampleStream(mode, baud), TurnCutter()
+        decoder, cutter = SampleDecoder(mode, link.baud), TurnCutter()
         times = ArrivalTimes(mode.sample_time * SECOND)
         wake_period = 0.01  # seconds of samples worth waking for
         records = max(wake_period / mode.sample_time / COUNTS[mode.answer], 1.0)
-        batch = round(records) * SIZES[mode.answer]
+        stream: DeviceStream[BeamSamples] = DeviceStream(
+            link,
+            clock,
+            lambda data: decoder.feed(data, float(stream.arrival - begin)),
+            batch=round(records) * SIZES[mode.answer],
+        )
         limits = MODELS[config.model].ranges.least, mode.longest
         due, first, measured = begin + round(config.first_scan * SECOND), True, False
         patience = config.first_scan
         while True:
             try:
-                data = await session.read(patience, batch)
+                found = await stream.next(patience)
             except DeviceTimeoutError as error:
                 raise DeviceTimeoutError(f"{error}{STANDS if first else ''}") from None
-            arrival = clock.now()
-            for samples in stream.feed(data, float(arrival - begin)):
+            for samples in found:
                 measured = True
                 for revolution in cutter.add(samples):
                     turn = on_equal_steps(times.timed(revolution))
@@ -178,7 +181,7 @@ class RplidarDriver:
                         self._report_ready(unit, mode)
                     due, first, measured = clock.now() + round(config.stale * SECOND), False, False
                     patience = config.silence
-                    publish(turn, begin, arrival, limits, config, self._out)
+                    publish(turn, begin, stream.arrival, limits, config, self._out)
             if clock.now() >= due:
                 if measured:
                     raise DeviceTimeoutError(f"{self._port.name}: samples, but no whole revolution")

@@ -99,17 +99,6 @@ class RplidarSession:
         if found.type != mode.answer or found.length != SIZES[mode.answer]:
             raise ProtocolError(f"{self._link.name}: mode {mode.name} sends data of type 0x{found.type:02x}")
 
-    async def read(self, within: float, least: int) -> bytes:
-        """Bytes of the stream.
-
-        Raises:
-            DeviceTimeoutError: silence.
-        """
-        try:
-            return await self._link.read(within, least=least)
-        except TimeoutError:
-            raise DeviceTimeoutError(f"{self._link.name}: silent for {within:.1f} s") from None
-
     async def stop(self) -> None:
         """Stop the unit and discard the bytes it still sends.
 
