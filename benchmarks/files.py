@@ -32,11 +32,11 @@ from ruamel.yaml import YAML
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.lens_files import lens_from
 from monstertruck_runtime.path_files import mission_from, path_from
 from monstertruck_schemas import topics as t
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruckd import open_log
+from monstertruckd.tools.calibrate.lens_files import lens_from
 from monstertruckd.tools.logs.arrow import export_parquet
 from monstertruckd.tools.logs.lerobot import export_lerobot
 from monstertruckd.tools.logs.pose_files import export_kitti, export_tum

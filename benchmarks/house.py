@@ -7,10 +7,10 @@ tests, benchmarks and docs. ``--list`` prints what was counted. The last line is
 
 *Places to change* are the files that one more of a kind changes, beside its own: of the trial changes that
 ``tests/daemon/test_trial_changes.py`` makes and runs; of trackers and explorers, the files that name a present one. A
-*module number* is an assignment at module level whose value is made
-of numbers: a literal, arithmetic with a literal, or a tuple of these. A *reader* of a file is a file of the packages
-that imports it. *Core* is what a robot needs to own its devices, estimate, map, plan, track, be stopped, be recorded
-and be operated; ``REST`` names everything else.
+*module number* is an assignment at module level whose value is made of numbers: a literal, arithmetic with a literal,
+or a tuple of these. A *reader* of a file is a file of the packages that imports it, or whose catalog row names it
+(``module:name``). *Core* is what a robot needs to own its devices, estimate, map, plan, track, be stopped, be
+recorded and be operated; ``REST`` names everything else.
 """
 
 import argparse
@@ -185,11 +185,13 @@ def module_of(path: str) -> str:
 
 
 def readers(files: list[Source]) -> dict[str, set[str]]:
-    """Return, for each module, the files that import it."""
+    """Return, for each module, the files that import it or name it as the place of a catalog row."""
     modules, found = {module_of(source.path) for source in files}, defaultdict(set)
     for source in files:
         for node in ast.walk(source.tree):
             match node:
+                case ast.Constant(value=str() as place) if re.fullmatch(r"[\w.]+:\w+", place):
+                    imported = [place.partition(":")[0]]
                 case ast.Import(names=aliases):
                     imported = [alias.name for alias in aliases]
                 case ast.ImportFrom(module=str() as module, names=aliases):

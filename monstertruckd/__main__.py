@@ -24,7 +24,7 @@ def _early(arguments: list[str]) -> AbstractContextManager[None]:
     """What must not wait until the command line is loaded."""
     if arguments[:1] != ["estop"]:
         return nullcontext()
-    from monstertruck_runtime.early_estop import early_estop  # noqa: PLC0415 - of this command only
+    from monstertruckd.early_estop import early_estop  # noqa: PLC0415 - of this command only
 
     return early_estop(arguments[1:])
 

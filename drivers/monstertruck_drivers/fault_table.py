@@ -58,8 +58,8 @@ class FaultTable:
         Raises:
             InputError: the device has no such fault, or the values do not fit it.
         """
+        known = ", ".join(dict.fromkeys(self._usages.values()))
         if fault not in self._usages:
-            known = ", ".join(dict.fromkeys(self._usages.values()))
             raise InputError(f"{self._device}: unknown fault {fault!r}; known: {known}")
         usage = self._usages[fault].split()[1:]
         try:
@@ -70,7 +70,7 @@ class FaultTable:
                 self._numbers[fault] = _number(self._numbers[fault], usage, values)
         except (LookupError, TypeError, ValueError) as error:
             expected, got = " ".join((fault, *usage)), " ".join((fault, *values))
-            raise InputError(f"{self._device}: expected '{expected}', got {got!r}") from error
+            raise InputError(f"{self._device}: expected '{expected}', got {got!r}; known: {known}") from error
 
 
 class LateAnswers:

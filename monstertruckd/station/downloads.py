@@ -12,9 +12,9 @@ from aiohttp import web
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import NotFoundError, NotPermittedError, RequestRefusedError, TruckError
-from monstertruck_runtime.recordings import fetch_recording
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.station.address import RobotAddress
+from monstertruckd.station.recordings import fetch_recording
 
 log = logging.getLogger(__name__)
 

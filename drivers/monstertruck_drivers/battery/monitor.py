@@ -8,9 +8,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from monstertruck_drivers.battery.config import PackConfig
+from monstertruck_drivers.thresholds import Dwell, Threshold, ThresholdAlarm
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import EventSink, Publisher, Subscription
-from monstertruck_runtime.thresholds import Dwell, Threshold, ThresholdAlarm
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback

@@ -6,9 +6,9 @@ from typing import Any, Final
 from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.host_health.config import HostHealthConfig
 from monstertruck_drivers.host_health.readings import Reading, busy_share, read_host
+from monstertruck_drivers.thresholds import Threshold, ThresholdAlarm
 from monstertruck_runtime.clock import IN_THREADS, Clock, Schedule
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
-from monstertruck_runtime.thresholds import Threshold, ThresholdAlarm
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import HostHealth
 from monstertruck_schemas.reasons import Reason

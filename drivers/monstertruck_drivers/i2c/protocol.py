@@ -4,9 +4,13 @@ Request: mark, number, address, bytes to read, bytes written, those bytes. Answe
 kernel, bytes read, those bytes. A CRC-16 ends each.
 """
 
+import errno
 from binascii import crc_hqx
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final, Generic, NamedTuple, TypeVar
+
+from monstertruck_drivers.cable import DeviceEnd
 
 REQUEST_MARK: Final = 0xA5
 ANSWER_MARK: Final = 0x5A
@@ -89,3 +93,22 @@ class Packets(Generic[P]):
 
 def _sealed(packet: bytes) -> bytes:
     return packet + crc_hqx(packet, 0xFFFF).to_bytes(CRC_SIZE, "big")
+
+
+Transfer = Callable[[int, bytes, int], bytes | None]
+"""Takes address, bytes written and number of bytes to read; returns them, or None if no device acknowledges."""
+
+
+async def serve(end: DeviceEnd, transfer: Transfer) -> None:
+    """Serve transfers until cancelled, at the speed of the bus."""
+    packets = Packets(I2cRequest)
+    while True:
+        for request in packets.feed(await end.read()):
+            found = transfer(request.address, request.data, request.size)
+            answer = I2cAnswer(request.number, errno.EREMOTEIO if found is None else 0, found or b"")
+            # 9 bits a byte, with its acknowledgement; an address before each direction
+            length = 9 * (len(request.data) + request.size + 1 + bool(request.size))
+            bus_rate = (
+                100_000  # clock of the bus (Hz): standard mode, as on a Raspberry Pi that is not configured otherwise
+            )
+            end.write(bytes(answer), length / bus_rate)

@@ -9,7 +9,7 @@ from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, MotorPlant, ServoPlant
 from monstertruck_drivers.esc_emulator import EscEmulator
 from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
-from monstertruck_drivers.i2c.emulator import serve
+from monstertruck_drivers.i2c.protocol import serve
 from monstertruck_drivers.pca9685.config import Pca9685Config, Pca9685EscConfig
 from monstertruck_drivers.pca9685.protocol import (
     ADDRESS,

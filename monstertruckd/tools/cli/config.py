@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.lens_forms import LensForm
+from monstertruckd.tools.calibrate.lens_forms import LensForm
 from monstertruckd.tools.cli.options import ConfigArgument
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
 
@@ -135,11 +135,11 @@ def convert_lens(
     ] = None,
 ) -> None:
     """Write camera intrinsics in another form; `config` is the section `devices.camera.driver.lens`."""
-    from monstertruck_runtime.lens_files import EXPECTED, lens_from, lens_text
     from monstertruck_runtime.outside import text_of
     from monstertruck_runtime.small_files import replace_file
     from monstertruck_runtime.yaml_files import LARGEST_YAML
     from monstertruck_schemas.body import LensConfig
+    from monstertruckd.tools.calibrate.lens_files import EXPECTED, lens_from, lens_text
     from monstertruckd.tools.simulation.config import load_robot
 
     text = text_of(file, EXPECTED, LARGEST_YAML)

@@ -1,4 +1,4 @@
-"""The demo, and the emulated robot it drives."""
+"""Everything without a robot: the demo, the emulated robot, and `try`, which serves its page as well."""
 
 import itertools
 import os
@@ -13,7 +13,7 @@ import typer
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.extras import needs_extra
 from monstertruck_runtime.small_files import require_place
-from monstertruckd.tools.cli.options import SimulatedOption
+from monstertruckd.tools.cli.options import SimulatedOption, complete_config
 from monstertruckd.tools.cli.output import (
     JsonOption,
     console,
@@ -28,7 +28,7 @@ from monstertruckd.tools.cli.output import (
 from monstertruckd.tools.shipped import configuration, shipped
 
 if TYPE_CHECKING:
-    from monstertruck_runtime.clock import Clock
+    from monstertruck_runtime.clock import Clock, WallClock
     from monstertruckd.tools.demo.exploring import Report
 
 DEMO_CONFIG = shipped("configs/room.yaml")
@@ -210,3 +210,48 @@ def _film(config: Path, film: Path, seconds: float, *, alone: bool) -> None:
     require_place(film)
     run_film(config, film, seconds)
     remark(f"wrote {seconds:g} s to {film}")
+
+
+@needs_extra("sim")
+@needs_extra("slam")
+def try_out(
+    robot: Annotated[
+        Path,
+        typer.Argument(
+            help="Emulated robot: a bundled configuration such as mecanum or tricycle, or a file.",
+            autocompletion=complete_config,
+        ),
+    ] = Path("explore"),
+    port: Annotated[
+        int, typer.Option("--port", "-p", min=1, max=65535, help="Port of the page; if it is taken, a free one.")
+    ] = 8470,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="New folder for configuration, logs, state and map.")
+    ] = Path("runs/try"),
+) -> None:
+    """Emulated robot, mapping, planner and the operator's page at once: click where it shall drive.
+
+    The world has a room and a person who walks in it; the page adds obstacles and lets devices fail. A robot whose body
+    no route planner can steer is driven by hand.
+    """
+    with needs_extra("planning"), needs_extra("station"):
+        from monstertruckd.tools.cli.calibrate_page import PageCalibrator
+        from monstertruckd.tools.demo.tryout import free_port, robot_file, run_tryout
+
+    file, folder = robot_file(robot), fresh(output)
+    remark(f"starting {robot}, its daemon and the page; logs and map go to {folder}")
+    if waiting := busy():
+        remark(f"{waiting}: late control ticks may stop the robot; `monstertruckd demo` explores on the virtual clock")
+    code = 0
+
+    async def main(clock: "WallClock") -> None:
+        nonlocal code
+        calibrator = PageCalibrator(clock)
+        code = await run_tryout(
+            clock, file, folder, free_port(port), print_words, browser=browser, calibrator=calibrator
+        )
+
+    until_stopped(main)
+    if code:
+        raise typer.Exit(code)

@@ -137,7 +137,7 @@ def fetch_command(
 
     The robot gives 1 MB/s at most, and one recording at a time.
     """
-    from monstertruck_runtime.recordings import fetch_recording
+    from monstertruckd.station.recordings import fetch_recording
 
     if name is None:
         answer = with_robot(lambda client, _: client.call("recordings"), robot, endpoint, named=False)

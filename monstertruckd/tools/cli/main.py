@@ -33,7 +33,6 @@ from monstertruckd.tools.cli import (
     stand,
     station,
     study,
-    tryout,
     tune,
     usb,
     zones,
@@ -65,7 +64,7 @@ def _options(
 
 
 app.command("demo")(demo.demo)
-app.command("try")(tryout.try_out)
+app.command("try")(demo.try_out)
 app.command("simulate")(demo.simulate)
 app.command("drill")(drill.drill)
 app.command("run")(robot.run)

@@ -10,7 +10,6 @@ import pytest
 
 from monstertruck_runtime import robots
 from monstertruck_runtime.client import TruckClient
-from monstertruck_runtime.early_estop import send_estop
 from monstertruck_runtime.endpoints import local_endpoints
 from monstertruck_runtime.errors import NoAnswerError, NotFoundError, NotPermittedError, RequestRefusedError
 from monstertruck_runtime.mailbox import fifo
@@ -19,6 +18,7 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import GATE, REQ_CONTROL, REQ_DRIVE, Writer
 from monstertruckd.bus.port_holder import holder_of
 from monstertruckd.bus.zenoh_config import TlsConfig
+from monstertruckd.early_estop import send_estop
 from tests.bus_kit import free_endpoint, gate_state, running_robot
 
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="makes certificates with openssl")

@@ -20,7 +20,6 @@ import zenoh
 from monstertruck_runtime import client, wire
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import WallClock
-from monstertruck_runtime.early_estop import estop_payload
 from monstertruck_runtime.errors import BusyError, ConfigError
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.base import Pose2D
@@ -47,6 +46,7 @@ from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.bus.zenoh_config import ZenohConfig, listeners, session_config
 from monstertruckd.bus.zenoh_session import MAX_CALL, ZenohBridge
+from monstertruckd.early_estop import estop_payload
 from tests.bus_kit import free_endpoint, gate_state, odometry, running_robot
 
 

@@ -9,11 +9,11 @@ import pytest
 
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import BusyError, InputError, NotFoundError
-from monstertruck_runtime.recordings import fetch_recording
 from monstertruck_runtime.threads import inline
 from monstertruckd.bus.rpc import Rpc
 from monstertruckd.recorder.recordings import CHUNK, DOWNLOAD_RATE, TURN, Recordings
 from monstertruckd.recorder.repair import in_use
+from monstertruckd.station.recordings import fetch_recording
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ import aiohttp
 import numpy as np
 import pytest
 
-from monstertruck_runtime import recordings
 from monstertruck_runtime.clock import SECOND, WallClock
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.mailbox import Mailbox
@@ -22,7 +21,7 @@ from monstertruck_schemas.event import Event, Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import Grid, Odometry
-from monstertruckd.station import commands, downloads, server
+from monstertruckd.station import commands, downloads, recordings, server
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.pilot import LONGEST_DRAWN_PATH, SHORTEST, Pilot, drawn_path, read_mission
 from monstertruckd.station.replay import ReplayFeed

@@ -5,9 +5,8 @@ import errno
 import pytest
 
 from monstertruck_drivers.cable import MemoryPort
-from monstertruck_drivers.i2c.emulator import serve
 from monstertruck_drivers.i2c.host import I2cBus
-from monstertruck_drivers.i2c.protocol import I2cAnswer, I2cRequest, Packets
+from monstertruck_drivers.i2c.protocol import I2cAnswer, I2cRequest, Packets, serve
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError
 from tests.unit.drivers.kit import background

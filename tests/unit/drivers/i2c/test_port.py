@@ -11,9 +11,9 @@ import pytest
 
 from monstertruck_drivers.cable import PtyPort
 from monstertruck_drivers.i2c import bus, port
-from monstertruck_drivers.i2c.emulator import serve
 from monstertruck_drivers.i2c.host import I2cBus
 from monstertruck_drivers.i2c.port import I2cPort
+from monstertruck_drivers.i2c.protocol import serve
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError
 from tests.unit.drivers.kit import background

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from monstertruck_runtime import early_estop, wire
-from monstertruck_runtime.early_estop import ENCODING, estop_payload
+from monstertruck_runtime import wire
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas.req import ControlRequest, Order
 from monstertruck_schemas.topics import REQ_CONTROL, estop_key
+from monstertruckd import early_estop
+from monstertruckd.early_estop import ENCODING, estop_payload
 from tests.bus_kit import free_endpoint, running_robot
 
 

@@ -1,5 +1,5 @@
+from monstertruck_drivers.thresholds import Dwell, Threshold, ThresholdAlarm
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.thresholds import Dwell, Threshold, ThresholdAlarm
 
 
 def test_a_dwell_needs_its_time_without_a_break():

@@ -12,10 +12,10 @@ import numpy as np
 from ruamel.yaml.error import YAMLError
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.lens_forms import LensForm
 from monstertruck_runtime.outside import QUOTED, reading
 from monstertruck_runtime.yaml_files import bounded_yaml, yaml_text
 from monstertruck_schemas.body import LensConfig
+from monstertruckd.tools.calibrate.lens_forms import LensForm
 
 EXPECTED: Final = "camera intrinsics"
 _PINHOLE: Final = ("plumb_bob", "rational_polynomial", "radtan", "none", "")

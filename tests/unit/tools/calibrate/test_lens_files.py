@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.lens_files import lens_from, lens_text
-from monstertruck_runtime.lens_forms import LensForm
 from monstertruck_schemas.body import LensConfig
+from monstertruckd.tools.calibrate.lens_files import lens_from, lens_text
+from monstertruckd.tools.calibrate.lens_forms import LensForm
 
 LENS = LensConfig(
     width=800, height=600, focal_x=610.5, focal_y=612.25, centre_x=401.5, centre_y=298.75, k1=-0.3, k2=0.1, p1=1e-3,
