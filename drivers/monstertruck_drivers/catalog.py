@@ -405,7 +405,7 @@ DEVICES: Final = DeviceCatalog(
         settings="monstertruck_drivers.sheet_lidar.config:SheetLidarConfig",
         implementation="monstertruck_drivers.sheet_lidar.driver:SheetLidarDriver",
         emulator="monstertruck_drivers.sheet_lidar.emulator:emulated",
-        probe="monstertruck_drivers.sheet_lidar.probe:probe",
+        identity="monstertruck_drivers.sheet_lidar.driver:identify",
     ),
     DeviceKind(
         name="epos",

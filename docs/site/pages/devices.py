@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from monstertruck_drivers.catalog import DEVICES, DeviceKind, Duty
+from monstertruck_runtime.plugins import load
 from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas.topics import Topic
 from monstertruckd.config.load import load_tree
@@ -39,7 +40,7 @@ def pages() -> Iterator[Page]:
 
 
 def _page(kind: DeviceKind) -> Page:
-    driver, probe = kind.implementation_class(), kind.probe_function()
+    driver, identify = kind.implementation_class(), load(kind.identity)
     emulator = get_type_hints(kind.emulator_factory())["return"]
     models = Definitions(kind.settings_class())
     text = join(
@@ -55,8 +56,8 @@ def _page(kind: DeviceKind) -> Page:
         _example(kind),
         *_settings(models),
         "## Probe",
-        f"`monstertruckd probe {kind.name}{PROBED[kind.opens]}`: {prose(probe.__doc__)}",
-        section(probe.__doc__, "Returns"),
+        f"`monstertruckd probe {kind.name}{PROBED[kind.opens]}`: {prose(identify.__doc__)}",
+        section(identify.__doc__, "Returns"),
         "## Emulator",
         prose(sys.modules[emulator.__module__].__doc__).partition("\n\n")[2],
         _without_faults(emulator.__doc__),

@@ -152,7 +152,6 @@ class HokuyoEmulator(FaultyDevice):
     next scan in the middle of a line. ``laser`` keeps the laser from lighting. ``seri`` puts a wrong sum on SERI and an
     empty line into VV. ``tm`` makes it refuse its time-adjust mode. ``timer`` sets the counter, ``drift`` the rate of
     its clock against the world's.
-
     ``cover`` puts something over the window between two directions, degrees from straight ahead, left positive: the
     beams, or a random share of them, give the value (below 20: an error code, otherwise mm). ``mirror`` puts a mirror
     there: its middle dazzles, the rest shows the room behind the mirror, twice as far away.

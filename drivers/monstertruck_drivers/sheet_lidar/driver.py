@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from monstertruck_drivers.link import Port
+from monstertruck_drivers.link import Link, Port
 from monstertruck_drivers.scanning.clock_map import ClockMap
 from monstertruck_drivers.scanning.clock_watch import ClockWatch
 from monstertruck_drivers.scanning.turns import MISSING
@@ -87,3 +87,17 @@ class SheetLidarDriver:
                 codes=np.where(met, VALID_BEAM, self._without).astype(np.uint8),
             )
         )
+
+
+async def identify(link: Link, clock: Clock, settings: SheetLidarConfig) -> dict[str, object]:
+    """Wait for one scan.
+
+    Returns:
+        JSON-able: ``beams``, ``stamp_ms``, ``returns``.
+
+    Raises:
+        DeviceError: as the driver's ``run``.
+    """
+    stream = DeviceStream(link, clock, SheetParser(settings.beams).feed)
+    scan = (await stream.first(settings.first_scan, EXPECTED))[-1]
+    return {"beams": len(scan.ranges), "stamp_ms": scan.stamp, "returns": int((scan.ranges > 0).sum())}

@@ -8,13 +8,12 @@ import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import Array, BeamSource, EmulatorSetup, ReceivedBytes
-from monstertruck_drivers.scanning.head import FAULTS as HEAD_FAULTS
+from monstertruck_drivers.fault_table import FaultRows, FaultTable, FaultyDevice
 from monstertruck_drivers.scanning.head import TurningHead
 from monstertruck_drivers.sheet_lidar.config import SheetLidarConfig
 from monstertruck_drivers.sheet_lidar.protocol import STAMP_TURN, SheetScan, build
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.errors import InputError
 
 RANGE: Final = "range"
 """Distances of a scan, mm."""
@@ -22,7 +21,7 @@ COUNTER: Final = "counter"
 """Time stamp, ms."""
 
 
-class SheetLidarEmulator:
+class SheetLidarEmulator(FaultyDevice):
     """Scanner that streams from power-up on.
 
     Faults (``inject``): ``silent on|off``, ``bad_crc N`` (the next N scans), and the faults of the head.
@@ -48,8 +47,8 @@ class SheetLidarEmulator:
         steps = np.arange(self._config.beams, dtype=np.float64)
         self._bearings: Array = self._config.start_angle + self._config.increment * steps
         self._clock = clock
-        self._silent = False
-        self._bad_sums = 0
+        rows: FaultRows = {"silent on|off": False, "bad_crc N": 0, **self.head.fault_rows()}
+        self.faults = FaultTable(self.name, rows)
         self._powered_at = 0
 
     async def run(self, end: DeviceEnd) -> None:
@@ -66,25 +65,6 @@ class SheetLidarEmulator:
         self.head.stop()
         self._powered_at = self.head.now()
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        match fault, values:
-            case "silent", (("on" | "off") as state,):
-                self._silent = state == "on"
-            case "bad_crc", (count,) if count.isdigit():
-                self._bad_sums = int(count)
-            case _ if self.head.inject(fault, *values):
-                pass
-            case _:
-                raise InputError(
-                    f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: silent on|off | "
-                    f"bad_crc N | {HEAD_FAULTS}"
-                )
-
     async def _stream(self, end: DeviceEnd) -> None:
         begin = float(self.head.now())
         while True:
@@ -97,11 +77,10 @@ class SheetLidarEmulator:
             late = self.head.now() - int(times[-1]) > overslept
             begin = float(self.head.now() if late else begin + period)
             self.head.turn(times)
-            if self._silent or times[0] < self._powered_at:
+            if self.faults["silent"] or times[0] < self._powered_at:
                 continue
             data = build(self._scan(times))
-            if self._bad_sums:
-                self._bad_sums -= 1
+            if self.faults.strikes("bad_crc"):
                 data = data[:-1] + bytes((data[-1] ^ 0x10,))
             end.write(data)
 

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.scanning.turns import MISSING
 from monstertruck_drivers.sheet_lidar.config import SheetLidarConfig
 from monstertruck_drivers.sheet_lidar.driver import SheetLidarDriver
 from monstertruck_drivers.sheet_lidar.emulator import SheetLidarEmulator
-from monstertruck_drivers.sheet_lidar.probe import probe
 from monstertruck_drivers.sheet_lidar.protocol import SheetParser, SheetScan, build
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, InputError, ProtocolError, WrongDeviceError
@@ -106,8 +106,8 @@ def test_another_data_sheet_is_refused_by_driver_and_probe():
         with pytest.raises(WrongDeviceError, match="no measurement of a scanner with the configured number of beams"):
             await rig.driver.run(lambda: None)
         with pytest.raises(WrongDeviceError):
-            await probe(rig.port, rig.clock, rig.config)
-        found = await probe(rig.port, rig.clock, SheetLidarConfig(beams=100))
+            await DEVICES["sheet_lidar"].identify(rig.port, rig.clock, rig.config)
+        found = await DEVICES["sheet_lidar"].identify(rig.port, rig.clock, SheetLidarConfig(beams=100))
         assert found["beams"] == 100
 
     on_bench(test, sheet=SheetLidarConfig(beams=100))
