@@ -7,11 +7,7 @@ from math import atan, tan
 import numpy as np
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_sim.config import CeilingCamera
-from monstertruck_sim.world.board import BoardHolder
 from monstertruck_sim.world.camera import CameraPlace, Drawing, Painter, Picture, SimulatedView, mounted
-from monstertruck_sim.world.config import HeldBoard
-from monstertruck_sim.world.world import World
 from monstertruck_sim.world3d.model import Group
 from monstertruck_sim.world3d.picture import CameraPose, WorldRenderer, standing
 from monstertruck_sim.world3d.plant import RigidPlant
@@ -94,28 +90,3 @@ def _close(thread: ThreadPoolExecutor, renderers: dict[tuple[int, int], tuple[Wo
     for renderer, *_ in renderers.values():
         thread.submit(renderer.close).result()
     thread.shutdown()
-
-
-class CeilingView(RenderedView):
-    """``ViewSource`` of a fixed camera in the world.
-
-    Args:
-        world: of engine mujoco.
-        config: place, lens and noise.
-        board: board held in front of the camera, or None.
-        seed: seed of noise and board poses.
-
-    Raises:
-        NotInstalledError: this computer has no EGL.
-        InputError: the world has nothing to render.
-    """
-
-    HIDDEN: tuple[Group, ...] = ()
-
-    def __init__(self, world: World, config: CeilingCamera, board: HeldBoard | None, seed: int) -> None:
-        holder = None if board is None else BoardHolder(board, config.field_of_view, seed)
-        drawn = SimulatedView(world.plant, world.scene.cast, config, crowd=world.scene, holder=holder, seed=seed)
-        super().__init__(drawn)
-
-    def _place(self, _time_ns: int) -> CameraPlace:
-        return mounted((0.0, 0.0, 0.0), self.config)
