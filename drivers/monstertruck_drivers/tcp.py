@@ -9,7 +9,7 @@ from typing import Final, cast
 from monstertruck_drivers.link import STREAM_LIMIT, Link
 from monstertruck_runtime.errors import DeviceLostError
 
-PATIENCE: Final = 2.0
+CONNECT_TIMEOUT: Final = 2.0
 """Seconds within which a device must accept the connection."""
 MAX_AGE: Final = 0.5
 """Age at which unacknowledged bytes end the connection (s): more than two retransmissions on a local network."""
@@ -40,12 +40,12 @@ class TcpPort:
             DeviceLostError: no route, no answer, or refused.
         """
         try:
-            async with asyncio.timeout(PATIENCE):
+            async with asyncio.timeout(CONNECT_TIMEOUT):
                 _, protocol = await asyncio.get_running_loop().create_connection(
                     lambda: _TcpProtocol(self.name), self._address, self._number
                 )
         except TimeoutError as error:
-            raise DeviceLostError(f"{self.name}: no answer within {PATIENCE:g} s") from error
+            raise DeviceLostError(f"{self.name}: no answer within {CONNECT_TIMEOUT:g} s") from error
         except ConnectionRefusedError as error:
             raise DeviceLostError(f"{self.name}: refused, or another program is connected") from error
         except OSError as error:

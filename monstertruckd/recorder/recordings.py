@@ -27,7 +27,7 @@ LIST: Final = "recordings"
 READ: Final = "recording_read"
 DELETE: Final = "recording_delete"
 
-CHUNK: Final = 65_536
+DOWNLOAD_CHUNK: Final = 65_536
 """Maximum data per answer (bytes)."""
 DOWNLOAD_RATE: Final = 1_000_000.0
 """Maximum total download rate (bytes/s)."""
@@ -132,7 +132,7 @@ class Recordings:
                 try:
                     with path.open("rb") as file:
                         file.seek(min(offset, row.bytes))  # empty beyond the end
-                        data = file.read(CHUNK)
+                        data = file.read(DOWNLOAD_CHUNK)
                 except OSError as error:
                     raise InputError(f"recording {row.name}: cannot be read: {error.strerror}") from error
                 return base64.b64encode(data).decode(), len(data), row.bytes

@@ -35,7 +35,7 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
 _SHIFTED: Final = ("x_ref_m", "y_ref_m", "x_normvec_m", "y_normvec_m", "alpha_m")
 """TUM's trajectory for a local planner: reference line, its normals, and the shift along them."""
 EXPECTED: Final = "a path"
-LARGEST: Final = 10_000_000
+LARGEST_PATH_FILE: Final = 10_000_000
 """Size of a file of poses at most: a hundred thousand and more."""
 SPACING: Final = 0.05
 """Distance between the poses of a curve through waypoints, m."""

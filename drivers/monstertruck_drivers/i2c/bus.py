@@ -9,12 +9,10 @@ from typing import Final
 
 MAJOR: Final = 89
 """Device number of the kernel's I2C buses."""
-LONGEST: Final = 255
-"""Maximum length of one direction of a transfer (bytes)."""
 I2C_TIMEOUT: Final = 0x0702
 I2C_RDWR: Final = 0x0707
 READ: Final = 0x0001
-PATIENCE: Final = 5
+ADAPTER_TIMEOUT: Final = 5
 """Time limit of the adapter for one transfer (10 ms)."""
 
 
@@ -41,7 +39,7 @@ def limit_waits(bus: int) -> None:
     Raises:
         OSError: not an I2C bus.
     """
-    fcntl.ioctl(bus, I2C_TIMEOUT, PATIENCE)
+    fcntl.ioctl(bus, I2C_TIMEOUT, ADAPTER_TIMEOUT)
 
 
 def transfer(bus: int, address: int, data: bytes, count: int = 0) -> bytes:

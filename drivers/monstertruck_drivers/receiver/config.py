@@ -4,10 +4,10 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from monstertruck_drivers.receiver.protocol import CHANNELS
+from monstertruck_drivers.receiver.protocol import RADIO_CHANNELS
 from monstertruck_schemas.base import Schema
 
-Channel = Annotated[int, Field(ge=1, le=CHANNELS)]
+Channel = Annotated[int, Field(ge=1, le=RADIO_CHANNELS)]
 
 
 class ReceiverConfig(Schema):

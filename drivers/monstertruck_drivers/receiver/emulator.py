@@ -13,7 +13,7 @@ from monstertruck_drivers.emulation import EmulatorSetup, ReceivedBytes
 from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.receiver import crsf, sbus
 from monstertruck_drivers.receiver.config import CrsfConfig, ReceiverConfig, SbusConfig
-from monstertruck_drivers.receiver.protocol import CENTRE, CHANNELS, CRSF_BAUD, LOW, SBUS_BAUD, SBUS_PERIOD, raw
+from monstertruck_drivers.receiver.protocol import CENTRE, CRSF_BAUD, LOW, RADIO_CHANNELS, SBUS_BAUD, SBUS_PERIOD, raw
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_runtime.clock import SECOND, Clock
 
@@ -40,9 +40,9 @@ class ReceiverEmulator(FaultyDevice):
         self._clock = clock
         self._crsf = isinstance(settings or CrsfConfig(), CrsfConfig)
         self._rng = np.random.default_rng(seed)
-        names = [f"channel_{i}" for i in range(1, CHANNELS + 1)]
+        names = [f"channel_{i}" for i in range(1, RADIO_CHANNELS + 1)]
         self.signals = Signals(clock.now, dict.fromkeys([*names, "quality"], SignalKind.NUMBER), self._rng)
-        self._positions = [CENTRE] * 4 + [LOW] * (CHANNELS - 4)
+        self._positions = [CENTRE] * 4 + [LOW] * (RADIO_CHANNELS - 4)
         self.faults = FaultTable(
             self.name,
             {

@@ -6,7 +6,7 @@ pulses 988, 1500 and 2012 us. SBUS packs its channels the same way.
 
 from typing import Final
 
-CHANNELS: Final = 16
+RADIO_CHANNELS: Final = 16
 PACKED: Final = 22
 """Bytes of all channels."""
 BITS: Final = 11
@@ -39,7 +39,7 @@ ChannelWords = tuple[int, ...]
 def unpack(data: bytes) -> ChannelWords:
     """Return the channels of 22 bytes."""
     bits = int.from_bytes(data[:PACKED], "little")
-    return tuple(bits >> BITS * i & _MASK for i in range(CHANNELS))
+    return tuple(bits >> BITS * i & _MASK for i in range(RADIO_CHANNELS))
 
 
 def pack(channels: ChannelWords) -> bytes:

@@ -21,7 +21,7 @@ from monstertruck_runtime.clock import SECOND
 
 SHIFT: Final = SECOND // 10
 """Step between the lags tried (ns)."""
-LONGEST: Final = 16
+LONGEST_DELAY: Final = 16
 """Maximum lag tried, in ``SHIFT``; only shorter ones are found."""
 SIGMAS: Final = 5.0
 """Significance of a finding, in standard deviations: a false alarm in 3 million checks. Here it rejects all tolerated
@@ -72,10 +72,10 @@ def lag_question(steps: list[ScanStep], others: list[tuple[Errors, MotionTrack]]
         others: other measures of the same motion.
         tolerated: maximum tolerated lag (s).
     """
-    shifts = SHIFT * np.arange(LONGEST + 1)[:, None]
+    shifts = SHIFT * np.arange(LONGEST_DELAY + 1)[:, None]
     known = []
     for errors, track in others:
-        usable = tuple(row for row in steps if track.covers(row.since - LONGEST * SHIFT, row.stamp))
+        usable = tuple(row for row in steps if track.covers(row.since - LONGEST_DELAY * SHIFT, row.stamp))
         if len(usable) >= FEWEST:
             begins, ends = (np.array([row[end] for row in usable]) - shifts for end in (0, 1))
             known.append((errors, usable, track.motions(begins, ends)))
@@ -84,7 +84,7 @@ def lag_question(steps: list[ScanStep], others: list[tuple[Errors, MotionTrack]]
 
 def scan_delay(question: LagQuestion) -> Delay | None:
     """Return the lag of the scans behind all other measures, or None unless it exceeds the tolerance beyond chance."""
-    cost, squares, places = np.zeros(LONGEST + 1), np.zeros(LONGEST + 1), 0
+    cost, squares, places = np.zeros(LONGEST_DELAY + 1), np.zeros(LONGEST_DELAY + 1), 0
     for errors, steps, moved in question.others:
         for axis in _axes(errors):
             mahalanobis, volume = _fit(steps, moved, axis)
@@ -97,7 +97,7 @@ def scan_delay(question: LagQuestion) -> Delay | None:
     # Errors that exceed the stated ones everywhere make every difference less certain.
     inflation = max(1.0, float(squares[best]) / places)
     # A change that the scans have not shown up to the longest lag may never show: the other measure may be wrong.
-    rejected = min(cost[:allowed].min(), cost[LONGEST]) - cost[best]
+    rejected = min(cost[:allowed].min(), cost[LONGEST_DELAY]) - cost[best]
     sigmas = math.sqrt(float(rejected) / inflation)
     return Delay(best * SHIFT / SECOND, sigmas) if sigmas >= SIGMAS else None
 

@@ -18,7 +18,7 @@ FILE: Final = "ground.npz"
 """File name in the folder of a saved map."""
 GROUND_RESOLUTION: Final = 0.1
 """Edge of a cell (m)."""
-LARGEST: Final = 2000
+LARGEST_GROUND_GRID: Final = 2000
 """Maximum number of cells per side; cells outside are left out."""
 KEY: Final = 1 << 24
 """Factor that combines the two indices of a cell or square into one number."""
@@ -107,8 +107,10 @@ class GroundGrid:
         with reading(path, "a grid of the ground"):
             corner, counts, tilt, roughness = (found[name] for name in ("corner", "counts", "tilt", "roughness"))
             shapes = {counts.shape, tilt.shape, roughness.shape}
-            if corner.shape != (2,) or counts.ndim != 2 or len(shapes) != 1 or max(counts.shape) > LARGEST:
-                raise InputError(f"{path}: layers of shapes {sorted(shapes)}: expected one of at most {LARGEST} a side")
+            if corner.shape != (2,) or counts.ndim != 2 or len(shapes) != 1 or max(counts.shape) > LARGEST_GROUND_GRID:
+                raise InputError(
+                    f"{path}: layers of shapes {sorted(shapes)}: expected one of at most {LARGEST_GROUND_GRID} a side"
+                )
             if not (np.isfinite(tilt).all() and np.isfinite(roughness).all()):
                 raise InputError(f"{path}: expected finite tilt and roughness")
             grid._corner, grid._counts = corner.astype(np.int64), counts.astype(np.uint8)
@@ -126,7 +128,7 @@ class GroundGrid:
         behind = np.where(high >= self._corner + size, high + 1 - self._corner - size + margin, 0)
         if not (before.any() or behind.any()):
             return True
-        if (size + before + behind).max() > LARGEST:
+        if (size + before + behind).max() > LARGEST_GROUND_GRID:
             return False
         widths = ((before[1], behind[1]), (before[0], behind[0]))
         self._counts = np.pad(self._counts, widths)

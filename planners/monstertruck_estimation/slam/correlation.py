@@ -25,7 +25,7 @@ Blocks = NDArray[np.int32]
 
 RESOLUTION: Final = 0.05
 """Edge of a cell, m."""
-LONGEST: Final = 0.5
+LONGEST_ELEMENT: Final = 0.5
 """An element is drawn to this half length at most, m."""
 WORK: Final = 400_000
 """Default number of evaluated blocks."""
@@ -50,7 +50,7 @@ class LikelihoodGrid:
         without any motion.
         """
         points = cloud.points
-        margin = math.ceil(LONGEST / RESOLUTION) + 5  # cells round the outermost points
+        margin = math.ceil(LONGEST_ELEMENT / RESOLUTION) + 5  # cells round the outermost points
         pad = (1 << (levels - 1)) + margin
         low = np.floor(points.min(axis=0) / RESOLUTION).astype(np.int64) - pad
         high = np.floor(points.max(axis=0) / RESOLUTION).astype(np.int64) + pad
@@ -205,7 +205,7 @@ def _lever(points: Array) -> float:
 @njit(cache=True)
 def _stamp(grid: Pyramid, points: Array, normals: Array, extents: Array, x0: float, y0: float) -> None:
     for i in range(points.shape[0]):
-        half = min(extents[i], LONGEST)
+        half = min(extents[i], LONGEST_ELEMENT)
         steps = int(half / RESOLUTION)
         for k in range(-steps, steps + 1):
             px = (points[i, 0] - normals[i, 1] * k * RESOLUTION - x0) / RESOLUTION

@@ -8,7 +8,7 @@ from monstertruck_planners.track.segments import check_path
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError
 from monstertruck_runtime.outside import text_of
-from monstertruck_runtime.path_files import EXPECTED, LARGEST, path_from
+from monstertruck_runtime.path_files import EXPECTED, LARGEST_PATH_FILE, path_from
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, RpcRegistry, Subscription
 from monstertruck_runtime.requests import Sequences, does_not_drive, examine, parse_request
 from monstertruck_runtime.threads import Offload
@@ -26,7 +26,7 @@ def load_path(file: FilePath, *, closed: bool, frame: str = "odom", columns: Seq
     Raises:
         InputError: naming file, line and expectation.
     """
-    path = path_from(text_of(file, EXPECTED, LARGEST), file, closed=closed, frame=frame, columns=columns)
+    path = path_from(text_of(file, EXPECTED, LARGEST_PATH_FILE), file, closed=closed, frame=frame, columns=columns)
     try:
         check_path(path)
     except InputError as error:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from monstertruck_runtime.map_files import WorldMap
 
 _EXPECTED: Final = "zones"
-LARGEST: Final = 2_000_000
+LARGEST_ZONE_FILE: Final = 2_000_000
 """Maximum size of the file of the operators' zones (bytes)."""
 
 
@@ -124,7 +124,7 @@ def load_saved(file: Path) -> dict[str, ZoneArea]:
     if not file.exists():
         return {}
     with reading(file, _EXPECTED):
-        return ZoneFile.model_validate_json(contents(file, _EXPECTED, LARGEST)).zones
+        return ZoneFile.model_validate_json(contents(file, _EXPECTED, LARGEST_ZONE_FILE)).zones
 
 
 def save(file: Path, areas: dict[str, ZoneArea]) -> None:

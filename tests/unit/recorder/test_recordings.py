@@ -11,7 +11,7 @@ from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import BusyError, InputError, NotFoundError
 from monstertruck_runtime.threads import inline
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.recorder.recordings import CHUNK, DOWNLOAD_RATE, TURN, Recordings
+from monstertruckd.recorder.recordings import DOWNLOAD_CHUNK, DOWNLOAD_RATE, TURN, Recordings
 from monstertruckd.recorder.repair import in_use
 from monstertruckd.station.recordings import fetch_recording
 
@@ -62,14 +62,14 @@ def test_a_download_comes_in_chunks_at_a_limited_rate_and_goes_on_where_it_was_b
         while True:
             answer = await call("recording_read", name="run-000001-000.mcap", offset=len(data))
             part = base64.b64decode(answer["data"])
-            assert len(part) <= CHUNK
+            assert len(part) <= DOWNLOAD_CHUNK
             data += part
             if len(data) == answer["bytes"]:
                 return data, (clock.now() - began) / SECOND
 
     (data, seconds), _ = asked(folder, scenario)
     assert data == (folder / "run-000001-000.mcap").read_bytes()
-    assert seconds > (len(data) - CHUNK) / DOWNLOAD_RATE * 0.99
+    assert seconds > (len(data) - DOWNLOAD_CHUNK) / DOWNLOAD_RATE * 0.99
 
 
 def test_one_source_downloads_at_a_time(folder: Path):

@@ -21,7 +21,7 @@ from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
 from monstertruck_drivers.hokuyo_urg.lx_emulator import LxEmulator
 from monstertruck_drivers.hokuyo_urg.models import LX, UNRETURNED
 from monstertruck_drivers.hokuyo_urg.protocol import split_lx_ranges
-from monstertruck_drivers.tcp import PATIENCE, TcpPort, parse_address
+from monstertruck_drivers.tcp import CONNECT_TIMEOUT, TcpPort, parse_address
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import BusyError, DeviceError, DeviceLostError, DeviceTimeoutError, WrongDeviceError
 from monstertruck_schemas.reasons import Reason
@@ -240,10 +240,10 @@ async def test_a_network_that_swallows_everything(monkeypatch: pytest.MonkeyPatc
         await asyncio.Event().wait()
 
     monkeypatch.setattr(asyncio.get_running_loop(), "create_connection", never)
-    monkeypatch.setattr("monstertruck_drivers.tcp.PATIENCE", 0.05)
+    monkeypatch.setattr("monstertruck_drivers.tcp.CONNECT_TIMEOUT", 0.05)
     with pytest.raises(DeviceLostError, match=r"192\.0\.2\.1:10940: no answer within 0\.05 s"):
         await TcpPort("192.0.2.1", 10940).open()
-    assert PATIENCE > 1.0
+    assert CONNECT_TIMEOUT > 1.0
 
 
 @pytest.mark.parametrize(

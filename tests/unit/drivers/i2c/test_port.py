@@ -99,7 +99,7 @@ def test_transfers_run_in_a_thread_and_the_node_is_closed_after_the_link(kernel,
         host.send(0x40, b"\x06\x01")
         assert await host.transfer(0x40, b"\x00", 1) == b"\x01"
         assert ("write", 0x40, b"\x06\x01") in kernel.calls
-        assert kernel.calls[0] == ("timeout", bus.PATIENCE)
+        assert kernel.calls[0] == ("timeout", bus.ADAPTER_TIMEOUT)
 
     on_node(patched, test)
 

@@ -16,10 +16,10 @@ from monstertruck_drivers.receiver.emulator import ReceiverEmulator
 from monstertruck_drivers.receiver.frames import ReceiverFrame
 from monstertruck_drivers.receiver.protocol import (
     CENTRE,
-    CHANNELS,
     CRSF_ADDRESS,
     HIGH,
     LOW,
+    RADIO_CHANNELS,
     SBUS_SIZE,
     pack,
     position,
@@ -39,7 +39,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import HandControls
 from tests.unit.drivers.kit import DriverRig, Kept, background
 
-MIDDLE = (CENTRE,) * CHANNELS
+MIDDLE = (CENTRE,) * RADIO_CHANNELS
 BOTH = pytest.mark.parametrize("config", [CrsfConfig(estop=6), SbusConfig(estop=6)], ids=["crsf", "sbus"])
 STICK, ARM, ESTOP = 2, 5, 6
 channels = st.binary(min_size=22, max_size=22).map(unpack)
@@ -85,7 +85,7 @@ def test_a_published_frame_has_our_sum_and_channels():
 
 def test_a_foreign_parser_reads_our_frames_and_ours_reads_its_layout():
     """crsf-parser (MIT licence)."""
-    words = tuple(range(172, 172 + 100 * CHANNELS, 100))
+    words = tuple(range(172, 172 + 100 * RADIO_CHANNELS, 100))
     found = []
     client = CRSFParser(lambda frame, status: found.append((frame, status)))
     client.parse_stream(bytearray(crsf.channels_frame(words) + crsf.link_frame(0.93, -71.0) + b"\xc8"))
@@ -129,7 +129,7 @@ def test_any_bytes_end_in_frames_or_nothing(data):
 
 @given(st.integers(8, 26 * 8 - 1))
 def test_no_single_wrong_bit_of_crsf_passes(bit):
-    data = bytearray(crsf.channels_frame(tuple(range(CHANNELS))))
+    data = bytearray(crsf.channels_frame(tuple(range(RADIO_CHANNELS))))
     data[bit // 8] ^= 1 << bit % 8
     assert CrsfParser().feed(bytes(data) + bytes(64)) == []
 
