@@ -36,7 +36,7 @@ async def explore(rig: VirtualRig) -> None:
     await rig.clock.sleep(14.0)
 
 
-@pytest.mark.parametrize(("name", "options"), [("ant", ANT), ("beetle", BEETLE)])
+@pytest.mark.parametrize(("name", "options"), [("ant", ANT), pytest.param("beetle", BEETLE, marks=pytest.mark.long)])
 def test_the_twin_maps_a_room(tmp_path: Path, name: str, options: str):
     made = CliRunner().invoke(app, ["new-robot", name, "--folder", str(tmp_path), *options.split()])
     assert made.exit_code == 0, made.output

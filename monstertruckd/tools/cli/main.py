@@ -20,6 +20,7 @@ from monstertruckd.tools.cli import (
     maps,
     mission,
     move,
+    new_driver,
     new_robot,
     orders,
     plan,
@@ -68,6 +69,7 @@ app.command("try")(demo.try_out)
 app.command("simulate")(demo.simulate)
 app.command("drill")(drill.drill)
 app.command("run")(robot.run)
+app.command("new-driver")(new_driver.new_driver)
 app.command("new-robot", cls=new_robot.AnswersCommand)(new_robot.new_robot)
 app.command("check-config", hidden=True)(config.show)  # its name before there were others
 app.command("description")(description.description)

@@ -1,0 +1,1 @@
+"""A new driver as a package with emulator, probe and tests."""
