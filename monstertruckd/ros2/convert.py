@@ -31,6 +31,7 @@ from monstertruck_schemas.sensor import (
     SonarRanges,
 )
 from monstertruck_schemas.state import TILT_STEP, GateMode, GateState, Grid, Ground, Odometry, Peers, Transform
+from monstertruck_schemas.zones import Zones
 
 RosValues = dict[str, Any]
 
@@ -373,7 +374,7 @@ def gate_status(gate: GateState, robot: str) -> RosValues:
     return status("gate", level, gate.why, values, robot)
 
 
-POINTS_MARKERS, FOOTPRINT_MARKER, STOPPING_MARKER = "points", "footprint", "stopping_distance"
+POINTS_MARKERS, ZONE_MARKERS, FOOTPRINT_MARKER, STOPPING_MARKER = "points", "zones", "footprint", "stopping_distance"
 """Namespaces of the markers."""
 
 _ARROW, _CYLINDER, _LINE_STRIP, _TEXT = 0, 3, 4, 9
@@ -403,6 +404,25 @@ def point_markers(message: PointsOfInterest, names: RosNames) -> RosValues:
         # 0.1, 0.15: m, size of the post and of the letters; 0.2: m from the point up to its name
         markers.append(post | {"pose": pose_of(place, point.z), "scale": vector(0.1, 0.1, 0.1)})
         markers.append(text | {"pose": pose_of(place, point.z + 0.2), "scale": vector(z=0.15), "text": point.name})
+    return {"markers": markers}
+
+
+def zone_markers(message: Zones, names: RosNames) -> RosValues:
+    """``visualization_msgs/msg/MarkerArray`` of the polygons of all zones, grey while off; masks are not drawn."""
+    header = names.header_of(message.stamp, "map")
+    markers: list[RosValues] = [{"header": header, "ns": ZONE_MARKERS, "action": 3}]  # delete all
+    for number, zone in enumerate(zone for zone in message.zones if zone.corners):
+        colour = (0.9, 0.2, 0.2, 0.9) if zone.kind == "keepout" else (0.9, 0.7, 0.1, 0.9)
+        if zone.off_until is not None:
+            colour = (0.5, 0.5, 0.5, 0.9)
+        words = zone.name if zone.limit is None else f"{zone.name} {zone.limit:g} m/s"
+        corners = [vector(x, y) for x, y in zone.corners]
+        line = _marker(header, ZONE_MARKERS, 2 * number, _LINE_STRIP, colour)
+        text = _marker(header, ZONE_MARKERS, 2 * number + 1, _TEXT, (1.0, 1.0, 1.0, 1.0))
+        x, y = (sum(values) / len(corners) for values in zip(*zone.corners, strict=True))
+        # 0.03, 0.15: m, width of the line, size of the letters
+        markers.append(line | {"scale": vector(0.03), "points": [*corners, corners[0]]})
+        markers.append(text | {"pose": pose_of(Pose2D(x=x, y=y, yaw=0.0)), "scale": vector(z=0.15), "text": words})
     return {"markers": markers}
 
 

@@ -30,6 +30,7 @@ from monstertruck_schemas.sensor import (
 )
 from monstertruck_schemas.state import ClockOffset, Grid, Ground, Odometry, Transforms
 from monstertruck_schemas.topics import Topic
+from monstertruck_schemas.zones import Zones
 from monstertruckd.ros2 import convert
 from monstertruckd.ros2.cdr import RosMessage
 from monstertruckd.ros2.facts import RobotFacts, renamed_links
@@ -172,6 +173,7 @@ class RosFace:
             (t.EVENT, self._event),
             (t.LOG, self._log),
             (t.POINTS, self._points),
+            (t.ZONES, self._zones),
         )
 
     def _follow_clock(self, message: ClockOffset) -> None:
@@ -294,6 +296,10 @@ class RosFace:
     def _points(self, message: PointsOfInterest) -> None:
         values = convert.point_markers(message, self._names)
         self._publish("points", "visualization_msgs/msg/MarkerArray", values, LATCHED)
+
+    def _zones(self, message: Zones) -> None:
+        values = convert.zone_markers(message, self._names)
+        self._publish("zones", "visualization_msgs/msg/MarkerArray", values, LATCHED)
 
     async def _diagnose(self) -> None:
         """Once a second: the state of services, gate and this face, and the footprint."""

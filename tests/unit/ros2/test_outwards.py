@@ -15,6 +15,7 @@ from monstertruck_schemas.body import LensConfig
 from monstertruck_schemas.plan import ExplorationPhase, ExplorationState, GoalPhase, GoalState
 from monstertruck_schemas.sensor import DriveFeedback, DriveMode, SteeringFeedback
 from monstertruck_schemas.state import Grid, Ground, Peer, Peers
+from monstertruck_schemas.zones import Zone, ZoneMask, Zones
 from monstertruckd.config.load import load_truck
 from monstertruckd.ros2 import convert
 from monstertruckd.ros2.cdr import decode, encode
@@ -104,7 +105,7 @@ def test_displays_of_rviz_read_topics_as_the_face_publishes_them():
         assert interface == KINDS[display["Class"].rpartition("/")[2]]
         assert (topic["Durability Policy"] == "Transient Local") == qos.latched
         assert (topic["Reliability Policy"] == "Best Effort") == (not qos.reliable)
-    assert shown == 7
+    assert shown == 8
 
 
 def grid(x, y, width, height):
@@ -186,3 +187,23 @@ def test_the_goal_the_next_frontier_and_robots_heard_lately_are_marked():
     assert markers[0]["pose"]["position"] == {"x": 1.0, "y": 2.0, "z": 0.0}
     ended = goal.model_copy(update={"phase": GoalPhase.IDLE})
     assert len(convert.task_markers(ended, None, None, RosNames())["markers"]) == 1
+
+
+def test_zones_are_polygons_with_their_names_and_grey_while_off():
+    corners = ((0.0, 0.0), (2.0, 0.0), (1.0, 3.0))
+    mask = ZoneMask(resolution=0.1, width=1, height=1, x=0.0, y=0.0, limits=(0.0,), runs=(1, 1))
+    zones = (
+        Zone(name="stairs", kind="keepout", corners=corners),
+        Zone(name="keepout_mask", kind="keepout", mask=mask),
+        Zone(name="hall", kind="speed", corners=corners, limit=0.1, off_until=5),
+    )
+    markers = convert.zone_markers(Zones(stamp=0, received=0, seq=0, zones=zones), RosNames())["markers"]
+    assert [one["ns"] for one in markers] == ["zones"] * 5
+    assert len({one.get("id") for one in markers}) == 5
+    keepout, words, speed = markers[1], markers[2], markers[3]
+    assert [(at["x"], at["y"]) for at in keepout["points"]] == [*corners, corners[0]]
+    assert words["text"] == "stairs"
+    assert words["pose"]["position"] == {"x": 1.0, "y": 1.0, "z": 0.0}
+    assert markers[4]["text"] == "hall 0.1 m/s"
+    assert speed["color"]["r"] == speed["color"]["g"] == speed["color"]["b"]
+    assert keepout["color"]["r"] > keepout["color"]["g"]
