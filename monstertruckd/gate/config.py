@@ -85,6 +85,15 @@ class SteeringCheckConfig(Schema):
     """Tolerated difference due to tyre slip and calibration, as a fraction of the larger turn."""
 
 
+class AssistConfig(Schema):
+    """Assisted driving: an operator's motion is turned to the nearest curvature whose swept ground is free."""
+
+    on: Annotated[bool, LIVE] = False
+    """Steer round obstacles; the operator's speed is never raised"""
+    horizon: LivePositive = 0.6
+    """Distance kept free beyond the stopping distance, m."""
+
+
 class ObstacleLimits(Schema):
     """Clearance kept along the swept path."""
 
@@ -249,6 +258,7 @@ class GateConfig(Schema):
     battery_low_speed: LivePositive = 0.1
     """Speed limit with a low battery, or a stale battery voltage, m/s."""
     obstacle: ObstacleLimits = ObstacleLimits()
+    assist: AssistConfig = AssistConfig()
     sonar: SonarLimits = SonarLimits()
     unwitnessed: Annotated[float, Field(gt=0, le=1), LIVE] = 0.5
     """Fraction of the speed limits while no second, independent sensor measures the robot's motion."""

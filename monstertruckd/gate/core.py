@@ -30,6 +30,7 @@ from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Or
 from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import BATTERY, COMPASS, DRIVES, SCAN, STEERING, Topic
 from monstertruckd.gate.arbitration import EventLog, GateEvent, GateStateMachine, Source, Sources
+from monstertruckd.gate.assist import Assist
 from monstertruckd.gate.catalog import CheckConfig
 from monstertruckd.gate.checks import Check, Checks, GateView, Tick
 from monstertruckd.gate.config import GateConfig, InForce
@@ -126,6 +127,8 @@ def obstacle_checks(
     lidar = None if sonars else ObstacleCheck(view, points, rear_sonars)
     sonar = SonarCheck(view, sonars) if sonars else None
     yield from (check for check in (lidar, sonar) if check is not None)
+    if lidar is not None:
+        yield Assist(view, lidar.guard)
     if peers:
         yield PeerCheck(view, peers, None if lidar is None else lidar.guard, None if sonar is None else sonar.guard)
 
@@ -243,6 +246,7 @@ class Gate:
             )
         )
         self._obstacles = next((check for check in self._checks if isinstance(check, ObstacleCheck)), None)
+        self._assist = next((check for check in self._checks if isinstance(check, Assist)), None)
         self._outages = Outages(services)
         self._stops = StopLog(self._outages)
         self._known: dict[Reason, int] = {}
@@ -517,6 +521,9 @@ class Gate:
         request = None if holder is None else holder.request
         if request is not None and self._contact is not None:
             request = self._contact.instead(request, now)
+        if self._assist is not None:
+            by_hand = holder is not None and not holder.inside and self._config.assist.on
+            request = self._assist.instead(request if by_hand else None, now) or request
         courses = self._limiter.aim(now, dt, request)
         limits = self._checks.limits(now, courses)
         self._limiter.advance(dt, limits)

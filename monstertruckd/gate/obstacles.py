@@ -118,6 +118,7 @@ class ObstacleGuard:
         kept = limits.config.obstacle
         self.memory = ScanMemory(footprint, points.mount, kept.memory_distance, kept.memory_time, kept.memory_deviation)
         self._points = np.empty((0, 2))
+        self._measured = np.empty((0, 2))
         self._stamp = 0
         self.unseen: float | None = 0.0
         """Age of the oldest view of a sector of travel at the latest scan, s; None if a sector was never seen."""
@@ -153,6 +154,23 @@ class ObstacleGuard:
         """Length of the sweep, m."""
         return self._reach
 
+    @property
+    def stamp(self) -> int:
+        """Stamp of the latest scan, ns."""
+        return self._stamp
+
+    def points(self, within: float, *, reverse: bool) -> Array:
+        """Return measured and remembered points in base at the latest scan, shape (n, 2), m.
+
+        Args:
+            within: greatest distance from the base, m.
+            reverse: whether the points of the rear sonars belong to them.
+        """
+        seen = (self._measured, self.memory.points(), *((self.memory.echoes(),) if reverse else ()))
+        points: Array = np.concatenate(seen)
+        points = points[np.hypot(points[:, 0], points[:, 1]) < within]
+        return points[~on_body(self._footprint, points, -self._footprint.padding)]
+
     def looks_at(self, points: Array) -> NDArray[np.bool_]:
         """Whether each point (n, 2) in base (m) lies in the lidar's field of view."""
         return self._visibility.covers(points)
@@ -178,6 +196,7 @@ class ObstacleGuard:
         """Take a scan."""
         points = self._scan_points.of(scan)
         self._visibility.observe(scan, points)
+        self._measured = points
         near = points[np.hypot(points[:, 0], points[:, 1]) < self._near]
         age = self._visibility.age(self._points, scan.stamp)
         # Points of a sector are kept while the sector is not seen, until they are too old.

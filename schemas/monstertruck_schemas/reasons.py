@@ -91,6 +91,7 @@ class Reason(StrEnum):
     STEERING_DEAD = "steering_dead", 66, "the robot does not turn as it is steered"
     IMPOSSIBLE_MOTION = "impossible_motion", 67, "this body cannot move like that"
     SERVO_LIMIT = "servo_limit", 68, "a steering servo is at the end of its range: less steering than requested"
+    ASSISTED = "assisted", 0, "assisted driving steers round an obstacle"
     LIDAR_SLOW = "lidar_slow", 70, "the lidar does not see the direction of travel: speed limited"
     LIDAR_BLIND = "lidar_blind", 71, "the lidar has not seen the direction of travel for too long"
     UNSEEN_SLOW = "unseen_slow", 76, "ground that no scan has seen lately: speed limited"

@@ -38,7 +38,7 @@ REQUEST_RATE: Final = 20.0
 """Drive requests per second."""
 NEUTRAL_REQUESTS: Final = 6
 """Number of neutral requests after the gamepad was let go, so that the truck stops by its ramp."""
-QUIET: Final = frozenset({Reason.CLIPPED, Reason.SERVO_LIMIT})
+QUIET: Final = frozenset({Reason.CLIPPED, Reason.SERVO_LIMIT, Reason.ASSISTED})
 """Limits caused by the driver's request, which the driver already knows."""
 HELP = "Enter arm  WASD drive  space E-STOP  Esc stop  r reset  x straight  q end"
 ARROWS = {1: "▲ forward", -1: "▼ back", 0: "standing"}

@@ -36,6 +36,7 @@ DELIVERED = {
     "short_faults": 4,
     "short_faults_within": 10.0,
     "battery_low_speed": 0.1,
+    "assist": {"on": False, "horizon": 0.6},
     "obstacle": {
         "ahead": 0.05,
         "side_clearance": 0.02,

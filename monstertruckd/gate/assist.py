@@ -1,0 +1,141 @@
+"""Assisted driving: turns an operator's motion to the nearest curvature whose swept ground is free.
+
+The operator's speed is never raised, and a request for standstill stays one. All checks of the gate see the turned
+motion as if the operator had asked for it.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import numpy as np
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_planners.collision import Footprint
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import DriveForm, DriveRequest
+from monstertruckd.gate.approach import stopping
+from monstertruckd.gate.checks import Check, GateView, PaceLimit
+from monstertruckd.gate.motion import Course
+from monstertruckd.gate.obstacles import ObstacleGuard
+
+CHOICES: Final = 12
+"""Number of turns to each side that are compared."""
+
+
+def nearest_free(turns: Array, free: Array, needed: float) -> float:
+    """Return the smallest turn that leaves ``needed`` metres free, or else the one that leaves most.
+
+    Args:
+        turns: deviations from the asked motion, shape (n,), in any unit.
+        free: free distance of each, shape (n,), m.
+        needed: m.
+    """
+    free = np.minimum(free, needed)
+    best = np.flatnonzero(free >= free.max() - 1e-9)
+    return float(turns[best[np.argmin(np.abs(turns[best]))]])
+
+
+def free_distances(twists: Array, footprint: Footprint, margin: float, points: Array) -> Array:
+    """Return how far a body gets on the arcs of constant twists before it touches a point, +inf if it never does.
+
+    Discs cover the footprint. A point inside of a disc counts if the disc moves towards it.
+
+    Args:
+        twists: vx, vy, wz of the base per metre travelled, shape (k, 3).
+        footprint: outline.
+        margin: added on all sides, m.
+        points: in base, shape (n, 2), m.
+
+    Returns:
+        Shape (k,), m.
+    """
+    if not len(points):
+        return np.full(len(twists), math.inf)
+    places, radius = footprint.covering_discs()
+    radius += margin
+    vx, vy, turn = twists.T
+    # 1e-3: a straight line is computed as a circle of 1000 m, 1 mm off after 1.4 m
+    turn = np.where(np.abs(turn) < 1e-3, 1e-3, turn)
+    side = np.sign(turn)[:, None]
+    centre = np.column_stack((-vy / turn, vx / turn))
+    arms = points[None] - centre[:, None]
+    reach, bearing = np.hypot(arms[..., 0], arms[..., 1]), np.arctan2(arms[..., 1], arms[..., 0])
+    result = np.full(len(twists), math.inf)
+    for disc in places.tolist():
+        arm = np.array((disc, 0.0)) - centre
+        size, begin = np.hypot(*arm.T)[:, None], np.arctan2(arm[:, 1], arm[:, 0])[:, None]
+        cosine = (reach**2 + size**2 - radius**2) / np.maximum(2.0 * reach * size, 1e-12)
+        ahead = np.mod(side * (bearing - begin), math.tau) - np.arccos(np.clip(cosine, -1.0, 1.0))
+        distance = np.where(cosine <= 1.0, np.maximum(ahead, 0.0) / np.abs(turn)[:, None], math.inf)
+        dx, dy = points[:, 0] - disc, points[:, 1]
+        towards = vx[:, None] * dx + (vy + turn * disc)[:, None] * dy > 0.0
+        inside = np.hypot(dx, dy) <= radius
+        distance = np.where(inside, np.where(towards, 0.0, math.inf), distance)
+        result = np.minimum(result, distance.min(axis=1))
+    return result
+
+
+class Assist(Check):
+    """Turns the requests of operators while ``gate.assist.on``; as a check, it shows when it does.
+
+    Args:
+        view: limits, samples and motion.
+        guard: measured and remembered points.
+    """
+
+    reasons = (Reason.ASSISTED,)
+
+    def __init__(self, view: GateView, guard: ObstacleGuard) -> None:
+        super().__init__(view)
+        self._guard = guard
+        self._turned = False
+        self._chosen: tuple[tuple[float, ...], float] = ((), 0.0)
+        """What the latest choice depends on, and the turn chosen (rad)."""
+
+    def instead(self, request: DriveRequest | None, now: int) -> DriveRequest | None:
+        """Return the request to be driven: the operator's, or one that turns more or less; None if none is assisted."""
+        self._turned = False
+        view = self.view
+        if (
+            request is None
+            or request.form is not DriveForm.AXLES
+            or request.neutral
+            or view.chassis.freedom == "parallel"
+        ):
+            return request
+        if not view.samples.scan_fresh(now):
+            return request
+        depends = (request.speed, request.front, request.rear, view.config.assist.horizon, self._guard.stamp)
+        if depends != self._chosen[0]:
+            self._chosen = depends, self._choose(request, now)
+        turn = self._chosen[1]
+        self._turned = turn != 0.0
+        front, rear = self._axles(request, turn)
+        return request.model_copy(update={"front": front, "rear": rear}) if self._turned else request
+
+    def _choose(self, request: DriveRequest, now: int) -> float:
+        """Return by how much each axle turns further than asked (rad)."""
+        config, bicycle = self.view.config, self.view.chassis.bicycle
+        # Both ends turn the axles to their limit, whatever the request.
+        turns = 2.0 * config.angle * np.arange(-CHOICES, CHOICES + 1) / CHOICES
+        ahead = math.copysign(1.0, request.speed)
+        twists = [bicycle.body_twist(ahead, *self._axles(request, turn)) for turn in turns.tolist()]
+        slowing = stopping(abs(request.speed), self._guard.delay(now), config.obstacle.deceleration)
+        needed = slowing + config.obstacle.ahead + config.assist.horizon
+        footprint, margin = self.view.footprint, config.obstacle.side_clearance
+        points = self._guard.points(needed + footprint.circumscribed_radius + margin, reverse=ahead < 0)
+        return nearest_free(turns, free_distances(np.array(twists), footprint, margin, points), needed)
+
+    def _axles(self, request: DriveRequest, turn: float) -> tuple[float, float]:
+        """Return the asked axle angles, each turned further to one side, within the limits."""
+        most, chassis = self.view.config.angle, self.view.chassis
+        front = min(max(request.front + turn, -most), most)
+        if chassis.freedom != "both":
+            return front, request.rear
+        return front, min(max(request.rear - turn, -most), most)
+
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
+        """Show that the motion is turned; it limits nothing."""
+        if courses and self._turned:
+            yield PaceLimit(Reason.ASSISTED, self.view.motion.max_pace(courses[0][0]))
