@@ -81,9 +81,6 @@ INSTEAD = {
     "monstertruckd drive --mapping pad.yaml": Instead(
         None, "needs the file; tests/unit/tools/driving/test_gamepad.py reads mappings"
     ),
-    "monstertruckd probe lidar --port /dev/ttyACM0": Instead(
-        None, "needs the device; tests/daemon/test_commands_wall.py probes its emulator"
-    ),
     "monstertruckd station --robot truck@tcp/127.0.0.1:7447": Instead(
         None, "serves until it is stopped; tests/daemon/test_station_wall.py opens its page"
     ),
