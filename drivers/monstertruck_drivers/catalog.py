@@ -186,7 +186,7 @@ ENCODERS: Final = RoleSpec(
 HAND: Final = RoleSpec(
     name=DeviceRole.HAND.value,
     duty=Duty.SENSOR,
-    doc="Receiver of the radio control of the operator beside the robot; without it the robot does not move",
+    doc="Receiver of the hand-held radio control; without it the robot does not move",
     writes={"out": topics.HAND},
     start=5,
 )
@@ -240,7 +240,7 @@ class UsbIdentity(NamedTuple):
 class DeviceKind(Plugin):
     """One kind of device; ``implementation`` is its driver.
 
-    A driver is a ``Service``, made with its settings, what it opens, the clock, and by name the ends of its role's
+    A driver is a ``Service``, made with its settings, the opened port, the clock, and by name the ends of its role's
     topics, ``events`` and ``name``.
     """
 
@@ -254,11 +254,11 @@ class DeviceKind(Plugin):
     """Topics written in addition to the role's topics, by the driver's parameter. The driver gets None if the topic is
     the main topic of another configured device."""
     opens: Literal["serial", "i2c", "video", "computer"] = "serial"
-    """What the driver gets: the ``Port`` of a serial line or of an I2C bus, a ``FrameSource``, or the ``Computer``."""
+    """Input of the driver: the ``Port`` of a serial line or of an I2C bus, a ``FrameSource``, or the ``Computer``."""
     baud: int | None = None
-    """Baud rate of its serial line; None = USB from end to end, any rate works."""
+    """Baud rate of its serial line; None if the device is USB throughout and any rate works."""
     framing: Framing | None = None
-    """Bits of a byte on its serial line; None = 8N1."""
+    """Bits of a byte on its serial line; None selects 8N1."""
     usb: UsbIdentity | None = None
 
     @property
@@ -276,10 +276,10 @@ class DeviceKind(Plugin):
         Args:
             where: ``Port`` of a serial line or of an I2C bus, path of a video device, or the ``Computer``.
             clock: time.
-            settings: settings of the driver; None = defaults.
+            settings: settings of the driver; None selects the defaults.
 
         Returns:
-            JSON-able: what the device says of itself; of a device on a port first ``device`` and ``port``.
+            JSON-able: the facts that the device reports; for a device on a port preceded by ``device`` and ``port``.
 
         Raises:
             DeviceLostError: not plugged in.

@@ -17,7 +17,7 @@ from monstertruck_schemas.sensor import DriveFeedback, DriveMode
 
 
 class MotorSettings(Protocol):
-    """What the base reads of a driver's settings."""
+    """Settings of a driver that the base reads."""
 
     @property
     def rate(self) -> float:
@@ -51,7 +51,7 @@ def requested(
     Args:
         commands: latest command of each shaft, if any.
         now: time, ns.
-        timeout: age from which a command stops the motors (s).
+        timeout: maximum age of a command (s); an older one stops the motors.
 
     Returns:
         DISABLED, QUICK_STOP or ENABLED, and the commands there are: with ENABLED one for each shaft.
@@ -159,7 +159,7 @@ class MotorBoard(ABC, Generic[Settings, Session]):
 
     @abstractmethod
     async def _exchange(self, session: Session) -> None:
-        """Send the set-points, set ``_sent``, and publish what the board answers."""
+        """Send the set-points, set ``_sent``, and publish the answer of the board."""
 
     @abstractmethod
     async def _make_safe(self, session: Session) -> None:

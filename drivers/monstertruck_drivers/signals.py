@@ -45,7 +45,7 @@ class Context:
     """Inputs of a distortion.
 
     Args:
-        newest: latest true value of the signal, None if it had none.
+        newest: latest true value of the signal; None before the first one.
         neighbour: returns the last true value of the next signal of the same kind, None if it had none.
         rng: randomness.
     """
@@ -208,7 +208,7 @@ class SignalFault:
     Args:
         make: builds the distortion from its context and, if it has one, its argument.
         kinds: applicable kinds of signals.
-        argument: name and unit of the argument for help texts; empty = it takes none.
+        argument: name and unit of the argument for help texts; empty for a fault without an argument.
     """
 
     make: Callable[..., Distortion]
@@ -250,7 +250,8 @@ class Signals:
         now: returns the time, ns.
         kinds: kinds of the signals by name; their order defines the neighbours.
         rng: the device's randomness; the faults' randomness is spawned from it.
-        codes: arrays in which values below a minimum are codes; faults that calculate leave codes unchanged.
+        codes: minimum of the measured values, by array; lower values are codes, which arithmetic faults do not
+            change.
     """
 
     def __init__(
@@ -268,7 +269,7 @@ class Signals:
         self._greatest: dict[str, float] = {}
         self._active: dict[str, list[Distortion]] = {}
         self._due: dict[str, int] = {}
-        """Instant at which a signal's latest delayed command is obeyed (ns); later commands never overtake it."""
+        """Execution time of a signal's latest delayed command (ns); later commands never overtake it."""
 
     def faults(self) -> Iterator[tuple[str, str]]:
         """Yield every (signal, fault) that ``inject`` accepts; ``swapped`` only where there is a neighbour."""
@@ -282,7 +283,7 @@ class Signals:
         return name in self._newest
 
     def extent(self, name: str) -> float:
-        """Return the maximum magnitude of a number, array or order so far, in its unit; 0 = none yet."""
+        """Return the maximum magnitude of a number, array or order so far, in its unit; 0 before the first value."""
         newest = self._newest.get(name)
         return float(np.abs(newest).max()) if isinstance(newest, np.ndarray) else self._greatest.get(name, 0.0)
 
@@ -310,7 +311,7 @@ class Signals:
         self._active.setdefault(name, []).append(distortion)
 
     def report(self, name: str, value: T) -> T:
-        """Return what the device reports for the true ``value``."""
+        """Return the value that the device reports instead of the true ``value``."""
         self._remember(name, value)
         distortions = self._active.get(name)
         if distortions is None:

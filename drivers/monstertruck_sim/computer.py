@@ -16,7 +16,7 @@ from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
 
 OTHER = UsbIdentity("1a86:7523", "USB Serial", "ttyUSB")
-"""A device whose kind says nothing of USB hangs on an adapter."""
+"""A device whose kind declares no USB identity is connected to an adapter."""
 DISK = Disk(total=64_000_000_000, free=32_000_000_000)
 """Disk of an emulated computer; on the real one, every run would record something else."""
 HELP = "known: lose HUB, return HUB, over-current PLACE, suspend PLACE; places as in 1-1.2"
@@ -28,7 +28,7 @@ class UsbCable:
     Args:
         usb: the tree.
         where: kernel's name of the device's place.
-        cable: what its node leads to.
+        cable: cable behind its node.
     """
 
     def __init__(self, usb: EmulatedUsb, where: str, cable: EmulatedPort) -> None:
@@ -113,7 +113,7 @@ class EmulatedComputer:
             self.ports[role] = UsbCable(self.usb, port.device, cables[role])
 
     def computer(self) -> Computer:
-        """What a daemon in this process takes for its computer."""
+        """Computer that a daemon in this process uses."""
         return Computer(self.usb.machine(self._clock), self.folder, lambda: self.usb.watcher, lambda _: DISK)
 
     def command(self, words: list[str]) -> None:

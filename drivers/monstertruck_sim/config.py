@@ -65,7 +65,7 @@ class SimConfig(Schema):
     stand: StandConfig = StandConfig()
     """How `stand: simulator` sees the robot"""
     drill: DrillConfig | None = None
-    """Faults that happen by themselves; null = none"""
+    """Faults that happen without an operator; null disables them"""
     recording: Path | None = None
     """Lidar recording (text columns, gzip) that the emulated lidar serves instead of the world"""
 

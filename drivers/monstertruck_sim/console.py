@@ -123,10 +123,10 @@ def set_line_fault(faults: LineFaults, name: str, value: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class CommandedGroup:
-    """Several things of which a command names one first; of a single one it may leave the name out."""
+    """Several things of which a command names one first; with a single thing the name is optional."""
 
     kind: str
-    """What they are, in a word."""
+    """Noun for the things, for messages."""
     members: Mapping[str, Commanded]
 
     def command(self, words: list[str]) -> None:

@@ -1,4 +1,4 @@
-"""Faults of the simulation: what can be injected, where, and the catalog from which random ones are drawn.
+"""Faults of the simulation: their kinds, their places, and the catalog of random faults.
 
 A fault is a pair of actions on a ``SimContext``: one starts it, one ends it. Scripted scenarios and random drills both
 are made of the actions defined here.
@@ -112,7 +112,7 @@ class Workers(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SimContext:
-    """What faults act on: the simulated side, and of the daemon its disk, workers and its computer's supply only.
+    """Targets of faults: the simulated side, and from the daemon only its disk, its workers and its computer's supply.
 
     Args:
         config: of the simulation.
@@ -156,7 +156,7 @@ class SimContext:
                 self.device(role).command(line.split())
 
     def monitored(self, name: str, fault: str, *values: str) -> None:
-        """Change what a monitor sees; nothing where the truck has none of the name."""
+        """Change the readings of a monitor; do nothing if the truck has no monitor of that name."""
         if name in self.robot.monitored:
             self.robot.monitored[name].inject(fault, *values)
 
@@ -166,7 +166,7 @@ class SimContext:
             self.computer.usb.lose_hub(hub)
 
     async def return_hubs(self, *hubs: str, enumerated: bool = False) -> None:
-        """Bring them back; the kernel enumerates each hub by a work item of its own (``usb_hub_wq``), so side by side.
+        """Bring them back; the kernel enumerates each hub in a separate work item (``usb_hub_wq``), so in parallel.
 
         Args:
             hubs: names.
@@ -228,7 +228,7 @@ def command(role: str, *lines: str) -> Action[SimContext]:
 
 
 def monitored(name: str, fault: str, *values: str) -> Action[SimContext]:
-    """Change what a monitor sees."""
+    """Change the readings of a monitor."""
     return lambda context: context.monitored(name, fault, *values)
 
 
@@ -272,7 +272,7 @@ class CatalogFault(Fault[SimContext]):
     Args:
         kind: of its kind.
         must_stop: the truck must stand soon, and stay so.
-        disarms: once it stands, it must not set off again by itself.
+        disarms: once it stands, it must not start again by itself.
     """
 
     kind: FaultKind
@@ -285,7 +285,7 @@ Maker = Callable[[np.random.Generator], CatalogFault]
 
 
 def hubs_of(devices: Devices, without: Collection[str] = ()) -> tuple[str, ...]:
-    """Hubs that devices are connected to, but for those of the roles ``without``."""
+    """Hubs with connected devices, except devices of the roles ``without``."""
     hubs: dict[str, set[str]] = {}
     for role, device in devices.present().items():
         if isinstance(device.port, UsbPortConfig):
@@ -333,7 +333,7 @@ class FaultCatalog:
 
     @property
     def kinds(self) -> tuple[FaultKind, ...]:
-        """What ``draw`` can give."""
+        """Faults that ``draw`` can return."""
         return tuple(self._makers)
 
     def draw(self, rng: np.random.Generator, *, without: frozenset[FaultKind] = frozenset()) -> CatalogFault:
@@ -593,7 +593,7 @@ def _clock_jump(rng: np.random.Generator) -> CatalogFault:
 
 
 def _loop_stall(rng: np.random.Generator) -> CatalogFault:
-    """The computer computes something else; devices, cables and world go on."""
+    """Another program uses the computer's processor; devices, cables and world continue."""
     seconds = float(10 ** rng.uniform(-1.3, 0.5))
 
     def stall(context: SimContext) -> None:

@@ -35,7 +35,7 @@ T = TypeVar("T")
 
 ACKNOWLEDGE_TIMEOUT = 0.1
 QUIET = 0.55
-"""Silence after which a controller with factory settings has certainly dropped a half frame (s)."""
+"""Silence that makes a controller with factory settings drop half a frame with certainty (s)."""
 QUICK_ANSWER = 0.05
 """Maximum duration of the latest exchanges on a quick line (s): a byte that has not arrived by then is lost, not
 late."""
@@ -48,7 +48,7 @@ STRAY_LIMIT = 3
 ATTEMPTS = 3
 """Attempts at an exchange outside the schedule."""
 BRIEF_SILENCES = 2
-"""Consecutive failures up to which a brief silence suffices. The second failure most likely has the same cause as the
+"""Maximum consecutive failures that need a brief silence only. The second failure most likely has the same cause as the
 first, as the request is repeated within some 130 ms; a controller that lost the time-out set by the host needs a long
 silence."""
 
@@ -59,7 +59,7 @@ class ObjectError(ProtocolError):
     """The controller answered with a communication error.
 
     Args:
-        subject: what was requested.
+        subject: name of the request.
         code: 32-bit error code.
     """
 
@@ -78,7 +78,7 @@ class Exchanger:
         link: open link to the controller.
         clock: time.
         node: node id.
-        quiet_until: instant before which nothing may be sent, left by an earlier link.
+        quiet_until: end of the silence that an earlier link requires (ns).
     """
 
     def __init__(self, link: Link, clock: Clock, node: int, quiet_until: int = 0) -> None:
@@ -89,7 +89,7 @@ class Exchanger:
         self._hurried = False
         """A task waits for the end of the exchange that is read."""
         self.quiet_until = quiet_until
-        """Instant from which the controller listens again; in the past during normal operation."""
+        """Time when the controller listens again (ns); in the past during normal operation."""
         self.strange = b""
         """Latest unexpected bytes."""
         self.acknowledged = False
@@ -101,7 +101,7 @@ class Exchanger:
         self.durations: deque[int] = deque(maxlen=RECENT)
         """Durations of the latest complete exchanges (ns)."""
         self._frame_timeout: float | None = None
-        """Time-out set by the host after which the controller drops a half frame (s); None = factory setting."""
+        """Timeout for half frames that the host has set in the controller (s); None for the factory setting."""
         self._answer_awaited = False
         """The controller has the request, so late bytes are its answer."""
         self._failures = 0
@@ -226,7 +226,7 @@ class Exchanger:
         Raises:
             DeviceLostError: the link went down.
         """
-        quiet_limit = 1.1  # seconds after which a line that is never silent is used anyway: it is not an EPOS
+        quiet_limit = 1.1  # maximum wait for silence (s); a line that is never silent is no EPOS, and is used anyway
         limit = self._clock.now() + int(quiet_limit * SECOND)
         while (left := min(self.quiet_until, limit) - self._clock.now()) > 0:
             with suppress(TimeoutError):

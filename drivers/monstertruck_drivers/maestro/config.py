@@ -70,9 +70,9 @@ class MaestroConfig(Schema):
     rear_right: ServoConfig | None = None
     """Servo of the rear right wheel; ``rear`` is then the rear left wheel"""
     dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Dead time from a steering command to the first movement of the wheels (s); null = not measured"""
+    """Dead time from a steering command to the first movement of the wheels (s); null if it was not measured"""
     lag: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Time constant of the wheels' movement after the dead time (s); null = not measured"""
+    """Time constant of the wheels' movement after the dead time (s); null if it was not measured"""
     battery: BatteryInputConfig | None = BatteryInputConfig()
     poll_rate: Annotated[float, Field(gt=0, le=50)] = 20.0
     """Times a second both pulses and the error word are read."""
@@ -81,13 +81,13 @@ class MaestroConfig(Schema):
     answer_timeout: Annotated[float, Field(gt=0, le=1)] = 0.1
     """Timeout of all answers to one poll (s)."""
     command_timeout: Annotated[float, Field(gt=0, le=2)] = 0.25
-    """Age at which a steering command is stale (s): the servos hold, the deadman is released."""
+    """Maximum age of a steering command (s); the servos then hold their position and the deadman line is released."""
     deadman_channel: Channel | None = None
     """Digital output held high while commands are fresh; wire it to the motor controller's quick-stop input."""
     deadman_feed: Literal["fresh", "always"] = "fresh"
     """When the Maestro's own serial time-out is fed: see ``MaestroDriver``."""
     device_number: Annotated[int, Field(ge=0, le=127)] | None = None
-    """Use the Pololu protocol with this number; None = compact protocol."""
+    """Device number of the Pololu protocol; null selects the compact protocol."""
     use_crc: bool = False
     """Must equal the unit's own setting."""
 

@@ -26,7 +26,7 @@ from monstertruck_runtime.clock import SECOND, Clock
 TICK: Final = 10_000_000
 """Nanoseconds between two steps of a ramp."""
 AT_JUNK: Final = b"AT\r\nAT+CGMI\r\nATI\r\n"
-"""What modem managers send into a serial port they do not know."""
+"""Bytes that a modem manager sends to an unknown serial port."""
 
 CHANNEL_ORDERS: Final = {
     Code.SET_TARGET: "target",
@@ -90,7 +90,7 @@ class MaestroEmulator(FaultyDevice):
         mode: serial mode; in ``uart`` (as from the factory) bytes over USB are ignored.
         crc: whether commands must carry a CRC-7 byte.
         device_number: for the Pololu protocol.
-        serial_timeout_s: silence after which all channels go home; 0 = never.
+        serial_timeout_s: serial timeout (s): all channels then go home; 0 disables it.
         home: per channel; default: outputs "off", others "ignore".
         inputs: channels that are analog inputs.
         outputs: channels that are digital outputs.
@@ -185,7 +185,7 @@ class MaestroEmulator(FaultyDevice):
         self._report_outputs()
 
     def set_serial_timeout(self, seconds: float) -> None:
-        """Store the serial timeout after which all channels go home (s); 0 = never."""
+        """Store the serial timeout (s): all channels then go home; 0 disables it."""
         self._timeout = round(seconds * SECOND)
 
     # Interface to the simulated world

@@ -36,9 +36,9 @@ class VescServoConfig(Schema):
     min: Position = 0.15
     max: Position = 0.85
     dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Dead time from a steering command to the first movement of the wheels (s); null = not measured"""
+    """Dead time from a steering command to the first movement of the wheels (s); null if it was not measured"""
     lag: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Time constant of the wheels' movement after the dead time (s); null = not measured"""
+    """Time constant of the wheels' movement after the dead time (s); null if it was not measured"""
 
     @model_validator(mode="after")
     def _centre_within_limits(self) -> Self:
@@ -90,7 +90,7 @@ class VescConfig(Schema):
     servo: VescServoConfig | None = None
     """Servo output, which steers the front axle; null = another device steers, or nothing does"""
     battery: PackConfig | None = None
-    """Pack that supplies the first controller, measured by that controller; null = not measured here"""
+    """Pack that supplies the first controller, measured by that controller; null if another device measures it"""
     battery_rate: Annotated[float, Field(gt=0, le=50)] = 10.0
     """Battery readings per second"""
     rate: Annotated[float, Field(ge=10, le=100)] = 40.0
@@ -98,9 +98,9 @@ class VescConfig(Schema):
     answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.03
     """Timeout of an answer (s)"""
     command_timeout: Seconds = 0.25
-    """Age of the latest command at which the motors brake (s)"""
+    """Maximum age of the latest command (s); the driver then brakes the motors"""
     watchdog: Annotated[float, Field(ge=0.05, le=1.0)] = 0.1
-    """Time without a set-point after which the controller itself brakes (s); written to it at every start"""
+    """Watchdog time of the controller (s): it brakes without a set-point; the driver writes it at every start"""
 
     @property
     def shafts(self) -> int:

@@ -1,4 +1,4 @@
-"""What the controllers move: the motor's shaft and the steering servos' arms."""
+"""Loads of the controllers: the motor's shaft and the steering servos' arms."""
 
 from collections import deque
 from math import copysign, exp, floor, pi, radians

@@ -55,9 +55,9 @@ class MotorConfig(Schema):
     lag: Positive = 0.02
     """Time constant of the controller's speed loop, s."""
     drivetrain_lag: Positive = 0.08
-    """Time constant with which the wheels follow the motor (wind-up of gears, shafts and tyres), s."""
+    """Time constant of the wheels' response to the motor (wind-up of gears, shafts and tyres), s."""
     clutch_force: Positive = 25.0
-    """Pull at the ground at which the slipper clutch slips, N (less than the grip of 35 N: wheels never spin)."""
+    """Pull at the ground that makes the slipper clutch slip, N (less than the grip of 35 N: wheels never spin)."""
     coast_rpm_s: Positive = 30_000.0
     """Deceleration of the unpowered motor by friction, rpm/s."""
     torque_constant: Positive = 0.0127
@@ -283,9 +283,9 @@ class LidarConfig(Schema):
     height: Positive = 0.25
     """Height of the scanning plane above the ground, m."""
     first_step: Annotated[int, Field(ge=0, le=768)] = 44
-    """First step of 0..768 at which a URG-04LX measures."""
+    """First measuring step of a URG-04LX, 0..768."""
     last_step: Annotated[int, Field(ge=0, le=768)] = 725
-    """Last step at which a URG-04LX measures."""
+    """Last measuring step of a URG-04LX, 0..768."""
     min_range: NotNegative | None = None
     """Minimum range, m; null: from the device's data sheet."""
     max_range: Positive | None = None
@@ -358,7 +358,7 @@ class HeldBoard(BoardConfig):
     """A ChArUco board that a person holds in front of a camera, changing its pose at intervals."""
 
     hold: Annotated[float, Field(ge=0.05, le=60)] = 1.5
-    """Time for which each pose is held, s"""
+    """Duration of each pose, s"""
     printed_scale: Annotated[float, Field(gt=0.1, lt=10)] = 1.0
     """Ratio of the true board size to the sizes above"""
 
@@ -418,7 +418,7 @@ class HornConfig(Schema):
     """Assembly of a servo of the lidar mount."""
 
     zero: float | None = None
-    """Position at which the lidar is parallel to the body, steps; None: from the driver settings."""
+    """Position of a lidar parallel to the body, steps; None: from the driver settings."""
     direction: Literal[-1, 1] | None = None
     """+1 if a rising position turns the joint positively (REP 103); None: from the driver settings."""
 

@@ -1,4 +1,4 @@
-"""From the configured body, masses and springs to the description of the robot."""
+"""Conversion of the configured body, masses and springs to the description of the robot."""
 
 from math import radians
 
@@ -20,7 +20,7 @@ from monstertruck_sim.world.config import MechanicsConfig, SimTruckConfig
 
 
 def mechanics(truck: SimTruckConfig, config: MechanicsConfig) -> Mechanics:
-    """What the description is made from.
+    """Inputs of the description.
 
     Raises:
         InputError: masses no robot can have.
@@ -70,7 +70,7 @@ def description(
         truck: body and dimensions.
         parts: masses and springs.
         sensors: frames on the chassis.
-        head: the lidar on its joints; None = it is fixed.
+        head: the lidar on its joints; None for a fixed lidar.
 
     Raises:
         InputError: masses or springs no robot can have.

@@ -40,7 +40,7 @@ Obstacle = Disc | Box
 
 
 def discs_and_segments(obstacles: Iterable[Obstacle]) -> tuple[Array, Array]:
-    """What the ray caster eats: discs (n, 3) of x, y, radius and segments (m, 4) of x0, y0, x1, y1."""
+    """Input of the ray caster: discs (n, 3) of x, y, radius and segments (m, 4) of x0, y0, x1, y1."""
     discs: list[tuple[float, float, float]] = []
     segments: list[Array] = []
     for obstacle in obstacles:
@@ -69,7 +69,7 @@ def _disc_penetration(box: Box, disc: Disc) -> float:
 
 
 def _box_penetration(a: Array, b: Array) -> float:
-    """Least overlap over the four edge normals (separating axis theorem)."""
+    """Minimum overlap over the four edge normals (separating axis theorem)."""
     edges = np.array([a[1] - a[0], a[2] - a[1], b[1] - b[0], b[2] - b[1]])
     normals = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]
     on_a, on_b = normals @ a.T, normals @ b.T

@@ -1,8 +1,8 @@
 """Exact ray casting and footprint contact on an occupancy grid, by numba.
 
 A range is the distance to the boundary of the first occupied cell, not a multiple of the cell size. A ray leaps over
-the empty square around its cell, as large as the grid's ``clearance`` there allows, to the very point at which it
-leaves that square: the cells it looks at are among those of a walk cell by cell (Amanatides and Woo, "A Fast Voxel
+the empty square around its cell, as large as the grid's ``clearance`` there allows, to the point where it
+leaves that square: it visits a subset of the cells of a walk cell by cell (Amanatides and Woo, "A Fast Voxel
 Traversal Algorithm for Ray Tracing", 1987), so the range is the same.
 """
 
@@ -27,7 +27,7 @@ def clearance(occupied: NDArray[np.bool_]) -> Clearance:
         occupied: (rows, columns).
 
     Returns:
-        (rows, columns) uint8; what is outside the grid counts as free.
+        (rows, columns) uint8; cells outside the grid are free.
     """
     rows, columns = occupied.shape
     clear = np.empty((rows, columns), np.uint8)
@@ -54,7 +54,7 @@ def clearance(occupied: NDArray[np.bool_]) -> Clearance:
 
 @njit(cache=True)
 def _entry(x: float, direction: float, cells: int) -> float:
-    """Distance after which a ray is between 0 and ``cells`` along one axis; inf if never."""
+    """Distance along a ray to the point where it is between 0 and ``cells`` along one axis; inf if never."""
     if 0.0 <= x < cells:
         return 0.0
     if direction == 0.0 or (x < 0.0) != (direction > 0.0):

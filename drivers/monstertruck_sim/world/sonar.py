@@ -28,7 +28,7 @@ SPEED_OF_SOUND: Final = 343.0
 
 
 Solids = Callable[[float, float, float, float], Caster | None]
-"""What rays meet that leave a body with this yaw, pitch and roll, rad, and height, m, beside the walls of the map."""
+"""Solids that rays hit besides the walls of the map, for a body of a yaw, pitch and roll (rad) and height (m)."""
 
 
 class Ping(NamedTuple):
@@ -88,7 +88,7 @@ def leaning(cast: Caster, yaw: float, pitch: float, roll: float, over: float) ->
         yaw: of the body in the map frame, rad.
         pitch: its nose down positive, rad.
         roll: its right side down positive, rad.
-        over: height of the walls over the sonars, m: what passes above them meets nothing.
+        over: height of the walls over the sonars (m); sound above it passes.
     """
     if pitch == 0.0 and roll == 0.0:
         return cast
@@ -119,7 +119,7 @@ def cone(surfaces: Sequence[Surface], listener: Ping, model: SonarModelConfig) -
     """Return the nearest echo that ``listener`` takes for its own (m); inf if none is within ``range_max``.
 
     Args:
-        surfaces: of every sonar that sent anything since the last sound died away, that of ``listener`` among them.
+        surfaces: surfaces of every sonar that sent anything since the last sound died away, including ``listener``.
         listener: place, axis, and when it sent.
         model: settings.
     """
@@ -132,7 +132,7 @@ def heard(distance: float, model: SonarModelConfig, noise: np.random.Generator |
     Args:
         distance: true one, m; inf = no echo.
         model: settings.
-        noise: two draws are taken; None = none.
+        noise: random generator, of which two draws are taken; None for no noise.
     """
     if noise is not None:
         drawn, kept = noise.standard_normal(), noise.random() >= model.dropout
@@ -168,7 +168,7 @@ def _normals(x: Array, y: Array, ranges: Array) -> tuple[Array, NDArray[np.bool_
     along = np.arctan2(2 * xy, xx - yy) / 2
     middle, half = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     with np.errstate(invalid="ignore"):
-        # 0.25: spread across over spread along, from which on points are no wall but a corner
+        # 0.25: ratio of the spread across to the spread along; points above it are a corner instead of a wall
         scatters |= np.sqrt(np.maximum(middle - half, 0.0)) > 0.25 * np.sqrt(middle + half)
     return along + pi / 2, scatters
 

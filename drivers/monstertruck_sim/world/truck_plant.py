@@ -122,7 +122,7 @@ class TruckPlant(Plant):
     def _accelerate(self, before: tuple[float, float, float], dt: float) -> None:
         vx, vy, wz = self._twist
         true = (vx - before[0]) / dt - wz * vy, (vy - before[1]) / dt + wz * vx
-        # 0.05: time constant with which an accelerometer feels the body's acceleration, s: its mount and filter
+        # 0.05: time constant of the accelerometer's response, s: its mount and filter
         share = 1.0 - exp(-dt / 0.05)
         forward, left = self._felt
         self._felt = forward + share * (true[0] - forward), left + share * (true[1] - left)
@@ -161,7 +161,7 @@ class TruckPlant(Plant):
             self._twist = (0.0, 0.0, 0.0)
         else:
             self._pose, self._twist = pose, twist
-            # 0.005: distance from the place of contact at which the robot is free again, m
+            # 0.005: distance from the place of contact that frees the robot again, m
             if self._stuck_at and hypot(pose[0] - self._stuck_at[0], pose[1] - self._stuck_at[1]) > 0.005:
                 self._stuck_at = None
         self._attitude = self._tilt(self._elapsed, *self._pose)
@@ -177,7 +177,7 @@ class TruckPlant(Plant):
 class _Steering:
     """Steering angles behind the linkage, and how fast the body goes per speed of the wheels; recomputed on change.
 
-    The truck's one motor drives four wheels through open differentials: it turns with the mean of the speeds at which
+    The truck's one motor drives four wheels through open differentials: it turns with the mean of the speeds that
     the body drags them, each along its own angle.
     """
 
@@ -207,13 +207,13 @@ def _tyres(config: SimTruckConfig, chassis: Chassis) -> SingleTrack | None:
 class SkidEffects:
     """Skid-steer effects beyond the kinematic model: unequal wheels, a turn at each reversal, a slow slide.
 
-    The skid-steer paper saw all three: its robot bent within a pass though its motors were commanded alike, turned a
+    The skid-steer paper saw all three: its robot bent within a pass although its motors had equal commands, turned a
     little whenever it reversed, and its circles wandered. Body parameters (turning centres, effective radii) are the
     body's own. Every draw is a function of seed and number of the reversal.
 
     Args:
         config: its parameters.
-        seed: None = every reversal turns by the mean.
+        seed: seed of the turns at reversals; None makes every reversal turn by the mean.
     """
 
     def __init__(self, config: SkidModelConfig, seed: int | None) -> None:
@@ -231,7 +231,7 @@ class SkidEffects:
         return [speed * gain for speed, gain in zip(speeds, gains, strict=True)] if gains else speeds
 
     def twist(self, twist: Twist2, yaw: float, dt: float) -> Twist2:
-        """Velocity of the body, from what its wheels make of it; m/s, rad/s."""
+        """Velocity of the body that results from the motion of its wheels; m/s, rad/s."""
         vx, vy, wz = twist
         turning_time = 0.2  # seconds that the turn at a reversal takes
         if abs(vx) > 1e-3:  # slower robots stand, m/s

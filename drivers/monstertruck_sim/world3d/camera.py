@@ -1,4 +1,4 @@
-"""The truck's camera in three dimensions: rendered by software (EGL) in a thread of its own, then bent by the lens."""
+"""The truck's camera in three dimensions: rendered by software (EGL) in a separate thread, then bent by the lens."""
 
 import weakref
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +14,7 @@ from monstertruck_sim.world3d.plant import RigidPlant
 
 
 class RenderedView(SimulatedView):
-    """``ViewSource`` of a robot of rigid bodies; what it asks of the plane is answered as by ``SimulatedView``.
+    """``ViewSource`` of a robot of rigid bodies; questions about the plane are answered by ``SimulatedView``.
 
     Args:
         drawn: the same camera in the plane.
@@ -25,7 +25,7 @@ class RenderedView(SimulatedView):
     """
 
     HIDDEN: tuple[Group, ...] = (Group.ROBOT,)
-    """Left out of its pictures: what carries it."""
+    """Groups that its pictures omit: the robot that carries it."""
 
     def __init__(self, drawn: SimulatedView) -> None:
         self.__dict__.update(drawn.__dict__)

@@ -1,8 +1,8 @@
 """The engine ``mujoco``: one robot of rigid bodies in the surroundings that all engines share.
 
-Walls, ground and whatever moves are in MuJoCo's model for contact. What the sensors see is cast on the same map and
+Walls, ground and whatever moves are in MuJoCo's model for contact. Sensor rays are cast on the same map and
 heights by the project's own kernels: MuJoCo's rays cost 0.9 ms a scan against 400 boxes and 0.3 s against a field of
-400 x 400 heights. Only what those kernels do not know, blocks on the ground, is seen by MuJoCo's rays.
+400 x 400 heights. Only blocks on the ground, which those kernels do not model, are found by MuJoCo's rays.
 """
 
 from math import hypot, radians
@@ -40,7 +40,7 @@ from monstertruck_sim.world3d.model import (
 from monstertruck_sim.world3d.plant import RigidPlant, Steering
 
 _Shown = tuple[Obstacle, bool] | None
-"""What a spare body stands for, and whether pictures show it: people are drawn as such; None = nothing."""
+"""Meaning of a spare body, and whether pictures show it: people are drawn as such; None for an unused one."""
 
 
 class LevelGround:
@@ -149,7 +149,7 @@ class RigidSpace(Space):
 
 
 class RigidSweep:
-    """Beams over the ground, against walls, and against what stands on it; the mount moves with the body.
+    """Beams over the ground, against walls and against blocks; the mount moves with the body.
 
     Args:
         plant: the robot, in its model.
@@ -223,7 +223,7 @@ def to_blocks(plant: RigidPlant, places: Array, ways: Array, reach: float) -> Ar
     Args:
         plant: the robot, in its model.
         places: where the beams begin, (n, 3), m; neighbours in the array are neighbours in space.
-        ways: unit vectors, (n, 3).
+        ways: directions as unit vectors, (n, 3).
         reach: m.
     """
     count = len(ways)

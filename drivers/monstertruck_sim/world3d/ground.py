@@ -31,7 +31,7 @@ HEIGHT_STEP: Final = 0.05
 """Distance of the points of the height field, m."""
 
 Bounds = tuple[float, float, float, float]
-"""Least and greatest x, then y, m."""
+"""Minimum and maximum x, then y, m."""
 
 
 def ground_heights(

@@ -34,7 +34,7 @@ class HeightGrid:
         return np.asarray(_heights(self.z, self.resolution, *self.origin, *flat)).reshape(shape)
 
     def between(self, x0: float, y0: float, x1: float, y1: float) -> tuple[float, float]:
-        """Least and greatest height of the points in and around a rectangle, m."""
+        """Minimum and maximum height of the points in and around a rectangle, m."""
         rows, columns = self.z.shape
         first = floor((y0 - self.origin[1]) / self.resolution), floor((x0 - self.origin[0]) / self.resolution)
         last = floor((y1 - self.origin[1]) / self.resolution) + 2, floor((x1 - self.origin[0]) / self.resolution) + 2
