@@ -20,6 +20,7 @@ from monstertruck_schemas.plan import TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import ClockOffset, Odometry
 from monstertruck_schemas.topics import BY_NAME, Topic
+from monstertruck_schemas.zones import Zones
 from monstertruckd.recorder.reader import LogMessage, LogReader
 from monstertruckd.tools.logs.messages import Progress, first_offset
 from monstertruckd.tools.logs.report.scan_map import ScanMap
@@ -137,6 +138,7 @@ class RunSummary:
     """Driven path, in the map frame if the log has poses there, else in odom."""
     odometry: DrivenPath = field(default_factory=DrivenPath)
     path_plan: TruckPath | None = None
+    zones: Zones | None = None
     tracker: TrackerState | None = None
     top_speed: float = 0.0
     cross_track_square: float = 0.0
@@ -190,6 +192,7 @@ class Collector:
             (t.ODOMETRY, self._odometry),
             (t.POSE, self._pose),
             (t.PATH, self._path),
+            (t.ZONES, self._zones),
             (t.TRACKER, self._tracker),
             (t.TRANSFORMS, lambda _, m: run.map.scans.transforms(m)),
             (t.MAP, lambda _, m: run.map.grid(m)),
@@ -258,6 +261,9 @@ class Collector:
 
     def _path(self, _: int, path: TruckPath) -> None:
         self._run.path_plan = path
+
+    def _zones(self, _: int, zones: Zones) -> None:
+        self._run.zones = zones
 
     def _tracker(self, _: int, tracker: TrackerState) -> None:
         self._run.tracker = tracker

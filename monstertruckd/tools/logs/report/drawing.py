@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import chain
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.event import Event, Severity
@@ -263,7 +264,9 @@ def scene(run: RunSummary) -> str:
     driven = [(x, y) for _, x, y in run.way.points]
     if picture is None and not planned and not driven:
         return ""
-    area = _around([*planned, *driven], None if picture is None else picture.area)
+    zones = [] if run.zones is None else [zone for zone in run.zones.zones if zone.corners]
+    outlines = [[(x, y) for x, y in zone.corners] for zone in zones]
+    area = _around([*planned, *driven, *chain(*outlines)], None if picture is None else picture.area)
     width, height = area.x1 - area.x0, area.y1 - area.y0
     parts = []
     if picture is not None:
@@ -274,6 +277,10 @@ def scene(run: RunSummary) -> str:
         )
     step = round_step(max(width, height) / 12)
     parts += [_grid(area, step)]
+    parts += [
+        f'<path class="{zone.kind}" d="{_polyline(outline)}Z"><title>{escape(zone.name)}</title></path>'
+        for zone, outline in zip(zones, outlines, strict=True)
+    ]
     parts += [
         f'<path class="{name}" d="{_polyline(way)}"/>'
         for name, way in (("planned", planned), ("driven", driven))
@@ -287,8 +294,12 @@ def scene(run: RunSummary) -> str:
         parts.append(f'<circle class="here" r="{1.2 * radius:.3f}" style="display:none"/>')
     legend = "".join(
         f'<span><svg viewBox="0 0 30 8" class="map"><path class="{name}" d="M0 4H30"/></svg>{text}</span>'
-        for name, text, way in (("planned", "planned", planned), ("driven", "driven (estimated)", driven))
-        if way
+        for name, text, shown in (
+            ("planned", "planned", planned),
+            ("driven", "driven (estimated)", driven),
+            *((kind, f"{kind} zone", True) for kind in dict.fromkeys(zone.kind for zone in zones)),
+        )
+        if shown
     )
     return (
         f'<svg viewBox="{area.x0:.3f} {-area.y1:.3f} {width:.3f} {height:.3f}" role="img" aria-label="map">'

@@ -1,4 +1,5 @@
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,7 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from monstertruck_runtime.clock import SECOND
-from monstertruckd.tools.logs.report.drawing import clock_text, line, time_ticks, value_axis
+from monstertruck_schemas.zones import Zone, Zones
+from monstertruckd.tools.logs.report.collect import RunSummary
+from monstertruckd.tools.logs.report.drawing import clock_text, line, scene, time_ticks, value_axis
 from monstertruckd.tools.logs.report.signals import Trace
 from monstertruckd.tools.logs.report.states import StateSpan, StateTrack, Tone, merged_spans
 
@@ -96,3 +99,19 @@ def test_middle_of_intervals():
     times, values = trace.middle()
     assert times.dtype == np.int64
     assert (times.tolist(), values.tolist()) == ([4, 8], [1.0, 3.0])
+
+
+def test_the_map_shows_zones_and_has_room_for_them():
+    run = RunSummary(Path("run.mcap"), 0)
+    corners = ((5.0, 5.0), (7.0, 5.0), (6.0, 8.0))
+    zones = (Zone(name="stairs", kind="keepout", corners=corners), Zone(name="hall", kind="speed", corners=corners))
+    run.zones = Zones(stamp=0, received=0, seq=0, zones=zones)
+    assert scene(run) == ""
+    run.way.take(0, 0.0, 0.0)
+    picture = scene(run)
+    assert 'class="keepout" d="M5.000 -5.000L7.000 -5.000L6.000 -8.000Z"><title>stairs</title>' in picture
+    assert 'viewBox="-0.350 -8.350 7.700 8.700"' in picture
+    assert "keepout zone" in picture
+    assert "speed zone" in picture
+    run.zones = None
+    assert "zone" not in scene(run)
