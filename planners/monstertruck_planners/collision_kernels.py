@@ -21,7 +21,7 @@ class FieldData(NamedTuple):
     """A grid with a ring of occupied cells around it."""
 
     distance: NDArray[np.float32]
-    """Between the centre of each cell and that of the nearest occupied one, m."""
+    """Distance between the centres of each cell and the nearest occupied cell, m."""
     occupied: NDArray[np.bool_]
     resolution: float
     x: float
@@ -31,7 +31,7 @@ class FieldData(NamedTuple):
     """Pose of the outer corner of the ringed grid's cell (0, 0)."""
     unseen_distance: NDArray[np.float32]
     unseen: NDArray[np.bool_]
-    """As ``distance`` and ``occupied``, of ground that nothing may reverse onto; empty arrays: none."""
+    """Like ``distance`` and ``occupied``, for ground closed to reversing; empty arrays if there is none."""
 
 
 class FootprintData(NamedTuple):
@@ -47,7 +47,7 @@ class FootprintData(NamedTuple):
     inscribed: float
     """Radius of the circle round the pose inside the footprint, m."""
     reach: float
-    """Greatest distance of a disc's centre from the pose, m."""
+    """Maximum distance of a disc's centre from the pose, m."""
 
 
 @njit(cache=True)
@@ -141,7 +141,7 @@ def safe_distance(field: FieldData, footprint: FootprintData, margin: float, x: 
 
 @njit(cache=True)
 def unseen_distance(field: FieldData, footprint: FootprintData, x: float, y: float, yaw: float) -> float:
-    """As ``safe_distance``, to ground that nothing may reverse onto: cells whose middle the footprint would cover."""
+    """Like ``safe_distance``, to ground closed to reversing: cells whose middle the footprint would cover."""
     if field.unseen.size == 0:
         return 1e9
     ground = FieldData(

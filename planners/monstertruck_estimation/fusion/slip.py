@@ -20,7 +20,7 @@ from monstertruck_kinematics.se2 import between, compose, compose_jacobians, int
 from monstertruck_runtime.clock import SECOND
 
 BLIND: Final = SECOND
-"""Time without scans after which wheels are compared with the compass (ns)."""
+"""Maximum time without scans (ns); then the wheels are compared with the compass."""
 SPAN: Final = SECOND
 """Time over which wheels and compass are compared (ns)."""
 
@@ -31,7 +31,7 @@ class SlipChange:
 
     slipping: bool
     since: int
-    """Time from which the wheels are not to be trusted (ns)."""
+    """Begin of the slip: the wheels are not trusted from then on (ns)."""
     text: str
     """Description of the disagreement."""
 

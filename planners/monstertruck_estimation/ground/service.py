@@ -50,7 +50,7 @@ class GroundService:
         events: receives failures to load or save.
         offload: runs the reading and writing of files.
         load: folder of the map known at the start; None without one.
-        save: folder in which the grid is saved, and the run that makes the map; None to save nothing.
+        save: folder of the saved grid, and the run that makes the map; None to save nothing.
     """
 
     name = ServiceName.GROUND.value
@@ -84,7 +84,7 @@ class GroundService:
         self._felt: Tilt | None = None
         self._marked: Array | None = None
         self._travelled: tuple[float, float] | None = None
-        """Position up to which the robot's height is integrated: x and y (m)."""
+        """End of the integration of the robot's height: x and y (m)."""
         self._height = 0.0
         self._hits: deque[tuple[int, Array]] = deque()
         self._changed = False
@@ -161,7 +161,7 @@ class GroundService:
         self._travelled = (x, y)
 
     def _see(self, scan: LaserScan, pose: Array) -> None:
-        """Keep the points of a scan at which it hit the ground."""
+        """Keep the points of a scan that hit the ground."""
         mount, angles = self._mount, None if self._angles is None else self._angles.at(scan)
         if mount is None or angles is None:
             return

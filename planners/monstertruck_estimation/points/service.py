@@ -49,7 +49,7 @@ OLDEST: Final = SECOND
 PERIOD: Final = SECOND
 """Time between two messages (ns)."""
 OTHERS_PAUSE: Final = 0.02
-"""Pause in which other tasks run (s)."""
+"""Pause that lets other tasks run (s)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +177,7 @@ class PointService:
                 answer: ReadAnswer = await actor.step(ReadTask.of(picture.data, self._lens, self._config))
             except WorkerError as error:
                 self._events(error.reason, Severity.ERROR, self.name, str(error))
-                await self._clock.sleep(2.0)  # seconds after which a failed worker is retried
+                await self._clock.sleep(2.0)  # pause before a failed worker is tried again (s)
                 continue
             self._publish_tags(answer, picture)
             if useful and placed is not None:
@@ -339,7 +339,7 @@ class PointService:
     # Requests
 
     async def kept(self) -> None:
-        """Save what is known now, as an answered request has to outlast a power cut, with the map that it belongs to.
+        """Save the current points, as an answered request has to outlast a power cut, with the map that it belongs to.
 
         Raises:
             RequestRefusedError: it cannot be written, or the map is not saved in time; it is tried again.

@@ -122,7 +122,7 @@ class PointMap:
 
         Args:
             name: name of the place; an existing one is moved.
-            stamp: an instant at which the robot was near it (ns).
+            stamp: an instant when the robot was near it (ns).
             base: robot in map at that instant.
             place: place to mark, in map.
             covariance: covariance of the robot's pose, (3, 3).
@@ -146,7 +146,7 @@ class PointMap:
         self.points[name] = replace(point, sightings=(new,))
 
     def stamps(self) -> tuple[int, ...]:
-        """Return the stamps at which the robot's pose is needed."""
+        """Return the stamps of the poses that are needed."""
         return tuple(sorted({one.stamp for point in self.points.values() for one in point.sightings}))
 
     def refresh(self, name: str, bases: Bases) -> None:
@@ -272,7 +272,7 @@ def _agreeing(places: Array, spreads: Array, worth: NDArray[np.int64], config: P
     apart = places[:, None, :2] - places[None, :, :2]
     both = spreads[:, None, :2, :2] + spreads[None, :, :2, :2]
     far = np.einsum("ijk,ijkl,ijl->ij", apart, np.linalg.inv(both), apart)
-    # 3.5: standard deviations at which two sightings disagree
+    # 3.5: minimum difference of two sightings that disagree, in standard deviations
     near = (np.hypot(apart[..., 0], apart[..., 1]) < config.agree) | (far < 3.5**2)
     votes = near @ worth
     best = len(votes) - 1 - int(np.argmax(votes[::-1]))
@@ -306,5 +306,5 @@ def _into_base(base: Pose2) -> Array:
 
 
 def nearest(trail: Sequence[tuple[int, Pose2]], place: Pose2) -> tuple[int, Pose2]:
-    """Return the instant at which the robot was nearest to a place, and its pose then."""
+    """Return the instant when the robot was nearest to a place, and its pose then."""
     return min(trail, key=lambda row: math.dist(row[1][:2], place[:2]))

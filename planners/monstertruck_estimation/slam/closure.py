@@ -8,7 +8,7 @@ closure that the optimised graph rejects is removed.
 
 A place seen again from the other side overlaps little. At the end of a run (``review``), where the drift is small, a
 match is also accepted if the part that must have been in view of the place fits, and neither side looked through the
-other's walls. One such match is no evidence, so supporting ones are needed in any window.
+other's walls. A single match of this kind proves nothing, so it needs supporting matches in any window.
 """
 
 import math
@@ -169,7 +169,7 @@ class LoopCloser:
     def review(self, keyframes: KeyframeMap) -> bool:
         """Search from all keyframes (seconds of work) for places that were only partly seen before.
 
-        For the end of a run, when the surroundings of a place include what came later. True if a closure has moved the
+        For the end of a run, when the surroundings of a place include later keyframes. True if a closure has moved the
         poses.
         """
         self._tried.clear()
@@ -283,7 +283,7 @@ class LoopCloser:
         fit = register(query, submap.cloud, peak.pose)
         ratio, _ = degeneracy(fit.information)
         moved = between(peak.pose, fit.pose)
-        # Least ratio of the eigenvalues of the position's information: below it is a corridor, where a fit proves
+        # Minimum ratio of the eigenvalues of the position's information: below it is a corridor, where a fit proves
         # nothing.
         min_ratio = 0.02
         max_correction = 0.3  # distance between the fine and the coarse fit at most, m
@@ -373,7 +373,7 @@ def consistent_group(keyframes: KeyframeMap, hits: list[LoopMatch]) -> list[Loop
     further away are not compared: both may be right, and the drift larger than its bound.
     """
     best: list[LoopMatch] = []
-    # Length of trajectory within which the drift is small, so that of two contradicting matches one is false, m.
+    # Length of trajectory with a small drift, m: of two contradicting matches in it, one is false.
     stretch = 3.0
     for hit in hits:
         near = [other for other in hits if _way(keyframes, [hit, other]) < stretch]
@@ -394,7 +394,7 @@ def _window(covariance: Array) -> tuple[float, float]:
 def _contradiction(
     keyframes: KeyframeMap, own: NDArray[np.intp], newest: int, near: NDArray[np.intp], pose: Array
 ) -> float:
-    """Share of the points of ``own`` and ``near`` looked through by the others, were ``newest`` at ``pose``."""
+    """Share of the points of ``own`` and ``near`` looked through by the others, if ``newest`` were at ``pose``."""
     placed = compose(pose, between(keyframes.poses[newest], keyframes.poses[own]))
     mine, theirs = ([keyframes.frames[k].scan for k in numbers] for numbers in (own, near))
     return contradiction(mine, placed, theirs, keyframes.poses[near])
@@ -548,7 +548,7 @@ def _sight(view, x, y):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     """Return the view of a point: 0 not in view, 1 seen, 2 in view and looked through."""
     limit = view[_sector(x, y)]
     r = math.hypot(x, y)
-    # Distance in front of what was seen behind a point from which on the point was looked through, m.
+    # Minimum distance between a point and the surface seen behind it that proves the point was looked through, m.
     view_margin = 0.25
     gap = view_margin + 0.04 * r  # added to that, as a share of the range, for the error of the yaw
     if limit <= 0 or r >= limit + gap:

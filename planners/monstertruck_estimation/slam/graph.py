@@ -21,9 +21,9 @@ from monstertruck_kinematics.se2 import between, wrap
 Index = NDArray[np.int64]
 
 SWITCH: Final = 12.0
-"""Squared Mahalanobis residual up to which a loop edge counts in full."""
+"""Maximum squared Mahalanobis residual of a loop edge with full weight."""
 SETTLED: Final = 1e-4
-"""Greatest change of a pose, m or rad, at which the optimisation ends."""
+"""Convergence threshold: maximum change of a pose in the last step, m or rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ def residuals(poses: Array, edges: Edges) -> tuple[Array, Array]:
 
 
 def robust_weights(squares: Array, loop: NDArray[np.bool_], switch: float = SWITCH) -> Array:
-    """Weight in (0, 1] of every edge by its squared residual; 1 for those that are no loop closures."""
+    """Weight in (0, 1] of every edge by its squared residual; 1 for all edges but loop closures."""
     scale = np.minimum(1.0, 2 * switch / (switch + squares))
     return np.where(loop, scale**2, 1.0)
 
@@ -114,7 +114,7 @@ def optimise(poses: Array, edges: Edges, iterations: int = 30) -> Array:
         settled = np.abs(step).max() < SETTLED or cost - cost_now < 1e-6 * cost
         if settled and switch == SWITCH:
             break
-        doubt = 4.0  # factor by which that shrinks from step to step to where it is
+        doubt = 4.0  # factor of its decrease from step to step
         switch = max(SWITCH, switch / doubt)
         cost = _cost(squares, edges.loop, switch)
     return poses
@@ -219,7 +219,7 @@ def drift(poses: Array, edges: Edges, spread: Array, source: int) -> tuple[Array
         Covariances, shape (n, 3, 3), infinite where no path leads; and the paths' summed variance, m^2, shape (n,).
     """
     count = len(poses)
-    lever = 4.0  # distance at which an error of the yaw counts as one of the translation, m
+    lever = 4.0  # lever that converts an error of the yaw into an error of the translation, m
     variance = spread[:, 0] + spread[:, 1] * lever**2
     low, high = np.minimum(edges.origin, edges.target), np.maximum(edges.origin, edges.target)
     order = np.lexsort((variance, high, low))

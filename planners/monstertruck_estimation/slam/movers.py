@@ -44,7 +44,7 @@ class View:
 
 
 class MoverDetector:
-    """Leaves out of every scan what has moved since a scan about a second older.
+    """Removes from every scan the points that moved since a scan about a second older.
 
     Scans are compared by the distances of odometry and the turns of the matches: people hardly turn a match, and wheels
     turn worse than they roll.
@@ -86,7 +86,7 @@ class MoverDetector:
         return scan.chosen(~marks) if marks.any() else scan
 
     def settle(self, turn: float) -> None:
-        """Keep the newest scan; ``turn``, rad, is that of base before it by the match."""
+        """Keep the latest scan; ``turn`` is the rotation of base before it by the match, rad."""
         if self._newest is None:
             return
         stamp, delta, view = self._newest
@@ -95,9 +95,9 @@ class MoverDetector:
 
 
 def moved(view: View, before: View, motion: Array) -> Marks:
-    """Which points of ``view``, shape (n,), are where ``before`` looked through, or behind what has left since.
+    """Return which points of ``view``, shape (n,), are where ``before`` looked through, or behind an object that left.
 
-    ``motion``, shape (3,), is that of base between both, m and rad.
+    ``motion``, shape (3,), is the motion of base between both, m and rad.
     """
     sights, sectors = _sights(before.limits, transform(motion, view.points))
     left = _sights(view.limits, transform(inverse(motion), before.points))[0] == THROUGH

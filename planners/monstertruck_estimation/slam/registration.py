@@ -22,7 +22,7 @@ CELL: Final = 0.3
 """Edge of the cells that find neighbours, m; also the greatest distance of a pair."""
 EDGE: Final = 0.03
 """A scan point that lies further along the surface from its map point than this and half the length that the map point
-stands for is beyond the edge of what is known, m: how the surface goes on there is not, and its pair must not count."""
+stands for is beyond the edge of the known surface, m: its continuation is unknown, so the pair is ignored."""
 CORRELATION: Final = 0.2
 """Factor on the information: errors of neighbouring beams are correlated."""
 
@@ -127,7 +127,7 @@ def normal_equations(scan: Scan, cloud: Cloud, pose: Array, reach: float = CELL)
 
 
 def _elements(scan: Scan, cloud: Cloud) -> tuple[Array, Array, Array, Array, Array, Array, Array, Index, Index]:
-    """What the kernels take of both."""
+    """Arrays of both clouds for the kernels."""
     moved = scan.points, scan.normals, scan.variances
     return *moved, cloud.points, cloud.normals, cloud.variances, cloud.extents, cloud.starts, cloud.order
 
@@ -171,7 +171,7 @@ def _nearest(
     cx = np.int64(math.floor(x / CELL))
     cy = np.int64(math.floor(y / CELL))
     best, found = reach * reach, -1
-    for ax in (0, -1, 1):  # the cell of the point first: few others are as near as what it holds
+    for ax in (0, -1, 1):  # the cell of the point first: most nearest points lie in it
         wx = 0.0 if ax == 0 else abs(x - (cx + max(ax, 0)) * CELL)
         for ay in (0, -1, 1):
             wy = 0.0 if ay == 0 else abs(y - (cy + max(ay, 0)) * CELL)
@@ -204,7 +204,7 @@ def accumulate(
         ny = s * normals[i, 0] + c * normals[i, 1]
         x, y = rx + pose[0], ry + pose[1]
         j = _nearest(x, y, nx, ny, map_points, map_normals, starts, order, reach)
-        kernel = 3.0  # mahalanobis distance at which a pair's influence is a quarter
+        kernel = 3.0  # Mahalanobis distance of a pair with a quarter of the full influence
         if j < 0:
             stats[2] += kernel * kernel
             continue
@@ -292,7 +292,7 @@ def _register(
     pose = start.copy()
     edge = reach if iterations > 0 else EDGE
     done = False
-    # Squared Mahalanobis distance at which the prior's weight is half: wheels slip further than their covariance.
+    # Squared Mahalanobis distance of a prior with half its weight: wheels slip further than their covariance.
     tails = 4.0
     for remaining in range(iterations, -1, -1):
         h, g, stats = accumulate(

@@ -1,4 +1,4 @@
-"""From ranges to surface elements: deskewing, levelling, and points with normals.
+"""Conversion of ranges to surface elements: deskewing, levelling, and points with normals.
 
 Every point carries the covariance of the surface element it was measured on, by its unit normal (towards the sensor)
 and the variances along and across it: a point among neighbours on a line is not constrained along that line, a lone
@@ -20,7 +20,7 @@ from monstertruck_kinematics.se2 import Twist2
 RANGE_NOISE: Final = 0.012
 """Standard deviation of a range close by, m (URG-04LX and SICK LMS200 manuals: 10 to 15 mm)."""
 RELATIVE_NOISE: Final = 0.005
-"""What is added per metre of range (beam width, URG-04LX: 1 % of the range as limits)."""
+"""Increase per metre of range (beam width, URG-04LX: 1 % of the range as limits)."""
 REACH: Final = 0.2
 """Neighbours up to this far away along the surface make its normal, m; the next on either side does anyway."""
 SLIDE: Final = 5.0
@@ -39,9 +39,9 @@ class ScanGeometry:
     angle_increment: float
     """Angle between neighbouring beams, rad."""
     range_min: float
-    """Shorter ranges are no returns, m."""
+    """Minimum range, m; shorter ones mean no return."""
     range_max: float
-    """Ranges at or beyond this are no returns, m."""
+    """Maximum range, m; ranges at or beyond it mean no return."""
     time_increment: float = 0.0
     """Seconds between neighbouring beams."""
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -100,12 +100,12 @@ def prepare(
     twist: tuple[float, float, float] = (0.0, 0.0, 0.0),
     longest: float = math.inf,
 ) -> Scan:
-    """Points with normals; no-returns, NaN and what is out of range are left out.
+    """Return points with normals; beams without a return, NaN and ranges out of bounds are left out.
 
     Args:
         ranges: shape (n,), m; anything not finite is a no-return.
         geometry: angles, limits, times and mount.
-        twist: the base's velocity (vx, vy, wz; m/s, rad/s), by which the scan's motion distortion is undone.
+        twist: the base's velocity (vx, vy, wz; m/s, rad/s), to undo the scan's motion distortion.
         longest: ranges beyond this are left out too, m.
     """
     values = np.ascontiguousarray(ranges, dtype=np.float64)
@@ -299,7 +299,7 @@ def downsample_indices(points: Array, cell: float) -> NDArray[np.intp]:
 
 
 def scans_in_a_room() -> list[ScanInput]:
-    """Return four scans of a drive in a square room, by which workers compile and load all before their first scan."""
+    """Return four scans of a drive in a square room, so that workers compile and load all before their first scan."""
     angles = np.linspace(-2.0, 2.0, 200)
     along, across = np.cos(angles), np.sin(angles)
     scans = []

@@ -40,7 +40,7 @@ from monstertruck_schemas.state import Grid, Odometry, ScanMotion, Transform
 
 TARGET: Final = "monstertruck_estimation.slam.worker:SlamWorker"
 UNMATCHED: Final = SECOND
-"""Time without a usable scan after which odometry alone predicts the pose and the lidar is no longer a source (ns)."""
+"""Maximum time without a usable scan (ns); then odometry alone predicts the pose and the lidar is not a source."""
 CORRECTIONS: Final = {
     "closed": (Reason.LOOP_CLOSED, Severity.INFO, "closure {}"),
     "joined": (Reason.LOOP_CLOSED, Severity.INFO, "two submaps are joined"),
@@ -239,7 +239,7 @@ class SlamService:
         while True:
             await self._asked.wait()
             self._asked.clear()
-            # Seconds to wait for a usable scan with which a requested map is saved; then it is saved without one.
+            # Seconds to wait for a usable scan before a requested map is saved; then it is saved without one.
             unscanned = 1.0
             await self._clock.sleep(unscanned)
             async with self._one_step:

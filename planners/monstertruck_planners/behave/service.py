@@ -74,7 +74,7 @@ class BehaviourService:
         bus: the topics that behaviours read.
         drive: ``plan/drive``, shared with the other planners.
         max_age: see ``GateConfig.max_request_age``.
-        body: what they move.
+        body: robot body that the behaviours move.
     """
 
     name = SOURCE
@@ -172,7 +172,7 @@ class BehaviourService:
         Raises:
             NotFoundError: no such behaviour is configured.
             InputError: the settings are wrong, or not complete; the text names the first key.
-            RequestRefusedError: the body cannot do that, a path is followed, or what the behaviour reads does not come.
+            RequestRefusedError: the body cannot do that, a path is followed, or an input of the behaviour is missing.
         """
         config, behaviour = self._configured(request.behaviour, request.settings)
         now, gate = self._clock.now(), self._gate.latest
@@ -192,7 +192,7 @@ class BehaviourService:
         self._events(Reason.BEHAVIOUR_STARTED, Severity.INFO, SOURCE, f"{name} started by {request.source}")
 
     def control(self, request: BehaviourRequest) -> None:
-        """Stop the behaviour, if it is the one that is named."""
+        """Stop the behaviour if its name matches."""
         assert self._run is not None
         if request.behaviour not in ("", self._run.name):
             raise RequestRefusedError(Reason.NOT_FOUND, f"the behaviour {request.behaviour} is not running")
@@ -227,7 +227,7 @@ class BehaviourService:
             self._ask(motion, now)
 
     def _interrupted(self, run: BehaviourRun, now: int) -> tuple[Reason, str] | None:
-        """Why the behaviour cannot go on."""
+        """Return the reason that prevents the behaviour from continuing."""
         gate = self._gate.latest
         if gate is None or not gate.mode.active:
             error = does_not_drive(gate)
@@ -238,7 +238,7 @@ class BehaviourService:
             return Reason.BUSY, other
         if (stale := self._stale(run.behaviour, now)) is not None:
             return Reason.INPUT_STALE, stale
-        # 2.0: seconds of requested but not executed motion after which a behaviour gives up
+        # 2.0: maximum time of requested but not executed motion (s); the behaviour then gives up
         if run.disobeyed is not None and now - run.disobeyed > 2.0 * SECOND:
             reason = next(iter(gate.reasons), Reason.NOT_OBEYED)
             return reason, f"the gate does not let it drive: {gate.why}"
@@ -281,7 +281,7 @@ class BehaviourService:
     def _settle(self, now: int) -> None:
         """Ask for standstill until the robot is at rest, then send nothing."""
         run, odometry = self._run, self._odometry.latest
-        # 1.0: seconds for which standstill is requested after the end
+        # 1.0: duration of the standstill requests after the end (s)
         if run is None or run.ended is None or now - run.ended > 1.0 * SECOND:
             return
         still = odometry is not None and max(abs(odometry.twist.vx), abs(odometry.twist.wz)) < 0.01  # m/s, rad/s
@@ -298,7 +298,7 @@ class BehaviourService:
         self._drive.put(planner_request(seq, gate, now, SOURCE, 0.3, speed=0.0, front=0.0, twist=twist))
 
     def state(self, now: int) -> BehaviourState:
-        """The report on the newest behaviour."""
+        """Report on the latest behaviour."""
         run = self._run
         if run is None:
             return BehaviourState(stamp=now, received=now, seq=0, frame="odom")

@@ -70,7 +70,7 @@ class StabiliserConfig(Schema):
     coast: Positive = 0.2
     """Maximum prediction time beyond the latest tilt reading, s."""
     stale_after: Positive = COMPASS.fresh_for()
-    """Time without valid tilt after which the joints return to 0, s."""
+    """Maximum time without valid tilt, s; the joints then return to 0."""
 
 
 class Joints(NamedTuple):
@@ -121,7 +121,7 @@ class TiltFilter:
     def __init__(self, config: StabiliserConfig) -> None:
         self._config = config
         self._stamp: int | None = None
-        # 0.6: each next filter forgets this much of what the one before it forgets
+        # 0.6: ratio of the forgetting rates of successive filters
         self._forget: Array = np.asarray((1 - config.memory) * 0.6 ** np.arange(FILTERS, dtype=np.float64))[:, None]
         self._past: deque[tuple[int, Array]] = deque(maxlen=JUDGED)
         """Stamps and states after the latest readings: angle, rate, acceleration; shape (3, filters, 2 axes)."""
@@ -149,7 +149,7 @@ class TiltFilter:
             if len(self._past) == JUDGED:
                 before, old = self._past[0]
                 missed = measured - _ahead(old, (attitude.stamp - before) / SECOND)
-                # 0.1: share that the newest reading has in a filter's errors
+                # 0.1: weight of the latest reading in a filter's errors
                 self._errors += 0.1 * (missed**2 - self._errors)
             state = _corrected(self._past[-1][1], measured, dt, self._forget)
         self._past.append((attitude.stamp, state))
@@ -161,7 +161,7 @@ class TiltFilter:
         age = (now - self._stamp) / SECOND
         if age > self._config.stale_after:
             return None
-        # 4: power of the mean square with which filters that are wrong more often lose
+        # 4: power of the mean square that decides how fast a less accurate filter loses weight
         weights = (self._errors + LEAST_ERROR**2) ** -4
         predicted = _ahead(self._past[-1][1], min(age + self._config.lead, self._config.coast))
         roll, pitch = ((weights * predicted).sum(axis=0) / weights.sum(axis=0)).tolist()

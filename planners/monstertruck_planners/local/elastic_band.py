@@ -82,7 +82,7 @@ def distance_and_gradient(field: FieldData, x: float, y: float) -> tuple[float, 
 
 @njit(cache=True)
 def clearance(field: FieldData, cover: CoveringDiscs, x: float, y: float, yaw: float) -> float:
-    """Least distance_and_gradient of the footprint's discs from what is occupied, m; negative where they overlap it."""
+    """Minimum distance of the footprint's discs from occupied cells, m, with its gradient; negative for an overlap."""
     least = 1e9
     c, s = cos(yaw), sin(yaw)
     for k in range(len(cover.x)):

@@ -1,7 +1,7 @@
 """Timed elastic band (TEB): poses and times of shortest time, with clearance, within the truck's limits. Loads numba.
 
-The band keeps its homotopy class and its changes of direction; where it is broken a local search finds a new one. What
-the least squares leave of constraint violations is removed at the end: segments within the limits are driven from the
+The band keeps its homotopy class and its changes of direction; where it is broken a local search finds a new one. At
+the end, violations of constraints that the least squares leave are removed: segments within the limits are driven from the
 truck's pose, so the path is exactly drivable, and it is checked for collisions. Source of the timed band: C. Roesmann
 and others, "Trajectory modification considering dynamic constraints of autonomous robots", 2012.
 
@@ -43,7 +43,7 @@ WIDTH = 12
 """Unknowns that a residual may touch, and diagonals of the matrix."""
 
 LEAST_STEP = 0.01
-"""Least distance in an interval, m."""
+"""Minimum distance in an interval, m."""
 
 LEAST_TIME = 0.02
 """Shortest time of an interval, s."""
@@ -57,9 +57,9 @@ class TebParameters(NamedTuple):
     """Distances of the axles before and behind the reference point, m."""
     front: float
     rear: float
-    """Greatest tangents of their angles."""
+    """Maximum tangents of their angles."""
     rate: float
-    """Greatest rate of both tangents, 1/s."""
+    """Maximum rate of both tangents, 1/s."""
     speed: float
     reverse: float
     acceleration: float
@@ -334,7 +334,7 @@ class TebPlanner:
     """The local planner of kind ``teb``.
 
     Args:
-        vehicle: what is driven.
+        vehicle: body, axles and limits of the robot.
         config: weights and limits.
     """
 
@@ -443,7 +443,7 @@ def drivable(vehicle: Vehicle, parameters: TebParameters, band: Array, direction
     """Path of one exact motion for each interval, from the first pose, within the steering's limits.
 
     Args:
-        vehicle: what is driven.
+        vehicle: body, axles and limits of the robot.
         parameters: its axles.
         band: shape (n, 4), see ``optimise``.
         directions: shape (n,).

@@ -52,7 +52,7 @@ class Abilities:
     lidar: bool = True
     zones: bool = True
     behaviour: Callable[[str, Mapping[str, float | str | bool]], object] | None = lambda _name, _settings: None
-    """Raises a ``TruckError`` if there is no such behaviour or it refuses the settings; None = there are none."""
+    """Raises a ``TruckError`` if there is no such behaviour or it refuses the settings; None: no behaviours."""
     known: frozenset[str] | None = None
     """Names of the points of interest, if all of them are known."""
 
@@ -112,7 +112,7 @@ def dead_ends(mission: Mission) -> list[Mistake]:
 
 
 def _sequence(places: list[StepPlace], policy: str, found: list[Mistake]) -> Ends:
-    """Return the ends of steps in sequence, and note what is wrong in them."""
+    """Return the ends of steps in sequence, and note their mistakes."""
     bad, takes_time, before = False, False, None
     for place in places:
         if before is not None:
@@ -185,7 +185,7 @@ def _repeat(place: StepPlace, step: RepeatStep, body: Ends, found: list[Mistake]
 
 
 def lacking(mission: Mission, able: Abilities) -> list[Mistake]:
-    """Return what steps and conditions need and the robot lacks, and the points of interest that nobody knows."""
+    """Return the missing needs of steps and conditions, and the unknown points of interest."""
     found: list[Mistake] = []
     places = list(steps_of(mission))
     explores = any(isinstance(place.step, ExploreStep) for place in places)

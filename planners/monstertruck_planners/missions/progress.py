@@ -1,8 +1,8 @@
 """Progress of a mission and the transition after each step, as pure functions.
 
 A mission is a tree: steps, and steps that contain others. The position in it is a stack of frames, one for the mission
-and one for each step that contains the present one. The present step itself has no frame: it begins
-anew after a restart.
+and one for each step that contains the current one. The current step itself has no frame: it starts
+again after a restart.
 """
 
 import math
@@ -66,7 +66,7 @@ class MissionFrame(Schema):
     block: Annotated[int, Field(ge=0)] = 0
     """Index among the node's ``blocks``: of a branch 1 = otherwise, of a parallel step n = its watch n"""
     index: Annotated[int, Field(ge=0)] = 0
-    """Index of the present step in the block"""
+    """Index of the current step in the block"""
     attempt: Annotated[int, Field(ge=0)] = 0
     """Failed attempts at that step"""
     rounds: Annotated[int, Field(ge=0)] = 0
@@ -74,7 +74,7 @@ class MissionFrame(Schema):
     fired: Annotated[tuple[int, ...], Field(strict=False)] = ()
     """Watches (blocks) whose condition has held ever since they fired"""
     interrupted: Annotated[tuple["MissionFrame", ...], Field(strict=False)] = ()
-    """Position at which a watch interrupted a parallel step: its own frame and those within"""
+    """Position of a parallel step when a watch interrupted it: its frame and its inner frames"""
     spent: Annotated[float, Field(ge=0)] = 0.0
     """Seconds spent in it, pauses left out"""
 
@@ -87,7 +87,7 @@ class MissionProgress:
     start: Pose2
     """Start pose in the map frame."""
     stack: tuple[MissionFrame, ...] = (MissionFrame(),)
-    """Frames of the mission and of the steps that contain the present one."""
+    """Frames of the mission and of the steps that contain the current one."""
     failures: int = 0
     why: StepEnd = StepEnd(Reason.OK)
     """Last failure."""
@@ -254,7 +254,7 @@ def judge(step: ConditionStep, facts: Facts) -> StepEnd:
 
 
 def _nodes(mission: Mission, stack: tuple[MissionFrame, ...]) -> list[Mission | AnyStep]:
-    """Return the nodes of all frames and the step at which the last one is."""
+    """Return the nodes of all frames, and the step of the last frame."""
     nodes: list[Mission | AnyStep] = [mission]
     for frame in stack:
         node = nodes[-1]

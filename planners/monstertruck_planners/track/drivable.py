@@ -39,7 +39,7 @@ class Bend(NamedTuple):
     length: float
     """Distance travelled meanwhile (m)."""
     deviation: float
-    """Least deviation of the body from the path (m); +inf if it does not find back."""
+    """Minimum deviation of the body from the path (m); +inf if it does not return to the path."""
 
 
 def require_drivable(path: Path, config: TrackerConfig, geometry: FourWheelSteering) -> None:
@@ -51,7 +51,7 @@ def require_drivable(path: Path, config: TrackerConfig, geometry: FourWheelSteer
         geometry: geometry of the body.
 
     Raises:
-        InputError: naming the first such place, what the path demands there and what the body can do.
+        InputError: names the first such place, the demand of the path there and the limit of the body.
     """
     tolerance = config.path_tolerance
     jump = _jump(path, tolerance)
@@ -96,7 +96,7 @@ def least_radius(steering: Steering, angle: float, geometry: FourWheelSteering) 
 
 
 def _lead(radius: float) -> float:
-    """Distance before and after a bend in which the body may deviate for it (m)."""
+    """Distance before and after a bend where the body may deviate for it (m)."""
     return 4.0 * radius
 
 

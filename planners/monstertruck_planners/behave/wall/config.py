@@ -27,7 +27,7 @@ class WallConfig(BehaviourConfig):
     ramp: Annotated[float, Field(gt=0, le=5)] = 0.5
     """Duration of a cubic ramp, s"""
     hold: Annotated[float, Field(ge=0, le=0.5)] = 0.25
-    """Time for which a sonar's last echo replaces missing ones, s; 0: a missing echo reads as the maximum range"""
+    """Maximum age of a sonar's last echo that replaces missing ones, s; 0: a missing echo reads as the maximum range"""
     approach_turn: Annotated[float, Field(ge=0, le=math.tau)] = 0.0
     """Angle of the initial arc towards the wall's side, rad; the coursework set a time by hand"""
     lap_length: Annotated[float, Field(gt=0, le=1000)] = 4.0
@@ -47,18 +47,18 @@ class WallPdConfig(WallConfig):
     k_d: Annotated[float, Field(ge=0)] = 11.3
     """Yaw rate per change of the error from one sample to the next, rad/s/m; not divided by the period"""
     trigger: Metres = 0.29
-    """Front range at which the robot turns away, m; after braking (0.06 m) and turning on the spot, the published value
-    leaves the side sonar 0.05 m too near; 0.34 is about right"""
+    """Front range that makes the robot turn away, m; after braking (0.06 m) and turning on the spot, the published
+    value leaves the side sonar 0.05 m too near; 0.34 is about right"""
     offset: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Distance of the diagonal sonar ahead of the side sonar when computing the wall angle, m: 0 as published, 0.05
     exact"""
     safety: Metres = 0.2
-    """Range of the far diagonal sonar at which the robot also turns away, m: for when it looks into a gap; our value,
-    above the sonars' minimum range"""
+    """Range of the far diagonal sonar that also makes the robot turn away, m, in case the front sonar looks into a
+    gap; our value, above the sonars' minimum range"""
     seen: Metres = 0.45
     """Side range below which the wall is detected, m; our value"""
     gap: Annotated[float, Field(ge=0, le=5)] = 0.0
-    """Distance for which a side sonar is ignored after its range jumped up, because it looks into a gap, m; 0 as
+    """Distance travelled without a side sonar after its range jumped up, because it looks into a gap, m; 0 as
     published: the robot turns into gaps"""
     aligned: Annotated[float, Field(ge=-1.5, le=0.5)] | None = None
     """Heading away from the wall, by side and diagonal sonar, that ends turning away, rad; null as published: the robot
@@ -77,7 +77,7 @@ class WallSwitchingConfig(WallConfig):
     obstacle: Metres = 0.30
     """Range of the front, diagonal or side sonar below which the robot turns away, m"""
     beyond: Metres = 0.05
-    """Distance beyond ``distance`` at which the robot turns back towards the wall, m"""
+    """Excess over ``distance`` that makes the robot turn back towards the wall, m"""
 
 
 class WallLineConfig(BehaviourConfig):
@@ -105,19 +105,19 @@ class WallLineConfig(BehaviourConfig):
     lead: Annotated[float, Field(ge=0, le=0.3)] = 0.08
     """Latency from a request to the body's motion, s: requests are taken from the ramp this far ahead"""
     play: Annotated[float, Field(ge=0, le=0.3)] = 0.0
-    """Part of ``lead`` by which the body lags its wheels, s: encoder odometry is ahead of the body by this time"""
+    """Lag of the body behind its wheels, s, a part of ``lead``: encoder odometry is ahead of the body by this time"""
     beam: bool = False
     """Whether sonars hear along their axis only; otherwise in the cone given by ``sensor/sonar``"""
     critical_angle: Annotated[float, Field(gt=0, le=1.4)] = 0.45
-    """Maximum angle from a wall's normal at which sound returns, rad; without ``beam``"""
+    """Maximum angle between a wall's normal and a returning sound, rad; without ``beam``"""
     window: Metres = 3.0
     """Travelled distance whose echoes are used for the line, m: longer is steadier but relies longer on odometry"""
     stiffness: Annotated[float, Field(gt=0, le=2)] = 0.3
-    """Distance constant with which the controller reduces a distance error, m; critically damped"""
+    """Distance constant of the controller's response to a distance error, m; critically damped"""
     door: Metres = 1.3
     """Distance to continue straight along the line without a wall before searching for another wall, m"""
     search: Annotated[float, Field(gt=0, le=100)] = 25.0
-    """Distance without a wall after which the robot gives up, m"""
+    """Maximum distance without a wall, m; the robot then gives up"""
     lap_length: Annotated[float, Field(gt=0, le=1000)] = 4.0
     """Minimum length of a lap, m"""
     lap_radius: Metres = 0.6

@@ -99,7 +99,7 @@ class EstimateFit(NamedTuple):
 
 def deviation(ranges: Array) -> Array:
     """Return the standard deviation of ranges (m)."""
-    # 0.005: standard deviation of a range, m, to which 0.01 of the range is added in quadrature
+    # 0.005: standard deviation of a range, m; 0.01 of the range is added in quadrature
     return np.asarray(np.hypot(0.005, 0.01 * ranges))
 
 
@@ -134,7 +134,7 @@ def search(echoes: Array, at: tuple[float, float], cone: Cone, before: WallEstim
     """
     normals = np.linspace(-math.pi, math.pi, GUESSES[0], endpoint=False)
     sample = echoes
-    sampled = 40  # echoes to which all guesses are fitted, taken evenly out of more
+    sampled = 40  # maximum number of echoes in the fits of the guesses, sampled evenly
     if len(echoes) > sampled:  # not every so many-th one, which could all be of one sonar
         sample = echoes[np.linspace(0, len(echoes) - 1, sampled).astype(int)]
     offsets = sample[:, :2] - at
@@ -178,16 +178,16 @@ def _fitted(
     x, y, axis, ranges = np.ascontiguousarray(echoes[:, :4].T)
     x, y = x - at[0], y - at[1]
     weight = 1.0 / deviation(ranges) ** 2
-    # 2.0: residual, in standard deviations, from which on an echo counts for less (Cauchy's weights)
+    # 2.0: scale of Cauchy's weights: residual, in standard deviations, that halves the weight of an echo
     damping = weight / 2.0**2
     first = np.stack([normals, distances])
     lines = first
     held_a, held_d = 1.0 / inertia[0] ** 2, 1.0 / inertia[1] ** 2
     terms = np.empty((len(normals), 3, len(echoes)))
-    """Of every fit and echo: derivatives of the range by direction and distance, and what is missing of it."""
+    """Derivatives of the range by direction and distance, and the residual, of every fit and echo."""
     across, step = np.empty((len(normals), len(echoes))), np.empty_like(first)
     longest = 0.3  # greatest step of a fit, rad and m
-    # Arrays are small: what costs time is the number of calls, so most of them write where there is room already.
+    # The arrays are small, so the number of calls costs the time; most calls write into existing arrays.
     for _ in range(steps):
         angle = lines[0][:, None]
         c, s = np.cos(angle), np.sin(angle)
@@ -201,7 +201,7 @@ def _fitted(
         np.multiply(across, share, out=terms[:, 0])
         terms[:, 1] = share
         far *= share
-        missing = np.where(heard, ranges - far, 0.5)  # what an echo from where none is expected counts like, m
+        missing = np.where(heard, ranges - far, 0.5)  # residual of an echo from a direction without an expected echo, m
         terms[:, 2] = missing
         doubt = missing * missing
         doubt *= damping
