@@ -1,9 +1,9 @@
 """Timed elastic band (TEB): poses and times of shortest time, with clearance, within the truck's limits. Loads numba.
 
 The band keeps its homotopy class and its changes of direction; where it is broken a local search finds a new one. At
-the end, violations of constraints that the least squares leave are removed: segments within the limits are driven from the
-truck's pose, so the path is exactly drivable, and it is checked for collisions. Source of the timed band: C. Roesmann
-and others, "Trajectory modification considering dynamic constraints of autonomous robots", 2012.
+the end, violations of constraints that the least squares leave are removed: segments within the limits are driven from
+the truck's pose, so the path is exactly drivable, and it is checked for collisions. Source of the timed band:
+C. Roesmann and others, "Trajectory modification considering dynamic constraints of autonomous robots", 2012.
 
 Least squares with analytic derivatives and banded normal equations. Unknowns are x, y, yaw of each pose and the time of
 the interval before it. A residual touches at most three neighbouring poses, so the normal matrix has eleven diagonals
