@@ -1,4 +1,4 @@
-"""``monstertruckd new-driver``: a driver's package with emulator, probe and tests."""
+"""``monstertruckd new-driver``: a driver's package with emulator and tests."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +16,7 @@ def new_driver(
     name: Annotated[str, typer.Argument(help="Name of the device kind, such as acme_l5.", show_default=False)],
     folder: Annotated[Path, typer.Option("--folder", help="Where its folder is made.")] = Path(),
 ) -> None:
-    """Write the package of a new driver: protocol, driver, emulator, probe, tests. Its tests pass as written.
+    """Write the package of a new driver: protocol, driver, emulator, identity, tests. Its tests pass as written.
 
     Replace the protocol by the device's own, then emulator and tests. Existing files are never overwritten.
     """

@@ -1,1 +1,1 @@
-"""A new driver as a package with emulator, probe and tests."""
+"""A new driver as a package with emulator and tests."""

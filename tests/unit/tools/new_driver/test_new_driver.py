@@ -55,7 +55,6 @@ def test_the_catalog_takes_its_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert row.settings_class()().kind == row.name
     assert callable(row.implementation_class())
     assert callable(row.emulator_factory())
-    assert callable(row.probe_function())
 
 
 def test_nothing_is_overwritten_and_odd_names_are_refused(tmp_path: Path):
