@@ -60,7 +60,7 @@ class ZoneCheck(Check):
         self._judged: tuple[Odometry, ZoneLayer] | None = None
         """Pose and zones of the next three values."""
         self._held: tuple[str, ...] = ()
-        """Keepout zones in which the robot stands."""
+        """Keepout zones around the robot's position."""
         self._left: tuple[int, ...] = ()
         """Index of each keepout zone that the robot is in and leaves."""
         self._slowest = math.inf
@@ -117,7 +117,7 @@ class ZoneCheck(Check):
             yield Reason.KEEPOUT
 
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
-        """Limits where the robot is, and before what is ahead."""
+        """Return the limits at the robot's place and ahead of it."""
         self._ahead = None
         if not courses:
             self._blocked = False
@@ -161,7 +161,7 @@ class ZoneCheck(Check):
             yield PaceLimit(Reason.ZONE_SLOW, slow)
 
     def _relative(self, near: Boundary, pose: Pose2) -> Boundary:
-        """Boundaries in base, without those of zones that the robot leaves."""
+        """Boundaries in base, without the boundaries of zones that the robot leaves."""
         kept = near.of(~np.isin(near.zones, self._left))
         return kept._replace(points=points_relative(kept.points, pose))
 

@@ -57,7 +57,7 @@ class RosNames:
     """Name of a frame of the robot."""
 
     def time(self, stamp: int) -> RosValues:
-        """``builtin_interfaces/msg/Time`` of the robot's time; its end, in 2038, for what is later."""
+        """``builtin_interfaces/msg/Time`` of the robot's time; later times become the end of the format, in 2038."""
         last = 2**31 * SECOND - 1  # last time that a ``builtin_interfaces/msg/Time`` can hold, ns
         seconds, nanoseconds = divmod(min(max(0, stamp + self.offset), last), SECOND)
         return {"sec": seconds, "nanosec": nanoseconds}
@@ -96,7 +96,7 @@ _PLANE: Final = np.array([6 * row + column for row in (0, 1, 5) for column in (0
 
 
 def full_covariance(planar: Array) -> Array:
-    """Shape (36,) from the (9,) of x, y, yaw; what the plane does not know is 0."""
+    """Covariance (36,) from the covariance (9,) of x, y, yaw; the other entries are 0."""
     full = np.zeros(36)
     full[_PLANE] = planar
     return full
@@ -202,7 +202,7 @@ def ground(message: Ground, names: RosNames) -> RosValues:
 
 
 def grid_update(tile: Grid, whole: Grid, names: RosNames) -> RosValues | None:
-    """``map_msgs/msg/OccupancyGridUpdate``: what of ``tile`` lies on the ``whole`` grid; None if nothing does."""
+    """``map_msgs/msg/OccupancyGridUpdate``: the part of ``tile`` on the ``whole`` grid; None if they do not overlap."""
     column = round((tile.origin.x - whole.origin.x) / whole.resolution)
     row = round((tile.origin.y - whole.origin.y) / whole.resolution)
     left, bottom = max(column, 0), max(row, 0)
@@ -229,7 +229,7 @@ def _known(value: float | None) -> float:
 
 
 def battery(message: Battery, names: RosNames) -> RosValues:
-    """``sensor_msgs/msg/BatteryState``; what is not known is NaN."""
+    """``sensor_msgs/msg/BatteryState``; unknown values are NaN."""
     capacity, share = _known(message.capacity_ah), _known(message.charge)
     return {
         "header": names.header(message),
@@ -246,7 +246,7 @@ def battery(message: Battery, names: RosNames) -> RosValues:
 
 
 UNKNOWN: Final = (-1.0, *(0.0,) * 8)
-"""Covariance in a ``sensor_msgs/msg/Imu`` that says that the quantity is not measured."""
+"""Covariance of a quantity that a ``sensor_msgs/msg/Imu`` does not measure."""
 
 
 def imu(message: Imu, names: RosNames) -> RosValues:
@@ -360,7 +360,7 @@ def service_states(table: HealthTable, robot: str) -> list[RosValues]:
 
 
 def gate_status(gate: GateState, robot: str) -> RosValues:
-    """``diagnostic_msgs/msg/DiagnosticStatus`` of the safety gate: who drives, and what limits the robot."""
+    """``diagnostic_msgs/msg/DiagnosticStatus`` of the safety gate: the driver, and the limits of the robot."""
     level = ERROR if gate.mode is GateMode.ESTOPPED else WARN if gate.hindrances else OK
     values = {
         "mode": gate.mode_text,

@@ -44,14 +44,14 @@ from monstertruckd.ros2.rmw import LATCHED, RELIABLE, SENSOR, RosQos
 TF: Final = RosQos(depth=100)
 """Quality of service of ``/tf``, as ``tf2_ros`` has it."""
 ROSOUT: Final = RosQos(depth=1000, latched=True)
-"""Of ``/rosout``, as ``rcl`` has it."""
+"""Quality of service of ``/rosout``, as in ``rcl``."""
 ORDERS: Final = (Order.ARM, Order.DISARM, Order.RESET, Order.ESTOP, Order.STOP)
 """Orders that are services of the node."""
 
 
 @dataclass(frozen=True, slots=True)
 class FaceOptions:
-    """What the user chooses."""
+    """Choices of the user."""
 
     prefix: str = ""
     """Before the name of every frame, such as ``truck1/``."""
@@ -111,7 +111,7 @@ class RosFace:
         """
         clock = self._client.subscribe(t.CLOCK, fifo(10))
         try:
-            async with self._clock.deadline(5.0):  # seconds in which a topic of 1 Hz comes
+            async with self._clock.deadline(5.0):  # seconds to wait for a topic of 1 Hz
                 self._follow_clock(await clock.next())
         except TimeoutError:
             raise NoAnswerError(f"robot {self._client.robot!r} does not publish {t.CLOCK.name}") from None
@@ -143,7 +143,7 @@ class RosFace:
             take(message)
 
     def _publish(self, topic: str, interface: str, values: Mapping[str, Any], qos: RosQos = RELIABLE) -> None:
-        """Publish; a topic is offered with its first message, so ROS 2 sees what this robot has."""
+        """Publish; a topic is offered with its first message, so ROS 2 lists only topics that this robot has."""
         publish = self._publishers.get((topic, interface))
         if publish is None:
             publish = self._publishers[topic, interface] = self._node.publisher(topic, interface, qos)
@@ -152,7 +152,7 @@ class RosFace:
     # Outwards
 
     def _rows(self) -> Iterable[tuple[Topic[Any], Callable[[Any], None]]]:
-        """Topics of the robot, and what is done with their messages."""
+        """Topics of the robot with the handlers of their messages."""
         return (
             (t.SCAN, self._scan),
             (t.ODOMETRY, self._odometry_message),
@@ -177,7 +177,7 @@ class RosFace:
         )
 
     def _follow_clock(self, message: ClockOffset) -> None:
-        # Change of the robot's offset to real time from which on stamps follow it, ns: below it, stamps of one drive
+        # Minimum change of the robot's offset to real time that stamps follow, ns: below it, stamps of one drive
         # agree.
         clock_step = SECOND // 1000
         if abs(message.offset - self._names.offset) > clock_step:
@@ -371,7 +371,7 @@ class RosFace:
         return await _outcome(client.order(order))
 
     def _estop(self, arrival: RosArrival) -> None:
-        """An emergency stop is never refused, whoever asks and however old the message is."""
+        """Pass on an emergency stop; it is never refused, regardless of its sender and age."""
         node = "an unknown publisher" if arrival.sender is None else arrival.sender.node
         self._operators.run(node, "estop", self._client.order(Order.ESTOP))
 

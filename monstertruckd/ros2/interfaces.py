@@ -1,4 +1,4 @@
-"""ROS 2 interfaces by name: their fields, and the type hashes by which ROS 2 programs recognise each other.
+"""ROS 2 interfaces by name: their fields, and the type hashes that ROS 2 programs compare.
 
 ``interfaces.txt`` lists them in the language of ``.msg``, ``.srv`` and ``.action`` files, without constants and
 defaults: neither is part of a hash. The hash of a type is RIHS01: SHA-256 of its type description as JSON (REP 2016).
@@ -38,7 +38,7 @@ PRIMITIVES: Final = {
 }
 """Type ids of ``type_description_interfaces/msg/FieldType``; a ``char`` of ROS 2 is a uint8."""
 ARRAY, BOUNDED, UNBOUNDED = 48, 96, 144
-"""Offsets of the type ids of arrays and of sequences with and without a greatest length."""
+"""Offsets of the type ids of arrays and of sequences with and without a maximum length."""
 
 _FIELD: Final = re.compile(r"(?P<kind>[\w/@]+)(?P<many>\[(?P<limit><=)?(?P<count>\d*)\])? (?P<name>\w+)")
 

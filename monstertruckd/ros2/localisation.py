@@ -26,7 +26,7 @@ from monstertruckd.ros2.rmw import LATCHED
 CORRECTION_PERIOD: Final = SECOND // 10
 """Minimum time between two corrections sent to the robot, ns."""
 CORRECTION_LEASE: Final = SECOND
-"""Time for which a correction stands without a newer one, ns."""
+"""Maximum age of a correction, ns."""
 
 
 def pose_in(pose: RosMessage) -> Array:

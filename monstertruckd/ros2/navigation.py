@@ -25,7 +25,7 @@ from monstertruckd.ros2.node import RosNode, RosSender
 from monstertruckd.ros2.operators import Operators
 
 GoalPose = tuple[tuple[float, float, float], str]
-"""x, y (m), yaw (rad), and the frame as the robot calls it."""
+"""x, y (m), yaw (rad), and the robot's name of the frame."""
 
 PoseReader = Callable[[RosMessage], GoalPose]
 """Reads a ``geometry_msgs/msg/PoseStamped``; raises ``InputError`` for another frame."""
@@ -56,7 +56,7 @@ class PosesToReach:
     poses: list[tuple[float, float, float]]
     """x, y (m), yaw (rad)."""
     frame: str
-    """As the robot calls it."""
+    """The robot's name of the frame."""
     asked: list[RosMessage] = field(default_factory=list)
     """The same as ``geometry_msgs/msg/PoseStamped``."""
     passed: int = 0
@@ -148,7 +148,7 @@ class NavigateThroughPoses(GoalAction):
     interface = "nav2_msgs/action/NavigateThroughPoses"
 
     def read(self, goal: RosMessage) -> PosesToReach:
-        """See ``RobotAction``; since Kilted poses without a frame have that of all."""
+        """See ``RobotAction``; since Kilted poses without a frame use the frame of the message."""
         _require_own_planner(goal)
         asked, header = goal["poses"], {"frame_id": ""}
         if isinstance(asked, dict):  # nav_msgs/msg/Goals

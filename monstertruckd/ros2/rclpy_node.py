@@ -1,9 +1,9 @@
 """A ROS 2 node by ``rclpy``: for every middleware that ROS 2 has, in an environment where ROS 2 is installed.
 
 Messages pass as the bytes that the face encodes and decodes itself. Interfaces whose package is not installed are left
-out. ``rclpy`` says of a message neither its publisher nor, of a request, its client:
+out. ``rclpy`` reports neither the publisher of a message nor the client of a request:
 
-- A message counts as that of the publisher of its topic where there is exactly one, and as that of an unknown one
+- A message is attributed to the publisher of its topic if there is exactly one, and to an unknown publisher
   otherwise.
 - All clients of services are one sender.
 """
@@ -72,7 +72,7 @@ class Participant:
     node: Node
     executor: MultiThreadedExecutor
     interfaces: dict[str, str] = field(default_factory=dict)
-    """By topic."""
+    """Names of interfaces by topic."""
 
     def leave(self) -> None:
         """Leave the graph."""
@@ -113,7 +113,7 @@ class RclpyNode:
         self._loop = asyncio.get_running_loop()
         self._participants = [await in_thread(self._join)]
         own = self._name, self._namespace
-        await asyncio.sleep(1.0)  # in which the nodes that are there are discovered
+        await asyncio.sleep(1.0)  # time to discover the running nodes (s)
         if self._node.get_node_names_and_namespaces().count(own) > 1:
             await self.__aexit__()
             where = f"{self._namespace.rstrip('/')}/{self._name}"
@@ -152,7 +152,7 @@ class RclpyNode:
     def _node_for(self, topic: str, interface: str) -> Any:
         """The node for a topic with an interface: a participant of DDS has one interface for a topic.
 
-        A second one, such as a stamped ``cmd_vel``, gets a participant and node of its own.
+        A second one, such as a stamped ``cmd_vel``, gets a separate participant and node.
         """
         for participant in self._participants:
             if participant.interfaces.setdefault(topic, interface) == interface:
@@ -200,7 +200,7 @@ class RclpyNode:
             arrival = RosArrival(message, sender, gid, int(number or 0), int(stamp))
             self._loop.call_soon_threadsafe(take, arrival)
 
-        # A queue of 1: of messages that wait only the newest counts.
+        # A queue of 1: only the latest of the waiting messages is used.
         profile = _profile(RosQos(depth=1, reliable=qos.latched, latched=qos.latched))
         self._node_for(topic, interface).create_subscription(kind, topic, receive, profile, raw=True)
 

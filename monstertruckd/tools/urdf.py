@@ -24,7 +24,7 @@ SENSORS: Final[Mapping[str, str]] = {
     "camera": r"camera|cam_",
     "imu": r"imu",
 }
-"""Devices, and what names of their links have in them."""
+"""Parts of the link names, by device."""
 OPTICAL: Final = "optical"
 """Part of the name of a camera's frame whose z axis looks ahead: not a mount."""
 
@@ -33,13 +33,13 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class UrdfRobot:
-    """What a URDF says of a robot."""
+    """Settings of a robot in a URDF."""
 
     name: str
     geometry: dict[str, float]
     """Settings of ``geometry``, m."""
     mounts: dict[str, dict[str, float]]
-    """By device: ``x``, ``y``, ``z`` (m), ``yaw``, ``pitch``, ``roll`` (rad), without those that are 0."""
+    """Mounts by device: ``x``, ``y``, ``z`` (m), ``yaw``, ``pitch``, ``roll`` (rad), without those that are 0."""
 
     def sections(self) -> dict[str, Any]:
         """Return the sections of a configuration."""
@@ -54,7 +54,7 @@ def load_urdf(file: Path, links: Mapping[str, str] | None = None) -> UrdfRobot:
         links: link of a device, where its name does not show it.
 
     Raises:
-        InputError: not URDF, no four wheels, or no such link; names what was expected.
+        InputError: not URDF, no four wheels, or no such link; names the expectation.
     """
     text = text_of(file, EXPECTED, 10 * MEGABYTE)
     with reading(file, EXPECTED):

@@ -286,7 +286,7 @@ class MissionLine(Schema):
     """Number of steps that contain it"""
     text: str
     active: bool = False
-    """Whether the present step is this one or within it"""
+    """Whether the current step is this one or within it"""
 
 
 class MissionState(Message):
@@ -304,9 +304,9 @@ class MissionState(Message):
     """The present one, counted from 1 without those within others; 0 = none."""
     steps: Annotated[int, Field(ge=0)] = 0
     node: str = ""
-    """Position of the present step among those within others, such as 2.1"""
+    """Position of the current step among those within others, such as 2.1"""
     lines: tuple[MissionLine, ...] = ()
-    """Steps around the present one"""
+    """Steps around the current one"""
     doing: str = ""
     """Current step in words."""
     attempt: Annotated[int, Field(ge=0)] = 0

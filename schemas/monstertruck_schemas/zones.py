@@ -22,7 +22,7 @@ OFF_FOR: Final = 600.0
 
 
 class ZoneArea(Schema):
-    """A polygon in map, and what holds on it; the even-odd rule decides what lies inside."""
+    """A polygon in map with its rule; the even-odd rule decides what lies inside."""
 
     kind: Literal["keepout", "speed"]
     corners: Annotated[Corners, Field(min_length=3)]
@@ -77,7 +77,7 @@ class Zone(Schema):
     saved: bool = False
     """Whether an operator made it, and may remove it; otherwise the configuration has it."""
     off_until: Nanoseconds | None = None
-    """Until when an operator has turned it off; None = it is in force."""
+    """End of the time that an operator turned it off for; None while it is in force."""
 
 
 class Zones(Message):
@@ -89,7 +89,7 @@ class Zones(Message):
 
 
 class ZoneOrder(StrEnum):
-    """What an operator can do with zones."""
+    """Operator's orders for zones."""
 
     ADD = "add"
     """Add a polygon, or replace one that an operator made."""
