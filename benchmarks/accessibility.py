@@ -1,4 +1,4 @@
-"""The station's page before axe-core: every view, light and dark, on a laptop and on a phone.
+"""The station's page before axe-core: every view, light and dark, at every width.
 
     python -m benchmarks.accessibility [--quick]
 
@@ -29,7 +29,13 @@ LATE = """(late) => {
     const send = WebSocket.prototype.send;
     WebSocket.prototype.send = function (data) { setTimeout(() => send.call(this, data), late); };
 }"""
-SIZES = {"laptop": (1280, 800), "phone": (360, 740)}
+SIZES = {
+    "desk": (1440, 900),
+    "tablet": (820, 1180),
+    "phone": (390, 844),
+    "landscape": (844, 390),
+    "small phone": (360, 740),
+}
 GOALS = {"serious_findings": 0, "same_robot_after_reload": True, "slows_when_late": True}
 
 
@@ -49,16 +55,19 @@ async def views(browser: Browser, url: str, size: str, scheme: str) -> tuple[int
     page = await opened(browser, url, viewport={"width": width, "height": height}, color_scheme=scheme)
     await page.evaluate(AXE)
     found: list[str] = []
-    tabs = await page.query_selector_all("[role=tab]")
+    tabs = await page.query_selector_all("[role=tab]:not([hidden])")
     for tab in tabs:
         await tab.click()
         await asyncio.sleep(0.3)
         found += await findings(page, f"{size}, {scheme}, {await tab.get_attribute('id')}")
+    for tool in ("zone", "point", "mission"):  # its form, whether or not this robot has the tool
+        await page.evaluate(f"document.querySelector('#{tool}').hidden = false")
+    found += await findings(page, f"{size}, {scheme}, forms of the map")
     await page.click("#fleet-open")
     await page.wait_for_selector("#fleet-rows tr")
     found += await findings(page, f"{size}, {scheme}, fleet")
     await page.context.close()
-    return len(tabs) + 1, found
+    return len(tabs) + 2, found
 
 
 async def poor_link(browser: Browser, url: str) -> dict[str, bool]:
@@ -109,5 +118,5 @@ async def main(quick: bool) -> int:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="laptop only")
+    parser.add_argument("--quick", action="store_true", help="desk only")
     sys.exit(asyncio.run(main(parser.parse_args().quick)))

@@ -1,8 +1,8 @@
 """Wizards against hidden truth: 20 trucks, all values of each off, calibrated in the order of docs/calibration.md.
 
-    python benchmarks/calibration.py [--seeds 20] [--jobs 1] [--light 200] [--engine mujoco]
-    python benchmarks/calibration.py --only camera --light 200
-    python benchmarks/calibration.py --part swapped|interruptions|square|alone [--count 20]
+    python -m benchmarks.calibration [--seeds 20] [--jobs 1] [--light 200] [--engine mujoco]
+    python -m benchmarks.calibration --only camera --light 200
+    python -m benchmarks.calibration --part swapped|interruptions|square|alone [--count 20]
 
 Every session runs the whole daemon on a virtual clock: real drivers, emulated devices, the safety gate; the operator
 has a tape, a string and a meter with errors of their own. Judged is whether the true value lies in the stated interval,

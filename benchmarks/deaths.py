@@ -1,6 +1,6 @@
 """A daemon that is killed, frozen or asked to end while the truck drives: seconds and metres to standstill.
 
-    python benchmarks/deaths.py [--trials 20]
+    python -m benchmarks.deaths [--trials 20]
 
 Emulated devices in one process, the daemon in another, on the wall clock; every trial begins at the start of the lap,
 at 0.18 m/s, at another moment of the lap. The true speed is the simulator's. Half an hour.

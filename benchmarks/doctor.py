@@ -1,7 +1,7 @@
 """The doctor against faults drawn by seed from a catalogue: which are found, with what mends, and what is said falsely.
 
-    python benchmarks/doctor.py [--seeds 100]
-    python benchmarks/doctor.py --drive 20
+    python -m benchmarks.doctor [--seeds 100]
+    python -m benchmarks.doctor --drive 20
 
 First every fault of ``tests/unit/tools/doctor/catalogue.py`` alone, then ``--seeds`` computers with up to six of them
 at once, then a healthy one. The computers are folders with emulated USB trees, networks and logs.

@@ -1,7 +1,7 @@
 """Five robots and three people in one world: every robot drives from place to place by moves, for ten minutes.
 
-    python benchmarks/fleet_world.py              one simulator process, a daemon process for each robot, real time
-    python benchmarks/fleet_world.py --virtual    the same daemons on one virtual clock, as fast as it computes
+    python -m benchmarks.fleet_world              one simulator process, a daemon process for each robot, real time
+    python -m benchmarks.fleet_world --virtual    the same daemons on one virtual clock, as fast as it computes
 
 Robots do not know each other's plans. Of the places that are drawn for it a robot takes the first of the next few to
 which the straight line leads past nobody it hears. Each hears where the others say that they are (``peers``), which

@@ -1,6 +1,6 @@
 """The overhead stand on rendered pictures: accuracy over the table, hand-over, frames a second, identities, faults.
 
-    python benchmarks/stand.py [--seeds 2] [--poses 60] [--crossing 10] [--minutes 10]
+    python -m benchmarks.stand [--seeds 2] [--poses 60] [--crossing 10] [--minutes 10]
 
 Six cameras of 640 x 480 with hidden lenses and places over a table of 3 m x 3 m, calibrated by the stand's own
 procedure from rendered boards and marks that a ruler measured to 1.5 mm; blur, noise and distortion as in

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections import deque
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -24,7 +24,7 @@ class Measured:
     """Result of a wizard, not yet saved."""
 
     rows: Sequence[dict[str, Any]]
-    """Estimates: name, unit, meaning, value, low, high, grade, and the value ``before``."""
+    """Estimates: name, unit, meaning, value, low, high, grade, and those ``before`` with their interval."""
     measured: str
     """What was done, in a sentence."""
     save: Callable[[], Awaitable[str]]
@@ -35,10 +35,10 @@ class Calibrator(Protocol):
     """The wizards, which the station does not know."""
 
     async def offered(self, truck: TruckClient) -> list[dict[str, Any]]:
-        """Return what fits the robot, in the order in which it is best done: id, name, doc, and whether it is due."""
+        """Return what fits the robot, in the order in which it is best done: id, name, doc, options, whether due."""
 
-    async def measure(self, truck: TruckClient, step: str, panel: "PagePanel") -> Measured:
-        """Run one of them.
+    async def measure(self, truck: TruckClient, step: str, options: Mapping[str, Any], panel: "PagePanel") -> Measured:
+        """Run one of them, with other options than its defaults.
 
         Raises:
             TruckError: it ended without a result.
@@ -153,8 +153,8 @@ class Calibration:
         async with self._session() as truck:
             return await self._calibrator.offered(truck)
 
-    def begin(self, step: str) -> None:
-        """Start a wizard.
+    def begin(self, step: str, options: Mapping[str, Any]) -> None:
+        """Start a wizard, with other options than its defaults.
 
         Raises:
             InputError: one runs already.
@@ -163,7 +163,7 @@ class Calibration:
             raise InputError(f"calibration {self._step} runs already")
         self._panel, self._step, self._measured = PagePanel(self._show), step, None
         self._enter("running")
-        self._task = asyncio.create_task(self._run(step), name=f"calibration {step}")
+        self._task = asyncio.create_task(self._run(step, options), name=f"calibration {step}")
 
     def answer(self, value: float | bool) -> None:
         """Answer the wizard's question; raises as ``PagePanel.answer`` does."""
@@ -192,10 +192,10 @@ class Calibration:
         self._phase, self._text = phase, text
         self._show()
 
-    async def _run(self, step: str) -> None:
+    async def _run(self, step: str, options: Mapping[str, Any]) -> None:
         try:
             async with self._session() as truck:
-                self._measured = await self._calibrator.measure(truck, step, self._panel)
+                self._measured = await self._calibrator.measure(truck, step, options, self._panel)
                 self._decision = asyncio.get_running_loop().create_future()
                 self._enter("measured")
                 if await self._decision:

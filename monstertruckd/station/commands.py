@@ -23,6 +23,7 @@ Heading = Annotated[float, Field(ge=-math.tau, le=math.tau)]
 Place = Annotated[tuple[Number, ...], Field(min_length=2, max_length=3)]
 """x, y (m) and optionally yaw (rad)."""
 Id = Annotated[int, Field(ge=0, lt=2**53)]
+Name = Annotated[str, Field(max_length=64)]
 Stamp = Annotated[int, Field(ge=0, lt=2**63)]
 """Time of the robot's clock (ns)."""
 
@@ -260,6 +261,8 @@ class Calibrate(Asked):
     order: Literal["list", "start", "answer", "accept", "discard"]
     step: Annotated[str, Field(max_length=100)] = ""
     """Wizard to start."""
+    options: Annotated[dict[Name, Number | bool | Name], Field(max_length=32)] = Field(default_factory=dict)
+    """Its options other than the defaults."""
     value: Number | bool = False
     """Answer: a number, or yes."""
 

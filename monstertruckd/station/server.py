@@ -618,7 +618,7 @@ class _Browser:
                 case "list":
                     value = {"wizards": await self._calibration.offer()}
                 case "start":
-                    self._calibration.begin(command.step)
+                    self._calibration.begin(command.step, command.options)
                 case "answer":
                     self._calibration.answer(command.value)
                 case "accept" | "discard":

@@ -1,5 +1,5 @@
 // Calibration in the page: the wizards that fit the robot, and the one that runs, with its questions, progress and result.
-import { byId, element } from "./dom.js";
+import { byId, element, svg } from "./dom.js";
 import { number, words } from "./words.js";
 
 /** A value with half its interval, as people write it. */
@@ -8,6 +8,42 @@ export function shown({ value, low, high, unit }) {
   const half = low === null || high === null ? null : (high - low) / 2;
   const digits = half ? Math.min(Math.max(1 - Math.floor(Math.log10(half)), 0), 6) : 4;
   return [`${value.toFixed(digits)}${half ? ` ± ${half.toFixed(digits)}` : ""}`, unit].filter(Boolean).join(" ");
+}
+
+/**
+ * A field for an option of a wizard, and what was given in it: nothing where it is the default.
+ *
+ * @param {string} id of the wizard
+ * @param {{name: string, default: number | boolean | string, help: string, low: number | null, high: number | null, choices: string[], whole: boolean}} option
+ */
+function field(id, option) {
+  const name = option.name.replaceAll("_", " ");
+  const key = `option-${id}-${option.name}`;
+  const flag = typeof option.default === "boolean";
+  const input = option.choices.length ? element("select", { id: key }, ...option.choices.map((choice) => new Option(choice, choice)))
+    : element("input", flag ? { id: key, type: "checkbox", checked: option.default } : { id: key, type: "number", step: option.whole ? "1" : "any", min: option.low ?? "", max: option.high ?? "" });
+  if (!flag) input.value = option.default;
+  const given = () => {
+    const value = flag ? input.checked : option.choices.length ? input.value : input.valueAsNumber;
+    return value === option.default || Number.isNaN(value) ? [] : [[option.name, value]];
+  };
+  const row = element("p", {}, element("label", { htmlFor: key, textContent: name }), input, element("small", { textContent: option.help }));
+  return { row, given };
+}
+
+/** The interval of a result above that of the result before, on one scale; nothing where there is no interval. */
+function intervals(row) {
+  const rows = [row, row.before].filter((each) => each && each.low !== null && each.high !== null);
+  if (!rows.length) return [];
+  const [low, high] = [Math.min(...rows.map((each) => each.low)), Math.max(...rows.map((each) => each.high))];
+  const place = (value) => 4 + (112 * (value - low)) / (high - low || 1);
+  const lines = rows.flatMap((each) => {
+    const [y, look] = each === row ? [6, "measured"] : [16, "before"];
+    return [svg("path", { class: look, d: `M${place(each.low)} ${y}H${place(each.high)}` }), svg("circle", { class: look, cx: place(each.value), cy: y, r: 3.5 })];
+  });
+  const drawn = svg("svg", { class: "intervals", viewBox: "0 0 120 22", role: "img", "aria-label": words(rows.length > 1 ? "wizard.intervals" : "wizard.interval") });
+  drawn.append(...lines);
+  return [drawn];
 }
 
 export class Calibration {
@@ -47,10 +83,12 @@ export class Calibration {
     const answer = await this.order("list");
     if (!answer.ok) return;
     this.wizards = answer.value.wizards;
-    byId("wizards").replaceChildren(...this.wizards.map(({ id, name, rough, doc, due }) => {
+    byId("wizards").replaceChildren(...this.wizards.map(({ id, name, rough, doc, due, options = [] }) => {
       const start = element("button", { textContent: words(rough ? "wizard.rough" : "wizard.start", { name }), className: due ? "go" : "" });
-      start.onclick = () => this.order("start", { step: id });
-      return element("li", {}, start, element("small", { textContent: `${due ? `${words("wizard.due")} ` : ""}${doc}` }));
+      const fields = options.map((option) => field(id, option));
+      start.onclick = () => this.order("start", { step: id, options: Object.fromEntries(fields.flatMap(({ given }) => given())) });
+      const more = fields.length ? [element("details", {}, element("summary", { textContent: words("wizard.options") }), ...fields.map(({ row }) => row))] : [];
+      return element("li", {}, start, element("small", { textContent: `${due ? `${words("wizard.due")} ` : ""}${doc}` }), ...more);
     }));
   }
 
@@ -98,8 +136,8 @@ export class Calibration {
     byId("wizard-measured").textContent = text;
     byId("wizard-rows").replaceChildren(...rows.map((row) => element("tr", {},
       element("td", {}, row.name.replaceAll("_", " "), element("small", { textContent: row.meaning })),
-      element("td", { textContent: shown(row) }),
-      element("td", { textContent: row.before === null ? "–" : shown({ value: row.before, low: null, high: null, unit: row.unit }) }),
+      element("td", { textContent: shown(row) }, ...intervals(row)),
+      element("td", { textContent: row.before === null ? "–" : shown({ ...row.before, unit: row.unit }) }),
       element("td", { textContent: row.grade ?? "–" }))));
   }
 }

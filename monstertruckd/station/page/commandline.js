@@ -3,6 +3,12 @@
 const shown = (value) => String(Number(value.toFixed(3)));
 const degrees = (radians) => shown((radians * 180) / Math.PI);
 
+/** An option of a command, as a flag or with its value. */
+function option([name, value]) {
+  const flag = `--${name.replaceAll("_", "-")}`;
+  return typeof value === "boolean" ? [value && flag] : [flag, typeof value === "number" ? shown(value) : value];
+}
+
 const LINES = {
   order: ({ order, hold }) => (order === "stop" ? null : [order, hold && order === "arm" && "--hold"]),
   goal: ({ goal: [x, y, yaw], via = [] }) => ["goto", ...via.flatMap((place) => ["--via", place.map(shown).join(",")]), "--", shown(x), shown(y), degrees(yaw)],
@@ -15,7 +21,7 @@ const LINES = {
   settings: () => ["get"],
   point: ({ order, name, place, yaw }) => ["points", order, name, ...(place ? ["--", ...place.map(shown), degrees(yaw)] : [])],
   zone: ({ order, name, area }) => ["zone", order, name, ...(area ? ["--", ...area.corners.map((corner) => corner.map(shown).join(","))] : [])],
-  calibrate: ({ order, step }) => (order === "start" ? ["calibrate", step.split(".")[0]] : null),
+  calibrate: ({ order, step, options = {} }) => (order === "start" ? ["calibrate", step.split(".")[0], ...Object.entries(options).flatMap(option)] : null),
 };
 
 /** The words of a command as a shell takes them; null where no command line does the same. */

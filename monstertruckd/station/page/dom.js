@@ -37,6 +37,13 @@ export function element(name, fields = {}, ...children) {
   return made;
 }
 
+/** Make an element of a drawing. */
+export function svg(name, fields) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(fields)) made.setAttribute(key, String(value));
+  return made;
+}
+
 /** Set a text where it has changed: assistive technology tells every change. */
 export function setText(target, text) {
   if (target.textContent !== text) target.textContent = text;

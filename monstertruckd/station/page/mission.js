@@ -142,7 +142,7 @@ export class MissionTool {
     map.stroke(c, [map.pose, ...stops.map(({ x, y }) => [x, y])].filter(Boolean), map.colour.accent, 1.5 * px, [4 * px, 4 * px]);
     stops.forEach(({ x, y, yaw }, i) => {
       map.drawGoal(c, [x, y, yaw], px, map.colour[i === present ? "goal" : "accent"]);
-      map.label(c, px, x, y, String(i + 1));
+      map.mark(c, px, x, y, map.colour[i === present ? "goal" : "accent"], String(i + 1));
     });
   }
 }

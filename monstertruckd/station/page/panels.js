@@ -1,5 +1,5 @@
 // The panels beside the map: safety gate, truck, system, events, banners.
-import { byId, element } from "./dom.js";
+import { byId, element, svg } from "./dom.js";
 import { wheelAngles } from "./geometry.js";
 import { Past } from "./series.js";
 import { degrees, modeText, moves, number, reason, words } from "./words.js";
@@ -9,12 +9,6 @@ const OLD = 3.0; // seconds after which a value that the robot no longer says ha
 const HOT = 80; // degrees of the computer
 const POOR = 250; // ms there and back from which on the slower link is named
 const LATE = 0.02; // seconds: one control tick
-
-function svg(name, fields) {
-  const made = document.createElementNS("http://www.w3.org/2000/svg", name);
-  for (const [key, value] of Object.entries(fields)) made.setAttribute(key, value);
-  return made;
-}
 
 function setText(id, text, look = null) {
   const target = byId(id);

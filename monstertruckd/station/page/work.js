@@ -246,7 +246,8 @@ export class Work {
 
 /** Unit that a setting's meaning names last, and by what its value is multiplied for people: degrees instead of radians. */
 export function unitOf(meaning) {
-  const [, unit = ""] = /(?:, |\()(rad(?:\/s(?:\^2)?)?|m(?:\/s(?:\^2)?)?|s|Hz|V|1\/m|%|N|kg)\)?\.?$/.exec(meaning.trim()) ?? [];
+  const [, name = ""] = /(?:, |\()(rad(?:\/s(?:\^2)?)?|m(?:\/s(?:\^2)?)?|s|Hz|V|1\/m|%|N|kg)\)?\.?$/.exec(meaning.trim()) ?? [];
+  const unit = name.replace("^2", "²");
   return unit.startsWith("rad") ? { name: unit.replace("rad", "°"), factor: 180 / Math.PI } : { name: unit, factor: 1 };
 }
 

@@ -5,6 +5,7 @@ import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
@@ -160,9 +161,9 @@ def all_(
             _run(wizard_of(steps[0]), call, panel)
 
 
-def wizard_of(run: WizardRun) -> "Wizard":
-    """The wizard of a run of ``calibrate all``, with its own defaults."""
-    return _made(run.wizard, run.step.options)
+def wizard_of(run: WizardRun, given: "Mapping[str, Any]" = MappingProxyType({})) -> "Wizard":
+    """The wizard of a run of ``calibrate all``, with its own defaults where an option is not given."""
+    return _made(run.wizard, {**run.step.options, **given})
 
 
 async def _steps_left(call: _Call, clock: "Clock") -> "tuple[list[WizardRun], bool]":

@@ -1,10 +1,12 @@
 """The wizards of ``monstertruckd calibrate`` for the operator's page."""
 
+import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration_rpc import SHOW
-from monstertruckd.config.wizards import WizardRun, sequence
+from monstertruckd.config.wizards import WizardOption, WizardRun, sequence
 from monstertruckd.station.calibration import Measured, PagePanel
 from monstertruckd.tools.cli.calibrate import file_in, wizard_of
 from monstertruckd.tools.cli.connection import robot_config
@@ -38,29 +40,70 @@ class PageCalibrator:
                 "rough": run.step.rough,
                 "doc": _sentence(run.wizard.doc),
                 "due": _id(run) in due,
+                "options": [_option(option, run) for option in run.wizard.options],
             }
             for run in sequence()
             if run.wizard.fits(config) and run.step.fits(config)
         ]
 
-    async def measure(self, truck: "TruckClient", step: str, panel: PagePanel) -> Measured:
+    async def measure(self, truck: "TruckClient", step: str, options: Mapping[str, Any], panel: PagePanel) -> Measured:
         """Run a step.
 
         Raises:
-            TruckError: there is no such step, or it ended without a result.
+            TruckError: there is no such step, an option is wrong, or it ended without a result.
         """
         from monstertruckd.tools.calibrate.wizard import measure, save
 
         run = next((run for run in sequence() if _id(run) == step), None)
         if run is None:
             raise InputError(f"{step}: no such calibration")
+        given = {name: _checked(run, name, value) for name, value in options.items()}
         config, known = await robot_config(truck), await _known(truck)
-        result = await measure(wizard_of(run), truck, panel, self._clock, config, known)
+        result = await measure(wizard_of(run, given), truck, panel, self._clock, config, known)
 
         async def saved() -> str:
             return (await save(truck, result))[1]
 
         return Measured(_rows(result, known.get(run.name)), result.measured, saved)
+
+
+def _option(option: WizardOption, run: WizardRun) -> dict[str, Any]:
+    """An option as the page shows it, with the default of this step."""
+    default = run.step.options.get(option.name, option.default)
+    return {
+        "name": option.name,
+        "default": default,
+        "help": option.help,
+        "low": option.low,
+        "high": option.high,
+        "choices": option.choices,
+        "whole": type(option.default) is int,
+    }
+
+
+def _checked(run: WizardRun, name: str, value: float | bool | str) -> float | bool | str:
+    """The value of an option, of its type and within its bounds; of which choices it is one, the wizard says.
+
+    Raises:
+        InputError: there is no such option, or the value does not fit.
+    """
+    option = next((option for option in run.wizard.options if option.name == name), None)
+    if option is None:
+        names = ", ".join(option.name for option in run.wizard.options) or "none"
+        raise InputError(f"{run.name}: option {name}: expected one of {names}")
+    kind: type[Any] = type(option.default)
+    mistake = InputError(f"{run.name}: option {name}: expected {kind.__name__}, got {value!r}")
+    if kind is bool or kind is str:
+        if type(value) is not kind:
+            raise mistake
+        return value
+    if isinstance(value, bool | str) or (kind is int and not float(value).is_integer()):
+        raise mistake
+    low, high = (-math.inf if option.low is None else option.low), (math.inf if option.high is None else option.high)
+    if not low <= value <= high:
+        raise InputError(f"{run.name}: option {name}: expected {low:g} to {high:g}, got {value:g}")
+    number: float = kind(value)
+    return number
 
 
 def _id(run: WizardRun) -> str:
@@ -85,5 +128,6 @@ def _rows(result: "Result", before: "Result | None") -> list[dict[str, Any]]:
         row = estimate.model_dump(
             mode="json", include={"name", "unit", "meaning", "value", "low", "high", "grade", "samples"}
         )
-        rows.append({**row, "before": None if old is None else old.value})
+        before_row = old and {"value": old.value, "low": old.low, "high": old.high}
+        rows.append({**row, "before": before_row})
     return rows

@@ -15,7 +15,7 @@ BENCHMARKS = sorted(path.name for path in FILES if "ArgumentParser" in path.read
 @pytest.mark.long
 @pytest.mark.parametrize("name", BENCHMARKS)
 def test_a_benchmark_says_what_it_takes(name: str) -> None:
-    command = [sys.executable, f"benchmarks/{name}", "--help"]
+    command = [sys.executable, "-m", f"benchmarks.{name.removesuffix('.py')}", "--help"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     assert "usage" in done.stdout

@@ -32,7 +32,8 @@ class Wizards:
     async def offered(self, truck: Any) -> list[dict[str, Any]]:
         return [{"id": "battery.gain", "name": "battery", "rough": False, "doc": "Scale.", "due": True}]
 
-    async def measure(self, truck: Any, step: str, panel: Any) -> Measured:
+    async def measure(self, truck: Any, step: str, options: Any, panel: Any) -> Measured:
+        self.options = options
         panel.say(f"{step} on {truck}")
         if self.fault is not None:
             raise self.fault
@@ -69,7 +70,7 @@ async def test_a_wizard_asks_shows_its_result_and_saves_it_once_it_is_accepted()
     wizards = Wizards()
     run, viewer = calibration(wizards)
     assert [row["id"] for row in await run.offer()] == ["battery.gain"]
-    run.begin("battery.gain")
+    run.begin("battery.gain", {})
     asked = await state(viewer)
     assert (asked["phase"], asked["said"]) == ("running", ["battery.gain on truck by ann.calibrate"])
     assert asked["question"] == {
@@ -93,7 +94,7 @@ async def test_a_wizard_asks_shows_its_result_and_saves_it_once_it_is_accepted()
     with pytest.raises(InputError, match="asks nothing now"):
         run.answer(1.0)
     with pytest.raises(InputError, match=r"battery\.gain runs already"):
-        run.begin("battery.gain")
+        run.begin("battery.gain", {})
     run.decide(accept=True)
     saved = await state(viewer)
     assert (saved["phase"], saved["text"], wizards.saved) == ("saved", "0002.json", 1)
@@ -102,7 +103,7 @@ async def test_a_wizard_asks_shows_its_result_and_saves_it_once_it_is_accepted()
 async def test_what_is_discarded_or_cancelled_is_not_saved():
     wizards = Wizards()
     run, viewer = calibration(wizards)
-    run.begin("battery.gain")
+    run.begin("battery.gain", {})
     await state(viewer)
     run.answer(12.0)
     await state(viewer)
@@ -110,7 +111,7 @@ async def test_what_is_discarded_or_cancelled_is_not_saved():
     await state(viewer)
     run.decide(accept=False)
     assert (await state(viewer))["phase"] == "discarded"
-    run.begin("battery.gain")
+    run.begin("battery.gain", {})
     await state(viewer)
     run.decide(accept=False)
     assert (await state(viewer))["phase"] == "discarded"
@@ -121,14 +122,14 @@ async def test_what_is_discarded_or_cancelled_is_not_saved():
 async def test_a_browser_that_leaves_ends_its_wizard_and_a_failure_is_shown():
     wizards = Wizards()
     run, viewer = calibration(wizards)
-    run.begin("battery.gain")
+    run.begin("battery.gain", {})
     await state(viewer)
     ended = run.end()
     assert ended is not None
     await asyncio.wait([ended])
     assert wizards.cancelled
     run, viewer = calibration(Wizards(NoAnswerError("sensor/battery: no message came for 10 s")))
-    run.begin("battery.gain")
+    run.begin("battery.gain", {})
     failed = await state(viewer)
     assert (failed["phase"], failed["text"]) == ("failed", "sensor/battery: no message came for 10 s")
 

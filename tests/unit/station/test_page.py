@@ -37,10 +37,16 @@ window.WebSocket = class {
   }
 };
 window.answers = true;
+const now = performance.now.bind(performance);
+window.passed = 0;
+performance.now = () => now() + window.passed;
 localStorage.guided ??= "yes";
 window.say = (...messages) => messages.forEach((m) => window.socket.onmessage({ data: JSON.stringify(m) }));
 """
-"""Instead of the browser's WebSocket: what the page sends is kept, what the station would say is said by the test."""
+"""Instead of the browser's WebSocket: what the page sends is kept, what the station would say is said by the test.
+
+Time passes at once where the test says so.
+"""
 
 FACTS = {
     "kind": "facts",
@@ -387,7 +393,7 @@ async def what_a_sensor_said_long_ago_is_not_shown_as_of_now(page: Page) -> None
     await say(page, battery, compass)
     await asyncio.sleep(0.2)
     assert await page.inner_text("#chip-battery") == "24.8 V"
-    await asyncio.sleep(2.9)
+    await page.evaluate("void (window.passed += 2900)")
     await say(page, compass)
     await page.wait_for_function("document.querySelector('#chip-battery').textContent === '24.8 V, 3 s old'")
     assert "old" not in (await page.text_content("#tilt") or "")
@@ -577,6 +583,7 @@ async def the_link_that_failed_is_named_with_its_age(page: Page) -> None:
         "() => document.querySelector('#chip-link').textContent === 'Station to robot: 8900 ms'"
     )
     await say(page, {"kind": "link", "alive": True, "round_trip": 0.02, "text": ""})
+    await page.evaluate("void (window.passed += 2000)")
     await page.wait_for_function(
         "() => /^Station to robot: silent for/.test(document.querySelector('#chip-link').textContent)"
     )
@@ -585,6 +592,7 @@ async def the_link_that_failed_is_named_with_its_age(page: Page) -> None:
     gone = "class { static OPEN = 1; constructor() { setTimeout(() => this.onclose(), 0); } send() {} }"
     await page.evaluate(f"void (window.WebSocket = {gone})")
     await page.evaluate("window.socket.onclose()")
+    await page.evaluate("void (window.passed += 2500)")
     await page.wait_for_function(
         "() => document.querySelector('#chip-link').textContent === 'Browser to station: lost for 3 s'"
     )
@@ -821,10 +829,17 @@ async def a_wizard_asks_and_its_result_is_accepted_beside_the_one_before(page: P
         {"id": "drive.inverted", "name": "drive", "rough": True, "doc": "Which way is forward.", "due": True},
         {"id": "battery.gain", "name": "battery", "rough": False, "doc": "Scale of the voltage.", "due": False},
     ]
+    bounds = {"low": 0.1, "high": 5.0, "choices": [], "whole": False}
+    fresh = {"name": "fresh", "default": False, "help": "Forget the earlier readings.", **bounds}
+    wizards[1]["options"] = [{"name": "meter_error", "default": 0.5, "help": "Of the meter, %.", **bounds}, fresh]
     await say(page, {"kind": "answer", "id": (await asked())["id"], "ok": True, "value": {"wizards": wizards}})
     await expect(page.locator("#wizards button")).to_have_text(["First look at drive", "Calibrate battery"])
+    await page.click("#wizards summary")
+    await page.get_by_label("meter error").fill("0.8")
     await page.locator("#wizards button").last.click()
-    assert ((await asked())["order"], (await asked())["step"]) == ("start", "battery.gain")
+    begun = await asked()
+    assert (begun["order"], begun["step"], begun["options"]) == ("start", "battery.gain", {"meter_error": 0.8})
+    await expect(page.locator("#command code")).to_have_text("monstertruckd calibrate battery --meter-error 0.8")
 
     state = {"kind": "calibrating", "step": "battery.gain", "phase": "running", "said": ["battery: Scale"], "text": ""}
     state |= {"progress": None, "measured": None, "question": None}
@@ -841,9 +856,11 @@ async def a_wizard_asks_and_its_result_is_accepted_beside_the_one_before(page: P
     assert await page.locator("#wizard-progress").evaluate("(bar) => bar.position") == 0.5
     await expect(page.locator("#wizard-ask")).to_be_hidden()
     row = {"name": "gain", "value": 1.0213, "low": 1.0, "high": 1.04, "unit": "V", "meaning": "scale", "grade": "A"}
-    measured = {"rows": [row | {"before": 0.98}], "text": "two readings"}
+    measured = {"rows": [row | {"before": {"value": 0.98, "low": 0.97, "high": 0.99}}], "text": "two readings"}
     await say(page, state | {"phase": "measured", "measured": measured})
-    await expect(page.locator("#wizard-rows td")).to_contain_text(["gain", "1.021 ± 0.020 V", "0.9800 V", "A"])
+    await expect(page.locator("#wizard-rows td")).to_contain_text(["gain", "1.021 ± 0.020 V", "0.980 ± 0.010 V", "A"])
+    ends = await page.locator("#wizard-rows path").evaluate_all("(all) => all.map((path) => path.getBBox().x)")
+    assert ends[0] > ends[1], "its interval above that of the value before"
     await page.click("#wizard-accept")
     assert (await asked())["order"] == "accept"
     await say(page, state | {"phase": "saved", "text": "0002.json"})

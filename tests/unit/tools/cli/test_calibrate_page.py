@@ -67,11 +67,28 @@ async def test_a_result_stands_beside_the_one_before_and_is_saved_when_that_is_a
 
     monkeypatch.setattr(BatteryWizard, "__call__", measures)
     truck = Truck()
-    measured = await PageCalibrator(WallClock()).measure(truck, "battery.gain", Panel())  # type: ignore[arg-type]
+    measured = await PageCalibrator(WallClock()).measure(truck, "battery.gain", {"meter_error": 1}, Panel())  # type: ignore[arg-type]
     (row,) = measured.rows
-    assert (row["value"], row["before"], row["meaning"]) == (1.6, 1.5, "scale")
+    assert (row["value"], row["before"]["value"], row["meaning"]) == (1.6, 1.5, "scale")
     assert not truck.saved
     assert await measured.save() == "0002.json"
     assert truck.saved[0]["source"] == "ann.calibrate"
     with pytest.raises(InputError, match=r"battery\.scale: no such calibration"):
-        await PageCalibrator(WallClock()).measure(truck, "battery.scale", Panel())  # type: ignore[arg-type]
+        await PageCalibrator(WallClock()).measure(truck, "battery.scale", {}, Panel())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("options", "mistake"),
+    [
+        ({"rounds": 3}, "battery: option rounds: expected one of meter_error, meter_digits, fresh"),
+        ({"fresh": 1}, "battery: option fresh: expected bool, got 1"),
+        ({"meter_error": "small"}, "battery: option meter_error: expected float, got 'small'"),
+        ({"meter_error": -1.0}, "battery: option meter_error: expected 0"),
+    ],
+)
+async def test_a_wrong_option_is_refused_by_name(options: dict[str, Any], mistake: str):
+    offered = await PageCalibrator(WallClock()).offered(Truck())  # type: ignore[arg-type]
+    (battery,) = (row for row in offered if row["id"] == "battery.gain")
+    assert [option["name"] for option in battery["options"]] == ["meter_error", "meter_digits", "fresh"]
+    with pytest.raises(InputError, match=mistake):
+        await PageCalibrator(WallClock()).measure(Truck(), "battery.gain", options, Panel())  # type: ignore[arg-type]
