@@ -379,6 +379,7 @@ class Daemon:
             peers=self._body.peers,
             compared=True,
             zones=config.zones,
+            docks=config.docks,
             own=config.checks,
         )
         shafts = len(self._body.chassis.shafts)

@@ -183,6 +183,10 @@ class PulseSource(Protocol):
 class ServoPlant(Protocol):
     """Servos with their load; ``advance`` is called before any target changes."""
 
+    @property
+    def inputs(self) -> frozenset[int]:
+        """Channels of the servo controller that are analog inputs."""
+
     def attach(self, pulses: PulseSource) -> None:
         """Set the controller whose pulses move the servos."""
 

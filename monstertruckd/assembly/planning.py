@@ -126,10 +126,10 @@ def build_planners(
     behaviours = None
     if config.behaviours and requests is not None:
         moved = BehaviourBody(body.chassis, config.gate.angle)
-        behaviours = BehaviourService(config.behaviours, clock, bus, requests, config.gate.max_request_age, moved)
+        behaviours = BehaviourService(config.all_behaviours, clock, bus, requests, config.gate.max_request_age, moved)
         yield behaviours
     if goals is not None:
-        yield _build_missions(config, bus, clock, MissionParts(goals, behaviours, explorer))
+        yield _build_missions(config, bus, clock, MissionParts(goals, behaviours, explorer, config.docks))
     if config.devices.stabiliser is not None and config.devices.compass is not None:
         yield LEVELLING.implementation(config.levelling)(config.levelling, clock, bus)
     if config.map is not None and config.devices.lidar is not None:

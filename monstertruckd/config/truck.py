@@ -23,6 +23,7 @@ from monstertruck_kinematics.chassis import AXLES, WHEEL_REACH, Chassis, Dimensi
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_planners.behave.api import BehaviourConfig
 from monstertruck_planners.behave.catalog import AnyBehaviour, AnyLevelling
+from monstertruck_planners.behave.dock.config import DockConfig, DockingConfig, UndockConfig
 from monstertruck_planners.behave.follow import FollowConfig
 from monstertruck_planners.behave.lidar_sonars import LidarSonarsConfig
 from monstertruck_planners.behave.move import MoveConfig
@@ -54,6 +55,8 @@ UNCOMPARED: Final = "consistency null: sensors that lie are not found"
 
 MOVE: Final = "move"
 """Name of the behaviour that every robot has."""
+DOCKING: Final = {"dock": DockingConfig, "undock": UndockConfig}
+"""Behaviours that every robot with docks has."""
 
 
 class Geometry(Schema):
@@ -154,6 +157,8 @@ class TruckConfig(Schema):
     """How unknown ground is explored; null = the robot does not explore"""
     behaviours: dict[Name, AnyBehaviour] = Field(default_factory=dict, validate_default=True)
     """Reactive behaviours (without a path) by name; started by `behave start`. `move` is always there"""
+    docks: dict[Name, DockConfig] = Field(default_factory=dict)
+    """Docks by name; with any, the behaviours `dock` and `undock` are there"""
     lidar_sonars: LidarSonarsConfig | None = None
     """Sonars computed from the lidar, for behaviours of a robot without sonars; null for none"""
     peers: dict[Name, PeerConfig] = Field(default_factory=dict)
@@ -195,6 +200,17 @@ class TruckConfig(Schema):
         if not isinstance(moves[MOVE], MoveConfig):
             raise ValueError(f"{MOVE}: expected kind move, which the command of this name starts")
         return moves
+
+    @property
+    def all_behaviours(self) -> dict[str, BehaviourConfig]:
+        """The configured behaviours, and those of the docks."""
+        if not self.docks:
+            return dict(self.behaviours)
+        given = {name: self.behaviours.get(name, kind()) for name, kind in DOCKING.items()}
+        return {
+            **self.behaviours,
+            **{name: behaviour.model_copy(update={"docks": self.docks}) for name, behaviour in given.items()},
+        }
 
     @property
     def own_planner(self) -> PlannerConfig | None:
@@ -293,6 +309,7 @@ class TruckConfig(Schema):
         for name, behaviour in self.behaviours.items():
             if isinstance(behaviour, FollowConfig) and behaviour.leader not in self.peers:
                 raise ValueError(f"behaviours.{name}.leader {behaviour.leader}: expected one of peers")
+        self._check_docks()
         if self.robot in self.peers:
             raise ValueError(f"peers.{self.robot}: expected other robots than this one")
         if self.lidar_sonars is not None and (self.devices.lidar is None or self.devices.sonar is not None):
@@ -302,6 +319,21 @@ class TruckConfig(Schema):
         if len(measuring) > 1:
             raise ValueError(f"{' and '.join(measuring)} both measure the battery; set the other one null")
         return self
+
+    def _check_docks(self) -> None:
+        for name, kind in DOCKING.items():
+            if not isinstance(self.behaviours.get(name, kind()), kind):
+                raise ValueError(f"behaviours.{name}: expected kind {name}, which the command of this name starts")
+        if not self.docks:
+            return
+        if self.points is None or self.devices.camera is None:
+            raise ValueError("docks need the section points and the device camera, which see their tags")
+        if lack := self.missing_actuators():
+            raise ValueError(f"docks need {lack}")
+        measured = any(True for _ in packs(self.devices, self.monitors))
+        for name, dock in self.docks.items():
+            if dock.charging is not None and not measured:
+                raise ValueError(f"docks.{name}.charging: no device measures the battery; expected null")
 
     def _check_actuators(self) -> None:
         chassis = self.chassis()

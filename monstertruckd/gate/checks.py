@@ -10,7 +10,12 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from monstertruck_kinematics.chassis import Chassis
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, points_relative
 from monstertruck_planners.collision import Footprint
 from monstertruck_runtime.requests import OPERATORS
 from monstertruck_schemas.base import Message
@@ -45,6 +50,22 @@ class PaceLimit(NamedTuple):
     """Maximum pace, m/s; 0: the robot stands while its driver stays in control."""
 
 
+class DockArea(NamedTuple):
+    """Area in front of a dock, in base."""
+
+    housing: tuple[Pose2, float, float] | None
+    """Near face of the dock's housing (pose of its middle, x away from the robot), depth and width (m); None without
+    one."""
+
+    def outside(self, points: Array) -> NDArray[np.bool_]:
+        """Whether each point (n, 2) in base (m) is no part of the housing."""
+        if self.housing is None:
+            return np.ones(len(points), np.bool_)
+        face, depth, width = self.housing
+        x, y = points_relative(points, face).T
+        return np.asarray((x < 0.0) | (x > depth) | (np.abs(y) > width / 2))
+
+
 class GateView:
     """Read access for checks: limits, latest samples, commanded motion and mode of the gate.
 
@@ -72,6 +93,8 @@ class GateView:
         self.samples = samples
         self.motion = motion
         self._states = states
+        self.dock: DockArea | None = None
+        """Dock that a behaviour approaches or leaves and that is near, as ``DockCheck`` finds at every tick."""
 
     @property
     def config(self) -> GateConfig:
@@ -87,6 +110,12 @@ class GateView:
     def calibrates(self) -> bool:
         """Whether an operator has armed the robot to calibrate sensors on ground kept clear."""
         return self._states.calibrates
+
+    @property
+    def planner(self) -> str | None:
+        """Planner of the robot that drives; None if none does."""
+        holder = self._states.holder
+        return holder.request.source if holder is not None and holder.inside else None
 
     @property
     def confirmed(self) -> bool:

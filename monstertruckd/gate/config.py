@@ -129,6 +129,19 @@ class ObstacleLimits(Schema):
     """Whether a scan without any range means free ground; otherwise it is invalid."""
 
 
+class DockingLimits(Schema):
+    """Limits near a dock while a behaviour docks or undocks."""
+
+    speed: Annotated[float, Field(gt=0, le=0.1), LIVE] = 0.05
+    """Maximum speed, m/s."""
+    across: Annotated[float, Field(gt=0, le=0.3)] = 0.15
+    """Maximum distance from the axis of the dock, m."""
+    turn: Annotated[float, Field(gt=0, le=0.5)] = 0.3
+    """Maximum heading relative to that axis, rad."""
+    beyond: Annotated[float, Field(ge=0, le=0.1)] = 0.02
+    """Maximum distance past the docked pose, m."""
+
+
 class SonarLimits(Schema):
     """Limits for the sonars of a robot without a lidar, and for rear sonars of a robot with a lidar."""
 
@@ -260,6 +273,7 @@ class GateConfig(Schema):
     obstacle: ObstacleLimits = ObstacleLimits()
     assist: AssistConfig = AssistConfig()
     sonar: SonarLimits = SonarLimits()
+    docking: DockingLimits = DockingLimits()
     unwitnessed: Annotated[float, Field(gt=0, le=1), LIVE] = 0.5
     """Fraction of the speed limits while no second, independent sensor measures the robot's motion."""
     event_interval: NotNegative = 1.0

@@ -229,8 +229,9 @@ class ContactCheck(Check):
             self._touch(ContactFinding(f"speed of {name}", measured, unit, least), seen.received)
 
     def _touch(self, found: ContactFinding, now: int) -> None:
-        """Begin to back off if an operator drives on into unseen ground and not already away from it."""
-        if self.view.confirmed and self._request is not None and self._leads(self._request, self._steady):
+        """Begin to back off if the robot drives on into unseen ground, or near a dock, and not already away from it."""
+        watched = self.view.confirmed or self.view.dock is not None
+        if watched and self._request is not None and self._leads(self._request, self._steady):
             self._touched, self._finding, self._began, self._backed = self._request, found, now, 0.0
             self._reached.clear()
             self._slow.clear()

@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple, assert_never
 
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import KinematicsError
+from monstertruck_planners.behave.dock.config import DockConfig
 from monstertruck_planners.collision import Footprint, ScanPoints
 from monstertruck_planners.zones.config import ZonesConfig
 from monstertruck_runtime.clock import SECOND
@@ -36,6 +37,7 @@ from monstertruckd.gate.checks import Check, Checks, GateView, Tick
 from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.consistency import ConsistencyCheck
 from monstertruckd.gate.contact import ContactCheck
+from monstertruckd.gate.docking import DockCheck
 from monstertruckd.gate.following import ShaftCheck, SteeringCheck
 from monstertruckd.gate.limiter import CommandLimiter
 from monstertruckd.gate.motion import Motion
@@ -204,6 +206,7 @@ class Gate:
         peers: outlines of other robots whose poses are received, by name.
         compared: whether the robot has to compare its measures of motion.
         zones: settings of the zones; None without zones.
+        docks: docks by name.
         own: settings of checks added by the configuration, by name.
     """
 
@@ -223,6 +226,7 @@ class Gate:
         peers: Mapping[str, Footprint] | None = None,
         compared: bool = False,
         zones: ZonesConfig | None = None,
+        docks: Mapping[str, DockConfig] = MappingProxyType({}),
         own: Mapping[str, CheckConfig] = MappingProxyType({}),
     ) -> None:
         self._limits = InForce(config)
@@ -240,6 +244,7 @@ class Gate:
                 *sensor_checks(view, battery_measured=battery_measured, compared=compared),
                 self._limiter,
                 *(() if self._contact is None else (self._contact,)),
+                *((DockCheck(view, docks),) if docks else ()),
                 *obstacle_checks(view, points, sonars, rear_sonars, peers),
                 *(() if zones is None else (ZoneCheck(zones, view),)),
                 *(OwnCheck(view, name, settings) for name, settings in own.items()),

@@ -26,7 +26,7 @@ from monstertruck_schemas.sensor import LaserScan, SonarRanges
 from monstertruck_schemas.state import Odometry
 from monstertruck_schemas.topics import ODOMETRY, SONAR, Topic
 from monstertruckd.gate.approach import Approach, comfortable_speed, reach, stopping
-from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
+from monstertruckd.gate.checks import Check, DockArea, GateView, PaceLimit, Tick
 from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.motion import AHEAD, Course
 from monstertruckd.gate.rear_sonars import RearSonars
@@ -127,6 +127,7 @@ class ObstacleGuard:
         self.known_slowly = math.inf
         """Distance to unseen ground that only slows these motions, m; +inf if none is within reach."""
         self._checked: frozenset[_Steps] | None = None
+        self._dock: DockArea | None = None
         self._free = math.inf
         self._outline = footprint.edge_points(OUTLINE, OUTLINE)
         self._near = 0.0
@@ -205,20 +206,25 @@ class ObstacleGuard:
         self._stamp = min(scan.stamp, scan.received)  # a sensor's clock may run ahead: at latest the arrival
         self._checked = None
 
-    def free_distance(self, twists: tuple[UnitTwist, ...]) -> float:
+    def free_distance(self, twists: tuple[UnitTwist, ...], dock: DockArea | None = None) -> float:
         """Distance the footprint can travel from the pose of the scan, m; +inf if no obstacle is within reach.
 
         Args:
             twists: motions of the base; the shortest distance of all is returned.
+            dock: points inside its housing do not count.
         """
         self._follow_limits()
+        if dock != self._dock:
+            self._dock, self._checked = dock, None
         rounded = frozenset((round(x / TWIST_STEP), round(y / TWIST_STEP), round(a / TWIST_STEP)) for x, y, a in twists)
         if self._checked != rounded:
             self._checked = rounded
             self._update_unseen(rounded)
-            remembered, echoes = self.memory.points(), self.memory.echoes()
-            self._free = min(self._free_distance(*twist, remembered, echoes) for twist in rounded)
-            self._check_ground(rounded, np.concatenate((self._points, remembered)))
+            points, remembered, echoes = self._points, self.memory.points(), self.memory.echoes()
+            if dock is not None:
+                points, remembered, echoes = (some[dock.outside(some)] for some in (points, remembered, echoes))
+            self._free = min(self._free_distance(*twist, points, remembered, echoes) for twist in rounded)
+            self._check_ground(rounded, np.concatenate((points, remembered)))
         return self._free
 
     def _update_unseen(self, twists: frozenset[_Steps]) -> None:
@@ -237,12 +243,12 @@ class ObstacleGuard:
         ground = ground.reshape(-1, 2)
         return _Sweep(distances, poses, ground, before, self._visibility.travelled(ground))
 
-    def _free_distance(self, x: int, y: int, turn: int, remembered: Array, echoes: Array) -> float:
+    def _free_distance(self, x: int, y: int, turn: int, points: Array, remembered: Array, echoes: Array) -> float:
         sweep = self._sweep(x, y, turn)
         clearance = self._limits.config.obstacle.side_clearance
         leaving = LEAVING * sweep.distances
         contacts = [
-            first_contact(self._footprint, sweep.poses, self._points, clearance, leaving),
+            first_contact(self._footprint, sweep.poses, points, clearance, leaving),
             # Without clearance: their positions may be off by as much.
             first_contact(self._footprint, sweep.poses, remembered, -self._footprint.padding),
         ]
@@ -386,7 +392,7 @@ class ObstacleCheck(Check):
         if view.samples.steering_fresh(now):
             courses.append((view.motion.along(courses[0][0], view.samples.angles), 0.0))
         twists = tuple(twist for twist, _ in courses)
-        free = guard.free_distance(twists)
+        free = guard.free_distance(twists, view.dock)
         yield from self._approach.limits(free, guard.allowed_speed(free, now), fastest)
         unseen, slow = guard.unseen, view.config.obstacle.unseen_speed
         if unseen is None or unseen > view.config.scan.stale_after:
@@ -402,7 +408,9 @@ class ObstacleCheck(Check):
     def _into_unseen(self, allowed: float, fastest: float) -> Iterator[PaceLimit]:
         """Limits before unseen ground, which allows a pace of ``allowed``, for motions up to ``fastest`` (m/s)."""
         config = self.view.config.obstacle
-        if config.unseen == "slow" or self.view.calibrates:
+        if self.view.dock is not None:
+            allowed = max(allowed, self.view.config.docking.speed)
+        elif config.unseen == "slow" or self.view.calibrates:
             allowed = max(allowed, config.unseen_speed)
         elif self.view.confirmed and allowed < config.confirmed_speed:
             self._before_unseen = False

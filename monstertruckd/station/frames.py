@@ -117,6 +117,7 @@ def facts(config: dict[str, Any], versions: dict[str, str]) -> str:
         tracks=config.get("tracker") is not None,
         path=PurePath(drawn["file"]).stem if (drawn := config.get("path")) else None,
         behaviours=sorted(config.get("behaviours") or {}),
+        docks=sorted(config.get("docks") or {}),
         versions=versions,
     )
 

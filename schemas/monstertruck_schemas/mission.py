@@ -143,6 +143,22 @@ class FollowWallStep(MissionStep):
     """In m"""
 
 
+class DockStep(MissionStep):
+    """Drive to the staging pose of a dock, dock, and wait until the battery is charged."""
+
+    do: Literal["dock"]
+    dock: Name | None = None
+    """Name of the dock in the robot's configuration; null if there is one only"""
+
+
+class UndockStep(MissionStep):
+    """Leave a dock, back to its staging pose."""
+
+    do: Literal["undock"]
+    dock: Name | None = None
+    """Name of the dock; null if there is one only"""
+
+
 class RecordStep(MissionStep):
     """Leave a note in the log."""
 
@@ -239,6 +255,8 @@ AnyStep = Annotated[
     | ExploreStep
     | BehaviourStepOfMission
     | FollowWallStep
+    | DockStep
+    | UndockStep
     | RecordStep
     | ReturnStep
     | ConditionStep

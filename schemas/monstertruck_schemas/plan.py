@@ -185,6 +185,15 @@ DOCK: Final = "dock"
 """Kind of the behaviour that docks: while it runs, every image is searched for tags."""
 
 
+class DockTarget(Schema):
+    """Dock that a behaviour drives to or away from."""
+
+    name: str
+    """Its name in the configuration"""
+    pose: Pose2D
+    """Pose of base at the dock, turned to face it, in the ``frame`` of odometry"""
+
+
 class BehaviourState(Message):
     """Progress of a behaviour, in the ``frame`` of odometry."""
 
@@ -208,6 +217,8 @@ class BehaviourState(Message):
     """Metres by odometry since it was started."""
     values: dict[str, float] = Field(default_factory=dict)
     """Measurements of its kind, such as the distance from a wall, m."""
+    dock: DockTarget | None = None
+    """Dock near which the gate lets the robot drive, while it runs."""
 
     @property
     def activity(self) -> str:

@@ -211,6 +211,12 @@ class Reason(StrEnum):
     BEHAVIOUR_STARTED = "behaviour_started", 0, "a behaviour was started"
     BEHAVIOUR_DONE = "behaviour_done", 0, "a behaviour is complete"
 
+    # Docking
+    DOCK_NOT_SEEN = "dock_not_seen", 98, "the camera does not see the tag of the dock"
+    DOCK_MISSED = "dock_missed", 126, "the robot stands beside the dock"
+    NOT_CHARGING = "not_charging", 128, "the robot stands at the dock, but its battery is not charged"
+    DOCKING = "docking", 0, "the robot drives slowly near a dock"
+
     # Exploration
     CHARGE_SPENT = "charge_spent", 123, "the charge is needed for the way home"
     EXPLORATION_STARTED = "exploration_started", 0, "an exploration was started"

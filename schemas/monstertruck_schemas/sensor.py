@@ -162,6 +162,8 @@ class Battery(Message):
     """Share of the capacity that is left, 0..1, from the resting voltage: right to 0.1 at best."""
     capacity_ah: float | None = None
     """Capacity of the pack as configured, Ah."""
+    current: float | None = None
+    """Current into the pack, A: positive while it is charged; None if the robot does not measure it."""
     degraded: bool = False
     """Whether it rests on a calibration that has expired."""
 

@@ -67,7 +67,11 @@ def test_the_shipped_missions_are_some():
     from monstertruckd.tools.cli.mission import load
 
     folder = Path(__file__).resolve().parents[2] / "configs" / "missions"
-    assert {file.stem: len(load(file).steps) for file in folder.glob("*.yaml")} == {"rooms": 6, "patrol": 2}
+    assert {file.stem: len(load(file).steps) for file in folder.glob("*.yaml")} == {
+        "rooms": 6,
+        "patrol": 2,
+        "charge": 1,
+    }
 
 
 @pytest.mark.parametrize("driven", [0.0, 3.0])

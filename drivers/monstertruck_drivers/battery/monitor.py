@@ -162,8 +162,13 @@ class BatteryMonitor:
         self._current = 0.0
         self._current_at = -CURRENT_VALID
 
-    def take(self, stamp: int, received: int, volts: float, *, at_limit: bool = False) -> None:
-        """Take one sample, V; ``at_limit`` = the converter reads 0 or full scale: a wire of the divider is off."""
+    def take(
+        self, stamp: int, received: int, volts: float, *, at_limit: bool = False, current: float | None = None
+    ) -> None:
+        """Take one sample, V; ``at_limit`` = the converter reads 0 or full scale: a wire of the divider is off.
+
+        ``current`` flows into the pack, A; None if it is not measured.
+        """
         verdict = self._judge.update(stamp, float("nan") if at_limit else volts, self._motor_current(stamp))
         level, rest = verdict.level, verdict.rest_voltage
         if level is not self._level and level in LEVEL_EVENTS:
@@ -183,6 +188,7 @@ class BatteryMonitor:
                 cell_voltage=None if rest is None else rest / self._config.cells,
                 charge=None if rest is None else charge_of(rest / self._config.cells),
                 capacity_ah=self._config.capacity_ah,
+                current=current,
             )
         )
 

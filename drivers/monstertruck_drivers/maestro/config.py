@@ -36,6 +36,23 @@ class ServoConfig(ServoPulses):
         return self.angle_of(quarters / 4)
 
 
+class CurrentInputConfig(Schema):
+    """Current into the pack by a Hall sensor on an analog input; the default is an ACS712 of 20 A."""
+
+    channel: Channel = 4
+    zero: float = 2.5
+    """Voltage at no current (V)"""
+    volts_per_amp: Annotated[float, Field(gt=0)] = 0.1
+    """Sensitivity (V/A)"""
+    reverse: bool = False
+    """Whether the voltage falls while the pack is charged"""
+
+    def amps(self, raw: int) -> float:
+        """Current into the pack (A) of a 10-bit reading against the 5 V rail."""
+        amps = (raw * 5.0 / ADC_MAX - self.zero) / self.volts_per_amp
+        return -amps if self.reverse else amps
+
+
 class BatteryInputConfig(PackConfig):
     """Pack voltage through a divider on an analog input."""
 
@@ -45,6 +62,8 @@ class BatteryInputConfig(PackConfig):
     gain: Annotated[float, Field(gt=0)] = 1.0
     offset: float = 0.0
     """Volts added after the gain."""
+    current: CurrentInputConfig | None = None
+    """Sensor of the current into the pack, which shows charging; null = none"""
 
     @model_validator(mode="after")
     def _ends_of_scale_are_faults(self) -> Self:
@@ -112,6 +131,8 @@ class MaestroConfig(Schema):
             used |= {"front_right": self.front_right.channel, "rear_right": self.rear_right.channel}
         if self.battery is not None:
             used["battery"] = self.battery.channel
+            if self.battery.current is not None:
+                used["current"] = self.battery.current.channel
         if self.deadman_channel is not None:
             used["deadman_channel"] = self.deadman_channel
         if len(set(used.values())) < len(used):

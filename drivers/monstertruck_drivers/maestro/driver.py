@@ -168,7 +168,7 @@ class MaestroDriver:
 
     async def _poll(self, session: MaestroSession, battery: "BatteryInput | None") -> None:
         config = self._config
-        channels = [servo.channel for servo in config.servos] + ([battery.channel] if battery else [])
+        channels = [servo.channel for servo in config.servos] + (battery.channels if battery else [])
         asked = self._clock.now()
         with self._misses:
             *positions, errors = await session.ask(
@@ -184,7 +184,7 @@ class MaestroDriver:
         self._report(session, stamp, received, positions, errors)
         self._polled(stamp, received)
         if battery is not None:
-            battery.take(stamp, received, positions[-1])
+            battery.take(stamp, received, *positions[-len(battery.channels) :])
 
     def _report(self, session: MaestroSession, stamp: int, received: int, positions: list[int], errors: int) -> None:
         positions = positions[: len(self._angles)]
@@ -223,10 +223,12 @@ class BatteryInput:
     """The analog input the battery hangs on."""
 
     def __init__(self, config: BatteryInputConfig, monitor: BatteryMonitor) -> None:
-        self.channel = config.channel
+        self.channels = [config.channel] if config.current is None else [config.channel, config.current.channel]
         self._config = config
         self._monitor = monitor
 
-    def take(self, stamp: int, received: int, raw: int) -> None:
-        """Take one 10-bit reading."""
-        self._monitor.take(stamp, received, self._config.volts(raw), at_limit=raw in (0, ADC_MAX))
+    def take(self, stamp: int, received: int, raw: int, current: int | None = None) -> None:
+        """Take one 10-bit reading, and one of the current where it is measured."""
+        sensor = self._config.current
+        amps = None if sensor is None or current is None else sensor.amps(current)
+        self._monitor.take(stamp, received, self._config.volts(raw), at_limit=raw in (0, ADC_MAX), current=amps)

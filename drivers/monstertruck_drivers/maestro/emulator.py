@@ -389,4 +389,5 @@ class MaestroEmulator(FaultyDevice):
 
 def emulated(setup: EmulatorSetup) -> MaestroEmulator:
     """The servo controller of a simulated truck."""
-    return MaestroEmulator(setup.clock, setup.physics.servos, seed=setup.seed)
+    servos = setup.physics.servos
+    return MaestroEmulator(setup.clock, servos, seed=setup.seed, inputs=servos.inputs)

@@ -30,6 +30,8 @@ class BatteryModel:
     def __init__(self, config: BatteryModelConfig) -> None:
         self._config = config
         self._slow_sag = 0.0
+        self.current = 0.0
+        """Current into the pack, A."""
         self.connected = True
         """Its plug is in."""
         self.set_charge(config.charge)
@@ -46,11 +48,12 @@ class BatteryModel:
         """Behind divider and filter."""
         return self._filtered / self._config.divider + self._config.analog_offset
 
-    def step(self, dt: float, motor_w: float) -> None:
-        """Draw the electronics' and the motor's power for dt seconds."""
+    def step(self, dt: float, motor_w: float, charger_a: float = 0.0) -> None:
+        """Draw the electronics' and the motor's power for dt seconds, less the current of a charger."""
         config = self._config
-        current = (config.electronics_w + motor_w) / max(self.volts, 1.0)
-        self.charge = max(0.0, self.charge - current * dt / 3600 / config.capacity_ah)
+        current = (config.electronics_w + motor_w) / max(self.volts, 1.0) - charger_a
+        self.current = -current
+        self.charge = min(max(0.0, self.charge - current * dt / 3600 / config.capacity_ah), 1.0)
         self._rest = rest_voltage(self.charge, config.cells)
         self._slow_sag += (current * config.recovery_resistance - self._slow_sag) * _share(dt, config.recovery_time)
         self.volts = self._loaded(current)

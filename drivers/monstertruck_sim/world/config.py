@@ -265,6 +265,12 @@ class BatteryModelConfig(Schema):
     """Time constant of the divider's RC low-pass, s."""
     analog_noise: NotNegative = 0.003
     """Standard deviation of the voltage at the analog input, V."""
+    current_channel: Annotated[int, Field(ge=0, le=5)] | None = None
+    """Analog input with a Hall sensor of the current into the pack; null: none."""
+    current_zero: float = 2.5
+    """Voltage of that sensor at no current, V."""
+    volts_per_amp: Positive = 0.1
+    """Sensitivity of that sensor, V/A."""
 
 
 class LidarConfig(Schema):
@@ -352,6 +358,23 @@ class TagConfig(Schema):
     """Side of the black square, m."""
     lies: bool = False
     """Whether the tag lies, facing upwards."""
+
+
+class ChargerConfig(Schema):
+    """Charging contacts on the ground, too low for lidar and camera, and the robot's pose at which they close."""
+
+    x: float
+    """x of the robot's geometric centre on the contacts, m."""
+    y: float
+    """y of the same, m."""
+    yaw: float = 0.0
+    """Heading of the robot, rad."""
+    tolerance: Positive = 0.015
+    """Maximum distance from that pose at which the contacts close, m."""
+    turn_tolerance: Positive = 0.035
+    """Maximum difference in heading at which they close, rad."""
+    current: NotNegative = 3.0
+    """Charging current, A; 0: the charger is off."""
 
 
 class HeldBoard(BoardConfig):
@@ -723,6 +746,8 @@ class WorldConfig(Schema):
     """People who walk through the world"""
     tags: Annotated[tuple[TagConfig, ...], Field(strict=False, max_length=500)] = ()
     """AprilTags in the world, visible to the camera; extra vision"""
+    chargers: Annotated[tuple[ChargerConfig, ...], Field(strict=False, max_length=50)] = ()
+    """Charging contacts of docks"""
     board: HeldBoard | None = None
     """Board held in front of the robot's camera, also visible to the lidar; null: no board; extra vision"""
     roof: RoofTag | None = None

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
-from math import copysign, hypot, pi
+from math import copysign, hypot, pi, remainder
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -14,7 +14,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, Twist2, integrate
 from monstertruck_sim.world.actuators import RPM, Servo, Shaft
 from monstertruck_sim.world.battery import BatteryModel
-from monstertruck_sim.world.config import BatteryModelConfig, SimTruckConfig
+from monstertruck_sim.world.config import BatteryModelConfig, ChargerConfig, SimTruckConfig
 
 PLANT_GRAVITY = 9.81
 
@@ -88,6 +88,8 @@ class Plant(ABC):
         """Motor current of each shaft (A)."""
         self.pulses: PulseSource | None = None
         """Pulse output of the steering servo controller."""
+        self.chargers: tuple[ChargerConfig, ...] = ()
+        """Charging contacts in the world."""
         self.servo_supply = True
         """Whether the steering servos have their 5 V supply."""
         self._servos = tuple(map(Servo, config.servos))
@@ -239,7 +241,16 @@ class Plant(ABC):
         for i, (shaft, pull) in enumerate(zip(self.shafts, pulls, strict=True)):
             current = self.currents[i] = motor_current(self.config, shaft, pull)
             watts += current**2 * motor.winding_resistance + abs(current * motor.torque_constant * shaft.rpm * RPM)
-        self.battery.step(dt, watts)
+        self.battery.step(dt, watts, self._charging())
+
+    def _charging(self) -> float:
+        """Return the current of the charger whose contacts the robot stands on, A."""
+        x, y, yaw = self._pose
+        for charger in self.chargers:
+            off, turn = hypot(x - charger.x, y - charger.y), remainder(yaw - charger.yaw, 2 * pi)
+            if off <= charger.tolerance and abs(turn) <= charger.turn_tolerance:
+                return charger.current
+        return 0.0
 
     @abstractmethod
     def _steering_angles(self) -> tuple[float, ...]: ...

@@ -300,6 +300,12 @@ class SimulatedServos:
         self._plant, self._config = plant, config
         self._noise = WhiteNoise(seed, ANALOG) if seed is not None else None
 
+    @property
+    def inputs(self) -> frozenset[int]:
+        """Inputs of the battery's voltage and current."""
+        current = self._config.current_channel
+        return frozenset({self._config.channel, *(() if current is None else (current,))})
+
     def attach(self, pulses: PulseSource) -> None:
         """Name the controller whose pulses move the servos."""
         self._plant.pulses = pulses
@@ -309,11 +315,14 @@ class SimulatedServos:
         self._plant.advance(time_ns)
 
     def analog_volts(self, channel: int, time_ns: int) -> float:
-        """Voltage at an analog input; 0 at all but the battery input."""
-        if channel != self._config.channel:
+        """Voltage at an analog input; 0 at all but the battery's and that of its current."""
+        config, battery = self._config, self._plant.battery
+        if channel not in (config.channel, config.current_channel):
             return 0.0
         self._plant.advance(time_ns)
-        volts = self._plant.battery.analog_volts
+        volts = battery.analog_volts
+        if channel == config.current_channel:
+            volts = config.current_zero + battery.current * config.volts_per_amp
         if self._noise is not None:
             volts += self._config.analog_noise * self._noise.at(self._plant.slot(time_ns, 1_000_000))[0]
         return max(0.0, volts)

@@ -80,6 +80,7 @@ class World:
             raise InputError(f"start: the robot at {start} touches what is not free on the map {config.map}")
         self._plant, self._space, sweep, solids = make_engine(config, self._footprint, start, noise_seed, lidar=lidar)
         self._plant.together = self.scene.advance
+        self._plant.chargers = config.chargers
         self._plant.on_blocked = self._footprint.blocked
         self.scene.add_body(self)
         cast = self._space.cast

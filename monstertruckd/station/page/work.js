@@ -99,6 +99,7 @@ export class Work {
     byId("mission-moved").hidden = !this.elsewhere || !mission?.resumable || observer;
     text("mission-state", mission?.running ? words("task.mission.state", { name: mission.name, step: mission.node || mission.step, steps: mission.steps, doing: mission.doing })
       : mission?.number || mission?.resumable ? mission.text || reason(mission.outcome) : words("task.none"));
+    this.showDocks(facts?.docks ?? [], mission?.running || observer);
     this.showLines(mission?.running || mission?.resumable ? mission.lines ?? [] : []);
     const names = facts?.behaviours ?? [];
     byId("task-behaviours").hidden = !names.length;
@@ -115,6 +116,16 @@ export class Work {
     text("behaviour-state", behaviour?.running ? words("task.behaviour.state", { name: title(behaviour.behaviour), phase: behaviour.phase, seconds: number(behaviour.elapsed, 0) })
       : behaviour?.number ? behaviour.text || reason(behaviour.outcome) : words("task.none"));
     byId("tasks-none").hidden = Boolean(facts?.explores || facts?.tracks || facts?.goals || names.length);
+  }
+
+  // Each dock is a mission of one step, and so is leaving it.
+  showDocks(names, hidden) {
+    const key = `${names.join()}|${hidden}`;
+    if (byId("docks").dataset.shown === key) return;
+    byId("docks").dataset.shown = key;
+    byId("docks").replaceChildren(...(hidden ? [] : names.flatMap((name) => ["dock", "undock"].map((step) =>
+      button(words(`task.${step}`, { name: title(name) }),
+        () => this.begin("task.mission", { do: "mission", order: "start", text: JSON.stringify({ version: 2, name: step, steps: [{ do: step, dock: name }] }) }))))));
   }
 
   // The steps of the mission around the present one, which is marked, as are the steps that contain it.

@@ -10,6 +10,7 @@ from monstertruckd.tools.cli import (
     demo,
     description,
     devices,
+    dock,
     doctor,
     drill,
     explore,
@@ -105,6 +106,8 @@ app.command("ros2")(ros2.ros2)
 app.command("doctor")(doctor.doctor)
 app.command("install-service")(service.install_service)
 app.command("uninstall-service")(service.uninstall_service)
+app.command("dock")(dock.dock)
+app.command("undock")(dock.undock)
 app.add_typer(behave.app, name="behave")
 app.add_typer(mission.app, name="mission")
 app.add_typer(config.app, name="config")

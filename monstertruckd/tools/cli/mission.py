@@ -195,7 +195,7 @@ def abilities(config: Path | None, map_folder: Path | None) -> "Abilities":
         from monstertruckd.config.load import load_truck
 
         robot, _ = load_truck(config)
-        names = robot.behaviours.keys()
+        names = robot.all_behaviours.keys()
 
         def behaviour(name: str, _: object) -> None:
             if name not in names:
@@ -207,6 +207,7 @@ def abilities(config: Path | None, map_folder: Path | None) -> "Abilities":
             charge=bool(list(packs(robot.devices, robot.monitors))),
             lidar=robot.devices.lidar is not None,
             zones=robot.zones is not None,
+            docks=robot.docks,
             behaviour=behaviour if names else None,
         )
     if map_folder is not None:

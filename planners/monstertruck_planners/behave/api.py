@@ -8,6 +8,7 @@ from pydantic import Field
 
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_schemas.base import Message, Schema
+from monstertruck_schemas.plan import DockTarget
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
 
@@ -44,6 +45,7 @@ class BehaviourStep:
         outcome: DRIVING, or the reason why the behaviour ended; an ended behaviour is not stepped again.
         text: message for the outcome; empty for the default message of the reason.
         values: values for ``plan/behaviour``.
+        dock: dock near which the gate is to let the robot drive.
     """
 
     motion: RequestedMotion | None
@@ -52,6 +54,7 @@ class BehaviourStep:
     outcome: Reason = Reason.DRIVING
     text: str = ""
     values: Mapping[str, float] = field(default_factory=dict)
+    dock: DockTarget | None = None
 
 
 class BehaviourBody(NamedTuple):
@@ -63,7 +66,7 @@ class BehaviourBody(NamedTuple):
 
 
 class Inputs:
-    """Latest message of every topic that a behaviour reads; all are fresh.
+    """Latest fresh messages of the topics that a behaviour reads and may read.
 
     Args:
         messages: messages by topic name.
@@ -73,14 +76,22 @@ class Inputs:
         self._messages = messages
 
     def of(self, topic: Topic[M]) -> M:
-        """Return the latest message of a topic."""
-        message = self._messages[topic.name]
-        assert isinstance(message, topic.model)
+        """Return the latest message of a topic that the behaviour requires."""
+        message = self.if_fresh(topic)
+        assert message is not None
+        return message
+
+    def if_fresh(self, topic: Topic[M]) -> M | None:
+        """Return the latest message of a topic; None if it is not fresh."""
+        message = self._messages.get(topic.name)
+        assert message is None or isinstance(message, topic.model)
         return message
 
 
 class Behaviour(Protocol):
     """Behaviour constructed from its settings; the state returned by a step is all it keeps between steps.
+
+    A class with an attribute ``may_read``, more topics, gets their fresh messages, too.
 
     A class with a class method ``fit(settings, body)`` is constructed by it instead at every start, with a
     ``BehaviourBody`` too; it raises a ``ValueError`` if the body cannot do that or the settings are wrong.

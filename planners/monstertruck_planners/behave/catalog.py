@@ -38,6 +38,18 @@ BEHAVIOURS: Final = Catalog(
         implementation="monstertruck_planners.behave.follow:LeaderFollower",
         doc="Follows the path of another robot at a distance",
     ),
+    Plugin(
+        name="dock",
+        settings="monstertruck_planners.behave.dock.config:DockingConfig",
+        implementation="monstertruck_planners.behave.dock.docking:Dock",
+        doc="Drives to a dock by its tag, and confirms that it charges",
+    ),
+    Plugin(
+        name="undock",
+        settings="monstertruck_planners.behave.dock.config:UndockConfig",
+        implementation="monstertruck_planners.behave.dock.docking:Undock",
+        doc="Drives from a dock back to its staging pose",
+    ),
     base=BehaviourConfig,
 )
 """A behaviour is a ``Behaviour`` made from its settings; it asks for motion through the gate."""

@@ -26,12 +26,12 @@ from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, Rpc
 from monstertruck_runtime.requests import does_not_drive, planner_request
 from monstertruck_schemas.base import Message, first_mistake
 from monstertruck_schemas.event import Severity
-from monstertruck_schemas.plan import BehaviourState, GoalState, TrackerState
+from monstertruck_schemas.plan import BehaviourState, DockTarget, GoalState, TrackerState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourRequest, DriveRequest, RequestedTwist
 from monstertruck_schemas.roles import AccessRole, ServiceName
 from monstertruck_schemas.state import GateMode, GateState, Odometry
-from monstertruck_schemas.topics import BEHAVIOUR, GATE, GOAL, ODOMETRY, TRACKER, Writer
+from monstertruck_schemas.topics import BEHAVIOUR, GATE, GOAL, ODOMETRY, TRACKER, Topic, Writer
 
 SOURCE: Final = ServiceName.BEHAVIOURS.value
 """Source of the drive requests."""
@@ -55,6 +55,7 @@ class BehaviourRun:
     text: str = ""
     ended: int | None = None
     values: Mapping[str, float] | None = None
+    dock: DockTarget | None = None
     travelled: float = 0.0
     disobeyed: int | None = None
     """Since when the gate does not carry out the requested motion, ns."""
@@ -91,7 +92,7 @@ class BehaviourService:
         body: BehaviourBody,
     ) -> None:
         self.configs, self._clock, self._drive, self._body = configs, clock, drive, body
-        reads = [BEHAVIOURS.implementation(config).reads for config in configs.values()]
+        reads = [_reads(BEHAVIOURS.implementation(config)) for config in configs.values()]
         topics = {topic.name: topic for some in reads for topic in some}
         self._read: dict[str, Subscription[Any]] = {
             name: bus.subscribe(topic, latest()) for name, topic in topics.items()
@@ -213,10 +214,13 @@ class BehaviourService:
         if (why := self._interrupted(run, now)) is not None:
             self._end(run, *why, now)
             return
-        newest = {topic.name: self._read[topic.name].latest for topic in run.behaviour.reads}
-        messages: dict[str, Message] = {name: message for name, message in newest.items() if message is not None}
+        messages: dict[str, Message] = {}
+        for topic in _reads(run.behaviour):
+            message = self._read[topic.name].latest
+            if message is not None and now - message.received <= topic.fresh_for() * SECOND:
+                messages[topic.name] = message
         step: BehaviourStep = run.behaviour.step(Inputs(messages), run.state, (now - run.begun) / SECOND)
-        run = replace(run, state=step.state, phase=step.phase, values=step.values)
+        run = replace(run, state=step.state, phase=step.phase, values=step.values, dock=step.dock)
         motion = step.motion or RequestedMotion()
         if not all(map(math.isfinite, motion)):
             self._end(run, Reason.NOT_FINITE, f"{run.name} asked for {motion}", now)
@@ -318,6 +322,7 @@ class BehaviourService:
             elapsed=((now if run.ended is None else run.ended) - run.begun) / SECOND,
             travelled=run.travelled,
             values=dict(run.values or {}),
+            dock=run.dock,
         )
 
     def register(self, rpc: RpcRegistry) -> None:
@@ -328,6 +333,11 @@ class BehaviourService:
 
         self.tasks.register(rpc, "behave", BehaviourRequest)
         rpc.register("behaviours", behaviours, AccessRole.OBSERVER, recorded=False)
+
+
+def _reads(behaviour: Any) -> tuple[Topic[Any], ...]:
+    """All topics that a behaviour, or its class, reads or may read."""
+    return (*behaviour.reads, *getattr(behaviour, "may_read", ()))
 
 
 def _with_settings(config: BehaviourConfig, settings: Mapping[str, Any]) -> BehaviourConfig:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from monstertruck_planners.behave.dock.config import Docks, chosen
 from monstertruck_planners.missions.outline import Container, prefix
 from monstertruck_runtime.errors import NotFoundError, TruckError
 from monstertruck_schemas.mission import (
@@ -12,6 +13,7 @@ from monstertruck_schemas.mission import (
     BranchStep,
     Condition,
     ConditionStep,
+    DockStep,
     ExploreStep,
     FallbackStep,
     FollowWallStep,
@@ -20,6 +22,7 @@ from monstertruck_schemas.mission import (
     PointStep,
     RecordStep,
     RepeatStep,
+    UndockStep,
     WaitStep,
     WaitUntilStep,
     blocks,
@@ -53,6 +56,8 @@ class Abilities:
     zones: bool = True
     behaviour: Callable[[str, Mapping[str, float | str | bool]], object] | None = lambda _name, _settings: None
     """Raises a ``TruckError`` if there is no such behaviour or it refuses the settings; None: no behaviours."""
+    docks: Docks | None = None
+    """Docks by name; None if they are not known"""
     known: frozenset[str] | None = None
     """Names of the points of interest, if all of them are known."""
 
@@ -220,6 +225,11 @@ def _require_parts(step: AnyStep, able: Abilities) -> None:
     looks = isinstance(step, PointStep) or (isinstance(step, ExploreStep) and step.find is not None)
     if looks and not able.points:
         raise NotFoundError(f"{step.do}: the robot's configuration has no section `points`")
+    if isinstance(step, DockStep | UndockStep) and able.docks is not None:
+        try:
+            chosen(able.docks, step.dock or "")
+        except ValueError as error:
+            raise NotFoundError(f"{step.do}: {error}") from None
     if isinstance(step, BehaviourStepOfMission | FollowWallStep):
         if able.behaviour is None:
             raise NotFoundError(f"{step.do}: the robot's configuration has no section `behaviours`")

@@ -8,6 +8,7 @@ from monstertruck_schemas.mission import (
     BehaviourStepOfMission,
     BranchStep,
     ConditionStep,
+    DockStep,
     ExploreStep,
     FallbackStep,
     FollowWallStep,
@@ -20,6 +21,7 @@ from monstertruck_schemas.mission import (
     RepeatStep,
     ReturnStep,
     SequenceOfSteps,
+    UndockStep,
     WaitStep,
     WaitUntilStep,
     blocks,
@@ -41,6 +43,8 @@ def in_words(step: AnyStep) -> str:
             return words if until is None else f"{words} until {condition_in_words(until)}"
         case SequenceOfSteps() | FallbackStep() | ParallelStep():
             return step.do
+        case DockStep(dock=dock) | UndockStep(dock=dock):
+            return step.do if dock is None else f"{step.do} {dock}"
         case _:
             return _leaf_in_words(step)
 

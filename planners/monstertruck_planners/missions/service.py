@@ -4,11 +4,13 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypeVar, assert_never
 
 from monstertruck_kinematics.se2 import Pose2
+from monstertruck_planners.behave.dock.config import Docks, chosen
+from monstertruck_planners.behave.dock.estimate import staging_pose
 from monstertruck_planners.behave.service import BehaviourService
 from monstertruck_planners.explore.service import ExplorerService
 from monstertruck_planners.goals.exchange import pose_of, require_place
@@ -45,6 +47,7 @@ from monstertruck_schemas.mission import (
     BehaviourStepOfMission,
     BranchStep,
     ConditionStep,
+    DockStep,
     ExploreStep,
     FallbackStep,
     FollowWallStep,
@@ -57,6 +60,7 @@ from monstertruck_schemas.mission import (
     RepeatStep,
     ReturnStep,
     SequenceOfSteps,
+    UndockStep,
     WaitStep,
     WaitUntilStep,
 )
@@ -91,7 +95,17 @@ from monstertruck_schemas.zones import Zones
 
 T = TypeVar("T", GoalState, ExplorationState, BehaviourState)
 
-DrivingStep = GoToStep | PointStep | LookStep | ExploreStep | BehaviourStepOfMission | FollowWallStep | ReturnStep
+DrivingStep = (
+    GoToStep
+    | PointStep
+    | LookStep
+    | ExploreStep
+    | BehaviourStepOfMission
+    | FollowWallStep
+    | DockStep
+    | UndockStep
+    | ReturnStep
+)
 """Steps that other services do."""
 
 SOURCE: Final = ServiceName.MISSIONS.value
@@ -138,6 +152,7 @@ class MissionParts:
     goals: GoalService
     behaviours: BehaviourService | None
     explorer: ExplorerService | None
+    docks: Docks = field(default_factory=dict)
 
 
 class MissionService:
@@ -340,6 +355,7 @@ class MissionService:
             charge=self._in.battery is not None,
             lidar=self._in.lidar,
             zones=self._in.zones is not None,
+            docks=self._parts.docks,
             behaviour=None if behaviours is None else behaviours.check,
         )
 
@@ -466,10 +482,20 @@ class MissionService:
                 return await self._behave(name, dict(settings), None)
             case FollowWallStep(name=name, distance=distance):
                 return await self._behave(name, {}, distance)
+            case DockStep(dock=name):
+                return await self._dock(name)
+            case UndockStep(dock=name):
+                return await self._behave("undock", {"dock": name or ""}, None)
             case ReturnStep():
                 return await self._go(lambda: progress.start)
             case _:
                 assert_never(step)
+
+    async def _dock(self, name: str | None) -> StepEnd:
+        """Drive to the staging pose of a dock, and dock; the mission's check has found the dock."""
+        known, dock = chosen(self._parts.docks, name or "")
+        end = await self._go(lambda: staging_pose(dock))
+        return await self._behave("dock", {"dock": known}, None) if end.good else end
 
     async def _wait(self, seconds: float) -> StepEnd:
         until = self._clock.now() + round(seconds * SECOND)

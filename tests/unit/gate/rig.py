@@ -70,6 +70,7 @@ def make_gate(
     rear_sonars=None,
     peers=None,
     zones=None,
+    docks=None,
     own=None,
     **config,
 ):
@@ -85,6 +86,7 @@ def make_gate(
         rear_sonars=rear_sonars,
         peers=peers,
         zones=zones,
+        docks=docks or {},
         own=own or {},
     )
 

@@ -1,0 +1,96 @@
+"""Dock check: lets the robot come near a dock, slowly, while a behaviour docks or undocks.
+
+The gate knows the docks of the configuration: their housings and staging distances. Where a dock is, the behaviour says
+in ``plan/behaviour``; the gate believes it only within these bounds:
+
+- the behaviour runs, holds the drive, and its report is fresh;
+- the robot stands on the axis of the dock: at most ``docking.across`` beside it, ``docking.turn`` off it, no farther
+  than the staging pose, and no more than ``docking.beyond`` past the docked pose. A robot that docks in reverse also
+  looks at the dock, and backs off to turn about: either end may face the dock, as far as ``turning`` beyond staging.
+
+Within them the pace is at most ``docking.speed``, lidar returns inside the housing do not count as obstacles, and
+ground on the axis counts as seen. All other rules stay in force, and contact is detected as for an operator on unseen
+ground.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from monstertruck_kinematics.se2 import between, compose
+from monstertruck_planners.behave.dock.config import DockConfig
+from monstertruck_planners.behave.dock.estimate import facing
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.base import Message
+from monstertruck_schemas.plan import BehaviourState
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import ServiceName
+from monstertruck_schemas.state import Odometry
+from monstertruck_schemas.topics import BEHAVIOUR, ODOMETRY, Topic
+from monstertruckd.gate.checks import Check, DockArea, GateView, PaceLimit, Tick
+from monstertruckd.gate.motion import Course
+
+FRESH: Final = SECOND
+"""Maximum age of a behaviour's report (ns); a running one reports at 5 Hz."""
+
+
+class DockCheck(Check):
+    """Finds the area of the dock that the robot is near, and limits the speed there.
+
+    Args:
+        view: read access to the gate's state.
+        docks: docks of the configuration, by name.
+    """
+
+    reasons = (Reason.DOCKING,)
+    reads = (ODOMETRY, BEHAVIOUR)
+
+    def __init__(self, view: GateView, docks: Mapping[str, DockConfig]) -> None:
+        super().__init__(view)
+        self._docks = docks
+        self._behaviour: BehaviourState | None = None
+        self._odometry: Odometry | None = None
+
+    def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
+        """Take reports of behaviours and odometry; at a tick, find the area."""
+        if isinstance(seen, Tick):
+            self.view.dock = self._area(seen.now)
+        elif isinstance(seen, BehaviourState):
+            self._behaviour = seen
+        elif isinstance(seen, Odometry) and topic is ODOMETRY:
+            self._odometry = seen
+
+    def _area(self, now: int) -> DockArea | None:
+        behaviour, odometry = self._behaviour, self._odometry
+        if behaviour is None or odometry is None or not behaviour.running or behaviour.dock is None:
+            return None
+        dock = self._docks.get(behaviour.dock.name)
+        late = now - behaviour.received > FRESH or now - odometry.received > ODOMETRY.fresh_for() * SECOND
+        if dock is None or late or self.view.planner != ServiceName.BEHAVIOURS.value:
+            return None
+        limits, base, pose = self.view.config.docking, odometry.pose, behaviour.dock.pose
+        at_dock = np.array((pose.x, pose.y, pose.yaw))
+        here = np.array((base.x, base.y, base.yaw))
+        x, y, turn = between(at_dock, facing(here, dock)).tolist()
+        far = dock.staging
+        if dock.direction == "reverse":
+            turn, far = math.remainder(turn, math.pi), far + dock.turning
+        # The staging pose is reached within the tolerance of a goal.
+        inside = -far - limits.across <= x <= limits.beyond
+        if not inside or abs(y) > limits.across or abs(turn) > limits.turn:
+            return None
+        if dock.housing is None:
+            return DockArea(None)
+        # 0.03: noise of lidar returns before the housing, m
+        face = compose(at_dock, np.array((self.view.footprint.length / 2 - 0.03, 0.0, 0.0)))
+        at_x, at_y, yaw = between(here, face).tolist()
+        return DockArea(((at_x, at_y, yaw), dock.housing.depth + 0.03, dock.housing.width))
+
+    def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
+        """Limit of the pace near the dock."""
+        if courses and self.view.dock is not None:
+            speed = self.view.config.docking.speed
+            if speed < max(pace for _, pace in courses):
+                yield PaceLimit(Reason.DOCKING, speed)

@@ -1,0 +1,1 @@
+"""Docking by the tag of a dock: perceive, approach, charge, and retry."""

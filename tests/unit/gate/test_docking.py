@@ -1,0 +1,103 @@
+"""The dock check: it lets the robot come near a dock that a behaviour approaches, slowly, and nothing else."""
+
+import math
+
+import pytest
+
+from monstertruck_planners.behave.dock.config import DockConfig, HousingConfig
+from monstertruck_schemas import topics
+from monstertruck_schemas.base import Pose2D, Twist2D
+from monstertruck_schemas.plan import BehaviourState, DockTarget
+from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.req import Role
+from monstertruck_schemas.state import Odometry
+from tests.unit.gate.rig import ANY_GROUND, Rig, header, make_gate
+
+HOUSING = HousingConfig(width=0.3, depth=0.2)
+FACE = 1.0 + 0.47 / 2
+"""x of the housing, which the docked robot touches (m)."""
+PLANNER = {"role": Role.TRACKER, "source": "behaviours", "inside": True}
+
+
+class Docking(Rig):
+    """A truck that drives along x to a dock whose docked pose is x = 1."""
+
+    def __init__(self, way=1, obstacle=ANY_GROUND, **dock):
+        super().__init__(obstacle=obstacle)
+        yaw = 0.0 if way > 0 else math.pi
+        dock = {"x": 1.0, "y": 0.0, "yaw": yaw, "tag": 1, "housing": HOUSING, "staging": 0.6} | dock
+        if way < 0:
+            dock["direction"] = "reverse"
+        self.gate = make_gate(docks={"charger": DockConfig(**dock)}, obstacle=obstacle)
+        self.place, self.yaw, self.way = [0.5, 0.0], yaw, way
+        self.dock, self.things = "charger", ()
+
+    def sense(self):
+        self.place[0] += self.speed * 0.02 * self.way
+        c = self.way
+        self.obstacles = [(c * (x - self.place[0]), c * (y - self.place[1])) for x, y in self.things]
+        super().sense()
+        odometry = Odometry(
+            **header(self.now), frame="odom", pose=Pose2D(x=self.place[0], y=self.place[1], yaw=self.yaw),
+            twist=Twist2D(vx=self.speed, vy=0.0, wz=0.0), pose_covariance=(0.0,) * 9, twist_covariance=(0.0,) * 9,
+            age=0.0,
+        )  # fmt: skip
+        self.gate.observe(odometry, topics.ODOMETRY)
+        target = None if self.dock is None else DockTarget(name=self.dock, pose=Pose2D(x=1.0, y=0.0, yaw=0.0))
+        state = BehaviourState(**header(self.now), frame="odom", running=True, kind="dock", dock=target)
+        self.gate.observe(state, topics.BEHAVIOUR)
+
+
+HOUSE = tuple((FACE, y / 100) for y in range(-14, 15))
+
+
+def end(rig) -> float:
+    return rig.place[0] + 0.47 / 2
+
+
+def test_a_docking_truck_touches_the_housing_slowly_and_goes_no_farther():
+    rig = Docking()
+    rig.things = HOUSE
+    rig.driving(speed=0.2, **PLANNER)
+    assert rig.speed == pytest.approx(0.05)
+    assert Reason.DOCKING in rig.out.reasons
+    rig.tick(600)
+    assert FACE - 0.005 < end(rig) < FACE + 0.03
+    assert rig.speed == 0.0
+    assert Reason.OBSTACLE_STOP in rig.out.reasons
+
+
+@pytest.mark.parametrize(
+    ("change", "driver"),
+    [
+        ({"dock": None}, PLANNER),
+        ({"dock": "other"}, PLANNER),
+        ({"place": [0.5, 0.2]}, PLANNER),
+        ({"yaw": 0.4}, PLANNER),
+        ({"things": ((FACE, 0.0), (FACE - 0.1, 0.05))}, PLANNER),
+        ({}, {"source": "ann"}),
+    ],
+)
+def test_without_docking_off_the_axis_or_for_a_person_it_is_an_obstacle(change, driver):
+    rig = Docking()
+    rig.things = HOUSE
+    for name, value in change.items():
+        setattr(rig, name, value)
+    rig.driving(speed=0.2, **driver)
+    rig.tick(600)
+    assert rig.speed == 0.0
+    assert end(rig) < FACE - 0.04
+
+
+def test_a_truck_reverses_into_a_dock_over_ground_that_no_sensor_has_seen():
+    usual = Docking(way=-1, obstacle={"unseen_speed": 1.0})
+    usual.dock = None
+    usual.armed()
+    usual.driver = {"speed": -0.1, **PLANNER}
+    usual.tick(100)
+    assert Reason.UNSEEN_STOP in usual.out.reasons
+    rig = Docking(way=-1, obstacle={"unseen_speed": 1.0})
+    rig.armed()
+    rig.driver = {"speed": -0.1, **PLANNER}
+    rig.tick(100)
+    assert rig.speed == pytest.approx(-0.05)
