@@ -108,6 +108,15 @@ SYMPTOMS: Final = (
         },
     ),
     Symptom(
+        "It does not dock",
+        "`monstertruckd dock` names the attempt that failed; `plan/behaviour` has the distances.",
+        {
+            "dock_not_seen": "Light and clean the tag; check its number and size, and the camera's mount.",
+            "dock_missed": "Measure the dock's pose and `tag_distance` again; check the floor for slip.",
+            "not_charging": "Switch the charger on and clean the contacts; check `docks.NAME.charging`.",
+        },
+    ),
+    Symptom(
         "It drives crookedly, or the pose is wrong",
         "`monstertruckd calibrate show` lists the measurements, their quality and expiry.",
         {
