@@ -19,7 +19,7 @@ from monstertruckd.gate.checks import Check, GateView, PaceLimit
 from monstertruckd.gate.motion import Course
 from monstertruckd.gate.obstacles import ObstacleGuard
 
-CHOICES: Final = 12
+CHOICES: Final = 8
 """Number of turns to each side that are compared."""
 
 
@@ -66,8 +66,10 @@ def free_distances(twists: Array, footprint: Footprint, margin: float, points: A
         arm = np.array((disc, 0.0)) - centre
         size, begin = np.hypot(*arm.T)[:, None], np.arctan2(arm[:, 1], arm[:, 0])[:, None]
         cosine = (reach**2 + size**2 - radius**2) / np.maximum(2.0 * reach * size, 1e-12)
-        ahead = np.mod(side * (bearing - begin), math.tau) - np.arccos(np.clip(cosine, -1.0, 1.0))
-        distance = np.where(cosine <= 1.0, np.maximum(ahead, 0.0) / np.abs(turn)[:, None], math.inf)
+        distance = np.full(reach.shape, math.inf)
+        met = cosine <= 1.0
+        ahead = np.mod((side * (bearing - begin))[met], math.tau) - np.arccos(np.maximum(cosine[met], -1.0))
+        distance[met] = np.maximum(ahead, 0.0) / np.broadcast_to(np.abs(turn)[:, None], reach.shape)[met]
         dx, dy = points[:, 0] - disc, points[:, 1]
         towards = vx[:, None] * dx + (vy + turn * disc)[:, None] * dy > 0.0
         inside = np.hypot(dx, dy) <= radius
@@ -118,13 +120,16 @@ class Assist(Check):
         """Return by how much each axle turns further than asked (rad)."""
         config, bicycle = self.view.config, self.view.chassis.bicycle
         # Both ends turn the axles to their limit, whatever the request.
-        turns = 2.0 * config.angle * np.arange(-CHOICES, CHOICES + 1) / CHOICES
+        most = config.angle + max(abs(request.front), abs(request.rear))
+        turns = most * np.arange(-CHOICES, CHOICES + 1) / CHOICES
         ahead = math.copysign(1.0, request.speed)
         twists = [bicycle.body_twist(ahead, *self._axles(request, turn)) for turn in turns.tolist()]
         slowing = stopping(abs(request.speed), self._guard.delay(now), config.obstacle.deceleration)
         needed = slowing + config.obstacle.ahead + config.assist.horizon
         footprint, margin = self.view.footprint, config.obstacle.side_clearance
         points = self._guard.points(needed + footprint.circumscribed_radius + margin, reverse=ahead < 0)
+        if free_distances(np.array(twists[CHOICES : CHOICES + 1]), footprint, margin, points)[0] >= needed:
+            return 0.0
         return nearest_free(turns, free_distances(np.array(twists), footprint, margin, points), needed)
 
     def _axles(self, request: DriveRequest, turn: float) -> tuple[float, float]:
