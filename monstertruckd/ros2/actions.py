@@ -1,4 +1,4 @@
-"""Action servers of ROS 2 for what the robot can do, whichever action it is.
+"""Action servers of ROS 2 for the robot's tasks, for any action type.
 
 An action has one edition for each set of fields that the distributions know. All editions of the node's distributions
 are served at once: where their hashes differ, they are different services and topics on the wire. A goal that the robot

@@ -39,7 +39,7 @@ class Condition(Schema):
     point: PointName | None = None
     """A point of interest of this name is known"""
     tags: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    """At least this many tags are known"""
+    """Minimum number of known tags"""
     obstacle: Seconds | None = None
     """An obstacle has stopped the robot for this time, s"""
     zone: Name | None = None
@@ -65,7 +65,7 @@ class MissionStep(Schema):
     retries: Annotated[int, Field(ge=0, le=20)] = 0
     """How often it is tried again before it has failed"""
     on_failure: Policy | None = None
-    """Reaction to the failure; null: that of the mission, or abort within another step"""
+    """Reaction to the failure; null: the reaction of the mission, or abort within another step"""
     limit: Seconds | None = None
     """Timeout of an attempt, s; null: only the step's own"""
 
@@ -75,7 +75,7 @@ class GoToStep(MissionStep):
 
     do: Literal["goto"]
     x: Coordinate
-    """In map, m"""
+    """Place in map, m"""
     y: Coordinate
     """In m"""
     yaw: Coordinate
@@ -99,7 +99,7 @@ class LookStep(MissionStep):
 
     do: Literal["look"]
     x: Coordinate
-    """In map, m"""
+    """Place in map, m"""
     y: Coordinate
     """In m"""
 

@@ -172,7 +172,7 @@ class ControlRequest(Request):
     """With an order to arm: sensors are calibrated on ground that an operator keeps clear. Until the robot is disarmed,
     measures of motion that disagree, and ground that no sensor has seen, slow it instead of stopping it."""
     to: Annotated[str, Field(max_length=64)] | None = None
-    """With a hand-over: source that may drive afterwards."""
+    """Source that may drive after a hand-over."""
 
 
 class Verb(StrEnum):
@@ -256,7 +256,7 @@ class BehaviourRequest(Request):
     settings: Annotated[dict[str, float | str | bool | None], Field(max_length=32)] = Field(default_factory=dict)
     """For a start: settings that replace the configured ones for this run."""
     own: bool = False
-    """With a stop: only a behaviour that the same program started."""
+    """Whether a stop applies only to a behaviour that the same program started."""
 
     @property
     def verb(self) -> Verb:
@@ -282,7 +282,7 @@ class ExploreRequest(Request):
     find: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """Look for tags on walls, and end when the map has so many of them; None = explore only."""
     own: bool = False
-    """With a stop: only an exploration that the same program started."""
+    """Whether a stop applies only to an exploration that the same program started."""
 
     @property
     def verb(self) -> Verb:
@@ -307,7 +307,7 @@ class MissionRequest(Request):
     moved: bool = False
     """For a resume: the robot is not where the mission was interrupted, and its pose is right."""
     own: bool = False
-    """With a stop: only a running mission that the same program started."""
+    """Whether a stop applies only to a running mission that the same program started."""
 
     @property
     def verb(self) -> Verb:

@@ -30,7 +30,7 @@ class ZoneArea(Schema):
     limit: Positive | None = None
     """Maximum speed on a speed zone (m/s)."""
     inside: Literal["stop", "leave"] = "stop"
-    """What a robot does that finds itself inside a keepout zone: stand and report, or leave slowly by the shortest way.
+    """Reaction of a robot inside a keepout zone: stand and report, or leave slowly by the shortest way.
     A stop is right if the zone stands for stairs that no sensor sees."""
 
     @model_validator(mode="after")

@@ -18,7 +18,7 @@ from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback
 MEDIAN_WINDOW: Final = 5
 """Window of the median filter (samples): rejects shorter spikes and connector bounces."""
 GAP: Final = SECOND
-"""Time without a sample after which all durations restart (ns)."""
+"""Maximum time without a sample (ns); then all durations restart."""
 
 CELL_VOLTS: Final = (
     3.27, 3.61, 3.69, 3.71, 3.73, 3.75, 3.77, 3.79, 3.80, 3.82, 3.84,
@@ -122,7 +122,7 @@ class BatteryJudge:
 
 
 CURRENT_VALID: Final = SECOND // 2
-"""Time for which a motor current explains the sag (ns)."""
+"""Maximum age of a motor current that explains the sag (ns)."""
 
 LEVEL_EVENTS: Final = {
     BatteryLevel.NORMAL: (Reason.OK, Severity.INFO),

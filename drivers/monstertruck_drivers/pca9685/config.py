@@ -41,15 +41,15 @@ class Pca9685Config(Schema):
     """Frequency of this chip's oscillator, Hz: measure the frequency of a pulse and set oscillator = 4096 times that
     times (prescaler + 1), which ``probe`` prints. An error of 4 % moves a neutral pulse by 60 us"""
     dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Dead time from a steering command to the first movement of the wheels (s); null = not measured"""
+    """Dead time from a steering command to the first movement of the wheels (s); null if it was not measured"""
     lag: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Time constant of the wheels' movement after the dead time (s); null = not measured"""
+    """Time constant of the wheels' movement after the dead time (s); null if it was not measured"""
     poll_rate: Annotated[float, Field(gt=0, le=50)] = 20.0
     """Times a second the registers are read back"""
     answer_timeout: Annotated[float, Field(gt=0, le=1)] = 0.1
     """Timeout of one transfer on the bus (s)"""
     command_timeout: Annotated[float, Field(gt=0, le=2)] = 0.25
-    """Age at which a command is stale (s): the servos hold, the motor gets its neutral pulse"""
+    """Maximum age of a command (s); then the servos hold and the motor gets its neutral pulse"""
 
     @cached_property
     def prescale(self) -> int:
@@ -113,7 +113,7 @@ class Pca9685EscConfig(Schema):
 
     @property
     def command_timeout(self) -> float:
-        """Age of the latest command at which the pulse becomes neutral (s)."""
+        """Maximum age of the latest command (s); then the pulse becomes neutral."""
         return self.unit.command_timeout
 
     @property

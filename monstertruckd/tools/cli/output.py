@@ -244,7 +244,7 @@ def print_end(reason: Reason, text: str, values: Mapping[str, Any], *, json_outp
     Args:
         reason: of the end.
         text: the end in words.
-        values: what is printed as JSON.
+        values: data of the JSON output.
         json_output: whether it is.
 
     Raises:
@@ -349,7 +349,7 @@ class CommandGroup(TyperGroup):
 
 @contextmanager
 def _usage_in_one_line() -> Iterator[None]:
-    """Say what is wrong with a command line in one line, and which help explains it."""
+    """Print the mistake of a command line in one line, and which help explains it."""
     from typer._click.exceptions import MissingParameter, NoArgsIsHelpError, UsageError
 
     try:

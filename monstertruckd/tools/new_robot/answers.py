@@ -68,7 +68,7 @@ class Answers(Schema):
     attitude: Literal["none", "os4000", "bno085", "wt61"] = "none"
     """Compass or inertial measurement unit"""
     battery: Literal["none", "drive", "steering", "iio"] = "none"
-    """What measures the battery"""
+    """Device that measures the battery"""
     cells: Annotated[int, Field(ge=1, le=14)] = 3
     """Cells of the pack in series"""
     camera: Literal["none", "webcam", "mjpeg"] = "none"

@@ -114,7 +114,7 @@ class GlobalLocaliser:
             found = None
         if found is None:
             found = self._searched(stamp)
-        outside_after = 10 * SECOND  # time without a place found after which the robot is outside the map, ns
+        outside_after = 10 * SECOND  # maximum search time without a place, ns; then the robot is outside the map
         self.outside = self._fruitless and stamp - self._seen_on_map >= outside_after
         if found is None or step is None:
             return None
@@ -195,7 +195,7 @@ class GlobalLocaliser:
         grid, window = self._submap.grid(LEVELS), (self._half, math.pi)
         unique_ratio = 0.85  # a place is unique if the next best scores less than this share of its score
         ambiguous_ratio = 0.97  # a place is ambiguous if another scores more than this share of its score
-        rivals = RivalSearch(1.0, unique_ratio, ambiguous_ratio)  # distance at which places differ, m
+        rivals = RivalSearch(1.0, unique_ratio, ambiguous_ratio)  # minimum distance between different places, m
         min_score = 0.6
         work = 3e6  # maximum number of blocks evaluated, each for the search and its rival, before it ends early
         peak = yield from correlation(grid, points, self._middle, window, anywhere, min_score, rivals, work)

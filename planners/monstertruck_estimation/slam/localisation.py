@@ -135,7 +135,7 @@ class LocalisationEstimator:
                 self._scan_odometry.forget()
         else:
             match, status = self._track(scan, delta, (guess, covariance, published), mount)
-            # Without odometry, the first match after a corridor corrects the error made there: that is no velocity.
+            # Without odometry, the first match after a corridor corrects the error made there: not a velocity.
             blind, self._blind = self._blind, match.degenerate
             if not blind or match.degenerate or self.odometry is OdometryUse.USED:
                 self._motion.learn(dt, delta, noise, between(self._pose, match.pose), match)
@@ -248,7 +248,7 @@ class LocalisationEstimator:
         return _without_weak_direction(match, guess, published), True
 
     def _with_scale_error(self, covariance: Array) -> Array:
-        """Return ``covariance``, shape (3, 3), with that of the scale of a displacement that no match measured.
+        """Return ``covariance``, shape (3, 3), plus the covariance of the scale of an unmatched displacement.
 
         Its errors do not average out: wheels that slip do so all along a corridor.
         """

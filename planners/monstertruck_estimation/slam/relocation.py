@@ -29,8 +29,8 @@ from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 
 LOST_PATH: Final = 7.0
-"""Distance after which the robot is lost, by wheels that agree with sparse scans, as a multiple of the distance between
-keyframes. Three scans so far apart, or a turn among people, may show the same crowd. By default it is 2.1 m, less than
+"""Distance travelled until the robot is lost, by wheels that agree with sparse scans, as a multiple of the distance
+between keyframes. Three scans so far apart, or a turn among people, may show the same crowd. By default it is 2.1 m, less than
 ``VIEW``: a submap that begins there still shares surroundings with the last keyframe."""
 PERIOD_GAIN: Final = 0.1
 """Weight of one period in the usual period."""
@@ -83,8 +83,8 @@ class LossDetector:
         """Whether scans have not fitted for 1.5 s."""
         since = (self._stamp or 0) - self.fitted
         far = not self.sparse or self.after_gap or self._path >= LOST_PATH
-        lost_after = 1.5  # seconds of misfits after which the robot is lost
-        lost_scans = 3  # number of misfits after which the robot is lost
+        lost_after = 1.5  # maximum duration of misfits (s); then the robot is lost
+        lost_scans = 3  # maximum number of misfits; then the robot is lost
         return self._misfits >= lost_scans and since >= lost_after * SECOND and far
 
     def arrive(self, stamp: int) -> None:
@@ -288,7 +288,7 @@ class Relocation:
                 if found:
                     return JoinChange.JOINED
                 failed += found is None
-                if failed > 3:  # failed verifications after which a place is rejected
+                if failed > 3:  # maximum number of failed verifications; then the place is rejected
                     break
         return None
 

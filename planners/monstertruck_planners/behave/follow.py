@@ -40,9 +40,9 @@ class FollowConfig(BehaviourConfig):
     ahead: Metres = 0.4
     """Look-ahead distance to the target point on the trail, m"""
     silence: Annotated[float, Field(gt=0, le=5)] = 0.5
-    """Time without a pose from the leader after which the follower stops, s"""
+    """Maximum time without a pose from the leader, s; the follower then stops"""
     lost: Metres = 5.0
-    """Distance from the leader at which the follower gives up, m"""
+    """Maximum distance from the leader, m; the follower then gives up"""
 
 
 class Point(NamedTuple):
