@@ -30,8 +30,8 @@ from monstertruck_runtime.clock import SECOND
 
 LOST_PATH: Final = 7.0
 """Distance travelled until the robot is lost, by wheels that agree with sparse scans, as a multiple of the distance
-between keyframes. Three scans so far apart, or a turn among people, may show the same crowd. By default it is 2.1 m, less than
-``VIEW``: a submap that begins there still shares surroundings with the last keyframe."""
+between keyframes. Three scans so far apart, or a turn among people, may show the same crowd. By default it is 2.1 m,
+less than ``VIEW``: a submap that begins there still shares surroundings with the last keyframe."""
 PERIOD_GAIN: Final = 0.1
 """Weight of one period in the usual period."""
 
