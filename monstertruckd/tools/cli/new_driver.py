@@ -22,4 +22,8 @@ def new_driver(
     """
     made = write_driver(kind, name, folder)
     remark(f"written: {made}; next:")
-    print(f"cd {made}\npython -m pytest\npython -m pip install -e .\nmonstertruckd plugins")
+    print(
+        f"cd {made}\npython -m pytest\npython -m hatchling build -t wheel -d dist\n"
+        f"python -m zipfile -e dist/{name}_driver-0.1-py3-none-any.whl plugins\n"
+        "PYTHONPATH=plugins monstertruckd plugins"
+    )
