@@ -212,9 +212,9 @@ class Reason(StrEnum):
     BEHAVIOUR_DONE = "behaviour_done", 0, "a behaviour is complete"
 
     # Docking
-    DOCK_NOT_SEEN = "dock_not_seen", 98, "the camera does not see the tag of the dock"
-    DOCK_MISSED = "dock_missed", 126, "the robot stands beside the dock"
-    NOT_CHARGING = "not_charging", 128, "the robot stands at the dock, but its battery is not charged"
+    DOCK_NOT_SEEN = "dock_not_seen", 120, "the camera does not see the tag of the dock"
+    DOCK_MISSED = "dock_missed", 36, "the robot stands beside the dock"
+    NOT_CHARGING = "not_charging", 98, "the robot stands at the dock, but its battery is not charged"
     DOCKING = "docking", 0, "the robot drives slowly near a dock"
 
     # Exploration

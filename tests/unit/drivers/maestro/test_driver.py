@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from monstertruck_drivers.maestro.config import MaestroConfig, ServoConfig
+from monstertruck_drivers.maestro.config import BatteryInputConfig, MaestroConfig, ServoConfig
 from monstertruck_drivers.maestro.driver import BatteryInput, MaestroDriver
 from monstertruck_drivers.maestro.protocol import Code, Decoder, Encoder, ServoCommand
 from monstertruck_drivers.maestro.session import MaestroSession
@@ -515,11 +515,22 @@ def test_a_battery_that_is_measured_elsewhere_is_not_read():
 @pytest.mark.parametrize(("raw", "at_limit"), [(0, True), (1, False), (1022, False), (1023, True)])
 def test_a_reading_at_either_end_of_the_scale_is_no_measurement(raw: int, at_limit: bool):
     taken = []
-    monitor = SimpleNamespace(take=lambda *given, at_limit: taken.append((*given, at_limit)))
+    monitor = SimpleNamespace(take=lambda *given, at_limit, current: taken.append((*given, at_limit, current)))
     config = MaestroConfig().battery
     assert config is not None
     BatteryInput(config, monitor).take(3, 5, raw)  # type: ignore[arg-type]
-    assert taken == [(3, 5, config.volts(raw), at_limit)]
+    assert taken == [(3, 5, config.volts(raw), at_limit, None)]
+
+
+@pytest.mark.parametrize(("reverse", "amps"), [(False, 2.0), (True, -2.0)])
+def test_a_hall_sensor_measures_the_current_into_the_pack(reverse: bool, amps: float):
+    taken = []
+    monitor = SimpleNamespace(take=lambda *_, current, **__: taken.append(current))
+    config = BatteryInputConfig.model_validate({"current": {"channel": 4, "reverse": reverse}})
+    battery = BatteryInput(config, monitor)  # type: ignore[arg-type]
+    assert battery.channels == [5, 4]
+    battery.take(3, 5, 500, round(2.7 / 5.0 * 1023))
+    assert taken == [pytest.approx(amps, abs=0.05)]
 
 
 # Samples
