@@ -1,5 +1,6 @@
 """Pictures over a link, with or without HTTP."""
 
+from abc import ABC, abstractmethod
 from typing import Final, Self
 
 from monstertruck_drivers.link import Link, Port
@@ -135,7 +136,7 @@ class _Connection:
             raise ProtocolError(f"{self._name}: {error}") from None
 
 
-class _Pictures:
+class _Pictures(ABC):
     """Base of both streams; the first picture is taken at the start and given by the first ``next``."""
 
     def __init__(self, source: LinkSource, mode: Mode) -> None:
@@ -156,8 +157,9 @@ class _Pictures:
         frame, self._first = self._first, None
         return frame or await self._take()
 
+    @abstractmethod
     async def _take(self) -> CameraFrame:
-        raise NotImplementedError
+        """Wait for the next picture."""
 
     def close(self) -> None:
         """Hang up."""

@@ -61,7 +61,8 @@ def test_state_is_kept_where_it_may_be_written_and_numba_works():
 def test_only_the_trucks_kinds_of_devices_may_be_opened():
     unit = settings(unit_of())
     assert unit["DevicePolicy"] == ["closed"]
-    assert unit["DeviceAllow"] == ["char-ttyACM rw", "char-ttyUSB rw", "char-i2c rw", "char-video4linux rw"]
+    kinds = ("ttyACM", "ttyUSB", "i2c", "video4linux", "media", "dma_heap")  # the last two are for rpicam-vid
+    assert unit["DeviceAllow"] == [f"char-{kind} rw" for kind in kinds]
     assert unit["SupplementaryGroups"] == ["dialout i2c video"]
     assert filled("modules-load.conf", {}).splitlines()[1:] == ["cdc_acm", "i2c_dev", "usbserial", "videodev"]
 
