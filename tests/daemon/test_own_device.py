@@ -51,7 +51,8 @@ def test_it_is_driven_and_recorded(project: Path, target: Path, tmp_path: Path):
     seconds = (found[-1]["stamp"] - found[0]["stamp"]) / 1e9
     assert len(found) / seconds == pytest.approx(1 / 0.134, rel=0.05)
     assert {message["frame"] for message in found} == {"ranger"}
-    distances = [message["distance"] for message in found if message["distance"] is not None]
+    distances = [message["distance"] for message in found if "distance" in message]
+    assert len(distances) > 0.9 * len(found), "a single beam may fail"
     assert max(distances) - min(distances) > 1.0, "the truck drove"
     rows = [row for table in messages(log, "health/services") for row in table["services"] if row["name"] == "ranger"]
     assert "ready" in {row["state"] for row in rows}
