@@ -21,7 +21,7 @@ def test_names_of_topics_devices_and_roles():
 
 def test_configurations_of_the_folder(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(ROOT)
-    assert complete_config("configs/d") == ["configs/demo.yaml"]
+    assert complete_config("configs/d") == ["configs/demo.yaml", "configs/dock.yaml"]
     assert "configs/robots/omni.yaml" in complete_config("")
     assert complete_config("go") == ["goals"], "a bundled one"
     assert "robots/omni" in complete_config("robots/")

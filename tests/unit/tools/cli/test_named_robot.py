@@ -25,6 +25,8 @@ LINES = {
     "behave stop": "behave stop",
     "mission run": "mission run configs/missions/rooms.yaml",
     "mission stop": "mission stop",
+    "dock": "dock",
+    "undock": "undock charger",
     "study circle": "study circle",
     "study straight": "study straight",
     "tune wall": "tune wall",
