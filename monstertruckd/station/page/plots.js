@@ -36,6 +36,9 @@ export class Plots {
     byId("plot-wide").onclick = () => this.widen(byId("plot-wide").getAttribute("aria-pressed") !== "true");
     byId("plot-hold").onclick = () => this.hold(byId("plot-hold").getAttribute("aria-pressed") !== "true");
     new ResizeObserver(() => this.resize()).observe(byId("plots"));
+    /** @type {Set<Element>} panels that are in view: the others are not drawn */
+    this.seen = new Set();
+    this.sight = new IntersectionObserver((rows) => rows.forEach(({ target, isIntersecting }) => (isIntersecting ? this.seen.add(target) : this.seen.delete(target))));
     this.held = null;
     const frame = () => {
       if (!byId("pane-plots").hidden && this.uPlot) this.draw();
@@ -113,8 +116,11 @@ export class Plots {
 
   /** Build all panels anew. */
   show() {
+    this.sight.disconnect();
+    this.seen.clear();
     for (const panel of this.panels) panel.plot?.destroy();
     byId("plots").replaceChildren(...this.panels.map((panel, i) => this.build(panel, i)));
+    for (const { box } of this.panels) this.sight.observe(box);
     const into = byId("plot-into").value;
     byId("plot-into").replaceChildren(new Option(words("plots.new"), ""), ...this.panels.map((_, i) => new Option(words("plots.into", { number: i + 1 }), String(i))));
     byId("plot-into").value = this.panels[into] ? into : "";
@@ -176,7 +182,7 @@ export class Plots {
   /** Draw the panel whose turn it is, if one is due: one in each picture of the screen. */
   draw() {
     const now = performance.now();
-    const panel = this.panels.find((each) => each.plot && now - each.at > PAUSE);
+    const panel = this.panels.find((each) => this.seen.has(each.box) && now - each.at > PAUSE);
     if (!panel) return;
     panel.at = now;
     const until = this.until();

@@ -281,7 +281,7 @@ async def places_are_marked_moved_renamed_driven_to_and_removed_on_the_map(page:
     (moved,) = await asked(page)
     assert (moved["order"], moved["name"], moved["place"]) == ("mark", "gate", pytest.approx([2, 0], abs=0.02))
     await answer(page, moved)
-    await page.wait_for_function("window.sent.length > 0")
+    await page.wait_for_function("() => window.sent.length > 0")
     (gone,) = await asked(page)
     assert (gone["order"], gone["name"]) == ("remove", "door")
     await answer(page, gone)
@@ -395,7 +395,7 @@ async def what_a_sensor_said_long_ago_is_not_shown_as_of_now(page: Page) -> None
     assert await page.inner_text("#chip-battery") == "24.8 V"
     await page.evaluate("void (window.passed += 2900)")
     await say(page, compass)
-    await page.wait_for_function("document.querySelector('#chip-battery').textContent === '24.8 V, 3 s old'")
+    await page.wait_for_function("() => /^24.8 V, . s old$/.test(document.querySelector('#chip-battery').textContent)")
     assert "old" not in (await page.text_content("#tilt") or "")
 
 
@@ -451,7 +451,7 @@ async def a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page: 
 
     async def asked(**answer: Any) -> dict[str, Any]:
         pick = "window.sent.find((each) => each.id !== undefined)"
-        await page.wait_for_function(pick)
+        await page.wait_for_function(f"() => {pick}")
         message = await page.evaluate(f"{{ const found = {pick}; window.sent = []; found }}")
         await say(page, {"kind": "answer", "id": message.pop("id"), **answer})
         return message
@@ -513,7 +513,7 @@ async def an_emulated_robot_fails_and_gets_obstacles_by_hand(page: Page) -> None
     assert [(each["do"], each.get("fault")) for each in asked] == [("fault", "unplugged"), ("obstacle", None)]
     assert len(asked[1]["at"]) == 2
     await say(page, {"kind": "answer", "id": asked[0]["id"], "ok": False, "reason": "input", "text": "no such device"})
-    await page.wait_for_function("document.querySelector('#fault-lidar').value === 'none'")
+    await page.wait_for_function("() => document.querySelector('#fault-lidar').value === 'none'")
     assert "no such device" in await page.inner_text("#refusal")
     await say(page, {"kind": "answer", "id": asked[1]["id"], "ok": True})
     await page.click("#tab-drive")
@@ -594,7 +594,7 @@ async def the_link_that_failed_is_named_with_its_age(page: Page) -> None:
     await page.evaluate("window.socket.onclose()")
     await page.evaluate("void (window.passed += 2500)")
     await page.wait_for_function(
-        "() => document.querySelector('#chip-link').textContent === 'Browser to station: lost for 3 s'"
+        "() => /^Browser to station: lost for . s$/.test(document.querySelector('#chip-link').textContent)"
     )
     text = "This browser has had no connection to the station for"
     assert text in await page.inner_text("#banners")
@@ -637,7 +637,7 @@ async def events_have_times_are_counted_and_filtered(page: Page) -> None:
     files = [("run-2-0", 9e12, False), ("run-3-1", 2e12, True), ("run-3-0", 1.0, False)]
     recordings = [{"name": name, "modified": at, "kind": "run", "open": is_open} for name, at, is_open in files]
     await answer(page, listing, value={"recordings": recordings})
-    await page.wait_for_function("window.sent.some((each) => each.do === 'replay')")
+    await page.wait_for_function("() => window.sent.some((each) => each.do === 'replay')")
     (replay,) = await asked(page)
     assert (replay["name"], replay["stamp"]) == ("run-2-0", 10**9), "the first that ended later"
     await answer(page, replay, ok=False, reason="busy", text="somebody else downloads")
@@ -771,11 +771,11 @@ async def numbers_are_plotted_pinned_and_pointed_at(page: Page) -> None:
 
     await page.evaluate("void (window.sent = [])")
     await page.click("#tab-plots")
-    await page.wait_for_function("window.sent.some((each) => each.do === 'numbers')")
+    await page.wait_for_function("() => window.sent.some((each) => each.do === 'numbers')")
     (listed,) = await page.evaluate("window.sent.filter((each) => each.do === 'numbers')")
     meanings = {"sensor/battery:voltage": "Pack voltage, V.", "state/pose:twist.wz": "Turn rate, rad/s."}
     await say(page, {"kind": "answer", "id": listed["id"], "ok": True, "value": {"numbers": meanings}})
-    await page.wait_for_function("document.querySelectorAll('#plot-names option').length === 2")
+    await page.wait_for_function("() => document.querySelectorAll('#plot-names option').length === 2")
 
     await page.fill("#plot-name", "sensor/battery")
     await page.click("#plot-add")
@@ -803,11 +803,11 @@ async def numbers_are_plotted_pinned_and_pointed_at(page: Page) -> None:
     assert box is not None
     await page.wait_for_timeout(300)
     await page.mouse.move(box["x"] + box["width"] * 0.8, box["y"] + 20)
-    past = await page.wait_for_function("document.querySelector('#map').dataset.past")
+    past = await page.wait_for_function("() => document.querySelector('#map').dataset.past")
     x = float((await past.json_value()).split(",")[0])
     assert 1.5 < x < 2.3, "two seconds ago"
     await page.mouse.move(5, 5)
-    await page.wait_for_function("!document.querySelector('#map').dataset.past")
+    await page.wait_for_function("() => !document.querySelector('#map').dataset.past")
 
     assert json.loads(await page.evaluate("localStorage.plots")) == [[*meanings]]
     for _ in meanings:
@@ -904,7 +904,7 @@ async def the_path_is_drawn_into_the_large_picture_of_the_camera(page: Page) -> 
     await page.evaluate(PICTURE)
     await page.click("#tab-truck")
     await page.click("#camera-large")
-    await page.wait_for_function("Number(document.querySelector('#camera-lines').dataset.drawn) > 60")
+    await page.wait_for_function("() => Number(document.querySelector('#camera-lines').dataset.drawn) > 60")
     box, view = await page.locator("#camera-lines").bounding_box(), await page.locator("#view").bounding_box()
     assert box is not None
     assert view is not None
