@@ -8,9 +8,9 @@ tests, benchmarks and docs. ``--list`` prints what was counted. The last line is
 *Places to change* are the files that one more of a kind changes, beside its own: of the trial changes that
 ``tests/daemon/test_trial_changes.py`` makes and runs; of trackers and explorers, the files that name a present one. A
 *module number* is an assignment at module level whose value is made of numbers: a literal, arithmetic with a literal,
-or a tuple of these. A *reader* of a file is a file of the packages that imports it, or whose catalog row names it
-(``module:name``). *Core* is what a robot needs to own its devices, estimate, map, plan, track, be stopped, be
-recorded and be operated; ``REST`` names everything else.
+or a tuple of these. A *reader* of a file is a file of the packages that imports it; a file that a catalog row names
+(``module:name``) stays a file of its kind. *Core* is what a robot needs to own its devices, estimate, map, plan,
+track, be stopped, be recorded and be operated; ``REST`` names everything else.
 """
 
 import argparse
@@ -185,13 +185,11 @@ def module_of(path: str) -> str:
 
 
 def readers(files: list[Source]) -> dict[str, set[str]]:
-    """Return, for each module, the files that import it or name it as the place of a catalog row."""
+    """Return, for each module, the files that import it."""
     modules, found = {module_of(source.path) for source in files}, defaultdict(set)
     for source in files:
         for node in ast.walk(source.tree):
             match node:
-                case ast.Constant(value=str() as place) if re.fullmatch(r"[\w.]+:\w+", place):
-                    imported = [place.partition(":")[0]]
                 case ast.Import(names=aliases):
                     imported = [alias.name for alias in aliases]
                 case ast.ImportFrom(module=str() as module, names=aliases):
@@ -202,6 +200,12 @@ def readers(files: list[Source]) -> dict[str, set[str]]:
             for name in modules.intersection(imported):
                 found[name].add(source.path)
     return found
+
+
+def placed(files: list[Source]) -> set[str]:
+    """Return the modules that catalog rows name (``module:name``): the catalog loads them on use."""
+    texts = (node.value for source in files for node in ast.walk(source.tree) if isinstance(node, ast.Constant))
+    return {text.partition(":")[0] for text in texts if isinstance(text, str) and re.fullmatch(r"[\w.]+:\w+", text)}
 
 
 def longest_cell() -> tuple[int, str]:
@@ -245,13 +249,14 @@ def main() -> None:
     )
     types = {name.partition(":")[2] for name in (*paths, *poses)}
     converting = [f"{source.path}:{name}" for source in files for name in conversions(source.tree, types)]
-    read_by = readers(files)
+    read_by, loaded = readers(files), placed(files)
     lonely = sorted(
         source.path
         for source in files
         if source.lines < SHORT
         and not source.path.endswith(("__init__.py", "_pb2.py"))
         and len(read_by[module_of(source.path)]) == 1
+        and module_of(source.path) not in loaded
     )
     rest = sum(source.lines for source in files if source.path.startswith(REST))
     cell, page = longest_cell()

@@ -224,7 +224,7 @@ Numbers = NDArray[np.intp]
 
 LOOSENED: Final = 30.0
 """Factor on the standard deviation of an edge of odometry that the scans contradict."""
-VIEW: Final = 0.7
+TURN_LEVER: Final = 0.7
 """Weight of one radian between two views (m)."""
 
 
@@ -442,7 +442,7 @@ class KeyframeMap:
 
     def _closeness(self, numbers: Numbers, pose: Array) -> Array:
         off = between(pose, self.poses[numbers])
-        return np.asarray(np.hypot(off[:, 0], off[:, 1]) + VIEW * np.abs(off[:, 2]))
+        return np.asarray(np.hypot(off[:, 0], off[:, 1]) + TURN_LEVER * np.abs(off[:, 2]))
 
 
 def redundancy(poses: Array, part: NDArray[np.int64]) -> Array:
@@ -450,7 +450,7 @@ def redundancy(poses: Array, part: NDArray[np.int64]) -> Array:
     result = np.full(len(poses), np.inf)
     for k in range(1, len(poses)):
         off = between(poses[k], poses)
-        distance = np.hypot(off[:, 0], off[:, 1]) + VIEW * np.abs(off[:, 2])
+        distance = np.hypot(off[:, 0], off[:, 1]) + TURN_LEVER * np.abs(off[:, 2])
         distance[k] = np.inf
         distance[part != part[k]] = np.inf
         result[k] = distance.min()
