@@ -30,6 +30,7 @@ from monstertruck_runtime.actors.actor import ActorFactory, Placement, WorkerAct
 from monstertruck_runtime.clock import Clock, VirtualClock
 from monstertruck_runtime.extras import not_installed
 from monstertruck_runtime.mailbox import fifo, latest
+from monstertruck_runtime.map_folders import YAML
 from monstertruck_runtime.service import Service
 from monstertruck_runtime.threads import in_thread, inline
 from monstertruck_schemas import topics
@@ -203,8 +204,13 @@ def _build_ground(config: TruckConfig, bus: Bus, clock: Clock, run: str) -> Grou
 
 
 def _folder(known: Path | None) -> Path | None:
-    """Folder of a map; the configuration names the folder or the YAML file."""
-    return known if known is None or known.is_dir() else known.parent
+    """Folder of a saved map, named by the folder or its YAML file; None for another map file.
+
+    The folder of such a file may hold several maps.
+    """
+    if known is None or known.is_dir():
+        return known
+    return known.parent if known.name == YAML else None
 
 
 def _build_points(

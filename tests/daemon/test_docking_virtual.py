@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +16,7 @@ from tests.daemon.test_missions_virtual import MissionOperator
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(900)]
 
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 DOCK = {"x": 2.5, "y": 0.805, "yaw": -math.pi / 2}
 
 
@@ -55,6 +57,7 @@ def test_the_truck_docks_and_charges_slowly():
     assert distance < 0.01
     assert turn < 1.0
     assert any(Reason.DOCKING in state.reasons for state in gate)
+    assert not (CONFIGS / "worlds" / "saves").exists(), "the dock's tag is saved beside a map of several robots"
 
 
 @pytest.mark.long

@@ -69,7 +69,7 @@ HARMLESS = {
         "smoothing": "of what is shown; limits are compared with what is measured",
         "plausible_min": "what reads less is a fault, what reads more is critical: both limit",
     },
-    BatteryInputConfig: dict.fromkeys(("channel", "volts_per_count", "gain", "offset"), UNIT),
+    BatteryInputConfig: dict.fromkeys(("channel", "current", "volts_per_count", "gain", "offset"), UNIT),
     IioConfig: {
         **dict.fromkeys(("kind", "device", "channel", "divider", "offset", "full_scale"), UNIT),
         "rate": "what is not measured for 2 s is slow",

@@ -159,6 +159,9 @@ INSTEAD = {
     "monstertruckd explore --arm --robot turtle": Instead(
         None, "drives for minutes; tests/daemon/test_explore_virtual.py explores"
     ),
+    "monstertruckd config show robot.yaml": Instead(
+        None, "needs the page's own package; tests/daemon/test_own_check.py installs it"
+    ),
     "monstertruckd demo --fast -c robot.yaml": Instead(None, OWN_DEVICE),
     "monstertruckd emulate ranger --link /tmp/ranger": Instead(None, OWN_DEVICE),
     "monstertruckd probe ranger --port /tmp/ranger": Instead(None, OWN_DEVICE),
@@ -202,6 +205,16 @@ FOREIGN = {
         "runs for minutes; test_figures.py checks what it writes"
     ),
     "python -m benchmarks.thesis --only 5.1 5.5": "drives for minutes; slowness and scores have their tests",
+    **dict.fromkeys(
+        (
+            "python -m hatchling build -t wheel -d dist",
+            *(
+                f"python -m zipfile -e dist/truck_{name}-1.0-py3-none-any.whl plugins"
+                for name in ("sonar", "bumper", "linear", "tracked")
+            ),
+        ),
+        "test_writing_pages.py runs it in the page's own package",
+    ),
     "pip install '.[ros2]'": "needs a package index; the extra is looked up",
     "pip install '.[tables,plot]'": "needs a package index; the extra is looked up",
     "pip install '.[view]'": "needs a package index; the extra is looked up",

@@ -125,10 +125,10 @@ def test_trouble_ends_the_session(trouble, error):
                 rig.port.unplug()
             else:
                 rig.emulator.inject(*trouble.split())
-            with pytest.raises(error):
-                await session
+            await session
 
-    on_bench(test)
+    with pytest.raises(error):
+        on_bench(test)
 
 
 def test_a_blocked_head_a_few_wrong_sums_and_unknown_faults():
