@@ -270,7 +270,12 @@ class TruckConfig(Schema):
         sees = self.devices.lidar is not None or self.devices.sonar is not None
         blind = () if sees or self.gate.scan.critical else (BLIND,)
         devices = weakened_devices(self.devices, self.monitors)
-        return (*weakened(self.gate), *blind, *self._weakened_comparison(), *devices, *opened)
+        housings = (
+            f"docks.{name}.housing: lidar returns in it are no obstacle while the robot docks"
+            for name, dock in self.docks.items()
+            if dock.housing is not None
+        )
+        return (*weakened(self.gate), *blind, *self._weakened_comparison(), *devices, *opened, *housings)
 
     def _weakened_comparison(self) -> Iterator[str]:
         usual, above = ConsistencyConfig(), ("slip", "slide", "delay")

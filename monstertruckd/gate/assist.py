@@ -18,6 +18,7 @@ from monstertruckd.gate.approach import stopping
 from monstertruckd.gate.checks import Check, GateView, PaceLimit
 from monstertruckd.gate.motion import Course
 from monstertruckd.gate.obstacles import ObstacleGuard
+from monstertruckd.gate.scan_memory import spaced
 
 CHOICES: Final = 8
 """Number of turns to each side that are compared."""
@@ -96,19 +97,25 @@ class Assist(Check):
         """What the latest choice depends on, and the turn chosen (rad)."""
 
     def instead(self, request: DriveRequest | None, now: int) -> DriveRequest | None:
-        """Return the request to be driven: the operator's, or one that turns more or less; None if none is assisted."""
+        """Return the request to be driven: the operator's, or one that turns more or less; None if none is assisted.
+
+        With the second control the operator has confirmed the ground on the asked motion, and on no other.
+        """
         self._turned = False
         view = self.view
         if (
             request is None
             or request.form is not DriveForm.AXLES
             or request.neutral
+            or request.unseen
             or view.chassis.freedom == "parallel"
         ):
             return request
         if not view.samples.scan_fresh(now):
             return request
-        depends = (request.speed, request.front, request.rear, view.config.assist.horizon, self._guard.stamp)
+        # 0.01 m/s and rad: noise of a stick, which must not cost a comparison in every tick
+        asked = (round(value, 2) for value in (request.speed, request.front, request.rear))
+        depends = (*asked, view.config.assist.horizon, self._guard.stamp)
         if depends != self._chosen[0]:
             self._chosen = depends, self._choose(request, now)
         turn = self._chosen[1]
@@ -123,11 +130,13 @@ class Assist(Check):
         most = config.angle + max(abs(request.front), abs(request.rear))
         turns = most * np.arange(-CHOICES, CHOICES + 1) / CHOICES
         ahead = math.copysign(1.0, request.speed)
+        speed = min(abs(request.speed), config.speed if ahead > 0 else config.reverse_speed)
         twists = [bicycle.body_twist(ahead, *self._axles(request, turn)) for turn in turns.tolist()]
-        slowing = stopping(abs(request.speed), self._guard.delay(now), config.obstacle.deceleration)
+        slowing = stopping(speed, self._guard.delay(now), config.obstacle.deceleration)
         needed = slowing + config.obstacle.ahead + config.assist.horizon
         footprint, margin = self.view.footprint, config.obstacle.side_clearance
         points = self._guard.points(needed + footprint.circumscribed_radius + margin, reverse=ahead < 0)
+        points = spaced(points, 0.02)  # m: the obstacle check sees them all
         if free_distances(np.array(twists[CHOICES : CHOICES + 1]), footprint, margin, points)[0] >= needed:
             return 0.0
         return nearest_free(turns, free_distances(np.array(twists), footprint, margin, points), needed)

@@ -527,8 +527,8 @@ class Gate:
         if request is not None and self._contact is not None:
             request = self._contact.instead(request, now)
         if self._assist is not None:
-            by_hand = holder is not None and not holder.inside and self._config.assist.on
-            request = self._assist.instead(request if by_hand else None, now) or request
+            assisted = self._config.assist.on and self._by_hand(holder)
+            request = self._assist.instead(request if assisted else None, now) or request
         courses = self._limiter.aim(now, dt, request)
         limits = self._checks.limits(now, courses)
         self._limiter.advance(dt, limits)
@@ -539,6 +539,12 @@ class Gate:
         self._report(now, tuple(limits), always=False)
         self._known = {reason: self._known.get(reason, now) for reason in (*blocks, *limits)}
         return self._output(now, blocks, limits)
+
+    def _by_hand(self, holder: Source | None) -> bool:
+        """Whether an operator drives, and no wizard, which measures what it asks for."""
+        if holder is None or holder.inside or self._states.calibrates:
+            return False
+        return holder.request.role in OPERATORS
 
     def _stop_runaway(self, now: int) -> None:
         """Latch the emergency stop for uncommanded motion; report every finding, even if already latched."""

@@ -1,9 +1,10 @@
 """Dock check: lets the robot come near a dock, slowly, while a behaviour docks or undocks.
 
-The gate knows the docks of the configuration: their housings and staging distances. Where a dock is, the behaviour says
-in ``plan/behaviour``; the gate believes it only within these bounds:
+The gate knows the docks of the configuration: places, housings and staging distances. Where exactly a dock is, the
+behaviour says in ``plan/behaviour``; the gate believes it only within these bounds:
 
 - the behaviour runs, holds the drive, and its report is fresh;
+- the dock is within 0.3 m and 0.3 rad of its place on the map, on which the robot knows its own;
 - the robot stands on the axis of the dock: at most ``docking.across`` beside it, ``docking.turn`` off it, no farther
   than the staging pose, and no more than ``docking.beyond`` past the docked pose. A robot that docks in reverse also
   looks at the dock, and backs off to turn about: either end may face the dock, as far as ``turning`` beyond staging.
@@ -19,16 +20,19 @@ from typing import Any, Final
 
 import numpy as np
 
+from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between, compose
 from monstertruck_planners.behave.dock.config import DockConfig
 from monstertruck_planners.behave.dock.estimate import facing
+from monstertruck_planners.goals.exchange import placeless
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Message
+from monstertruck_schemas.health import SlamHealth
 from monstertruck_schemas.plan import BehaviourState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import Odometry
-from monstertruck_schemas.topics import BEHAVIOUR, ODOMETRY, Topic
+from monstertruck_schemas.topics import BEHAVIOUR, ODOMETRY, POSE, SLAM, Topic
 from monstertruckd.gate.checks import Check, DockArea, GateView, PaceLimit, Tick
 from monstertruckd.gate.motion import Course
 
@@ -45,13 +49,16 @@ class DockCheck(Check):
     """
 
     reasons = (Reason.DOCKING,)
-    reads = (ODOMETRY, BEHAVIOUR)
+    reads = (ODOMETRY, BEHAVIOUR, POSE, SLAM)
 
     def __init__(self, view: GateView, docks: Mapping[str, DockConfig]) -> None:
         super().__init__(view)
         self._docks = docks
         self._behaviour: BehaviourState | None = None
         self._odometry: Odometry | None = None
+        self._located: Odometry | None = None
+        """Latest pose in map."""
+        self._slam: SlamHealth | None = None
 
     def observe(self, seen: Message | Tick, topic: Topic[Any] | None) -> None:
         """Take reports of behaviours and odometry; at a tick, find the area."""
@@ -59,8 +66,12 @@ class DockCheck(Check):
             self.view.dock = self._area(seen.now)
         elif isinstance(seen, BehaviourState):
             self._behaviour = seen
+        elif isinstance(seen, SlamHealth):
+            self._slam = seen
         elif isinstance(seen, Odometry) and topic is ODOMETRY:
             self._odometry = seen
+        elif isinstance(seen, Odometry) and topic is POSE:
+            self._located = seen
 
     def _area(self, now: int) -> DockArea | None:
         behaviour, odometry = self._behaviour, self._odometry
@@ -70,9 +81,12 @@ class DockCheck(Check):
         late = now - behaviour.received > FRESH or now - odometry.received > ODOMETRY.fresh_for() * SECOND
         if dock is None or late or self.view.planner != ServiceName.BEHAVIOURS.value:
             return None
-        limits, base, pose = self.view.config.docking, odometry.pose, behaviour.dock.pose
+        limits, pose = self.view.config.docking, behaviour.dock.pose
         at_dock = np.array((pose.x, pose.y, pose.yaw))
-        here = np.array((base.x, base.y, base.yaw))
+        here = _base(odometry)
+        place = self._place(now)
+        if place is None or not _agree(compose(place, between(here, at_dock)), dock):
+            return None
         x, y, turn = between(at_dock, facing(here, dock)).tolist()
         far = dock.staging
         if dock.direction == "reverse":
@@ -88,9 +102,29 @@ class DockCheck(Check):
         at_x, at_y, yaw = between(here, face).tolist()
         return DockArea(((at_x, at_y, yaw), dock.housing.depth + 0.03, dock.housing.width))
 
+    def _place(self, now: int) -> Array | None:
+        """Base in map; without localisation the frame of odometry is the map."""
+        if self._located is None and self._slam is None:
+            return None if self._odometry is None else _base(self._odometry)
+        located = self._located
+        if located is None or now - located.received > POSE.fresh_for() * SECOND or placeless(self._slam):
+            return None
+        return _base(located)
+
     def limit(self, now: int, courses: Sequence[Course] | None) -> Iterator[PaceLimit]:
         """Limit of the pace near the dock."""
         if courses and self.view.dock is not None:
             speed = self.view.config.docking.speed
             if speed < max(pace for _, pace in courses):
                 yield PaceLimit(Reason.DOCKING, speed)
+
+
+def _agree(told: Array, dock: DockConfig) -> bool:
+    """Whether a reported dock, in map, is where the configuration has it."""
+    x, y, turn = between(facing(np.array((dock.x, dock.y, dock.yaw)), dock), told).tolist()
+    off = 0.3  # m and rad: localisation, and the place as it was entered
+    return math.hypot(x, y) <= off and abs(turn) <= off
+
+
+def _base(odometry: Odometry) -> Array:
+    return np.array((odometry.pose.x, odometry.pose.y, odometry.pose.yaw))

@@ -81,10 +81,15 @@ def test_an_operator_is_steered_round_an_obstacle_and_sees_it():
     [
         ({}, {"speed": 0.2}),
         (ON, {"speed": 0.2, "role": Role.TRACKER, "inside": True, "source": "tracker"}),
+        (
+            {**ON, "remote_trackers": ("lab",)},
+            {"speed": 0.2, "role": Role.TRACKER, "inside": False, "source": "lab"},
+        ),
+        (ON, {"speed": 0.2, "unseen": True}),
         (ON, {"speed": 0.0, "front": 0.0}),
         (ON, {"speed": -0.1}),
     ],
-    ids=["off", "tracker", "standstill", "away"],
+    ids=["off", "tracker", "remote tracker", "second control", "standstill", "away"],
 )
 def test_nothing_else_is_steered(config, driver):
     rig = Rig(**config)
@@ -122,3 +127,11 @@ def test_it_is_switched_while_driving():
     rig.gate.configure(rig.config.model_copy(update={"assist": rig.config.assist.model_copy(update={"on": True})}))
     rig.tick(20)
     assert rig.out.front > 0.05
+
+
+def test_a_speed_beyond_all_limits_is_steered_like_the_greatest():
+    rig = Rig(**ON)
+    rig.obstacles = RIGHT_HALF
+    rig.driving(speed=1e200)
+    assert rig.out.front > 0.05
+    assert rig.out.twist[0] <= rig.config.speed + 1e-9

@@ -50,9 +50,9 @@ class DockConfig(Schema):
     """Distance from base of the docked robot to the tag, along the approach (m)"""
     tag_offset: Annotated[float, Field(ge=-1, le=1)] = 0.0
     """Offset of the tag to the left of the approach, seen towards the dock (m)"""
-    staging: Metres = 0.7
+    staging: Annotated[float, Field(gt=0, le=1.5)] = 0.7
     """Distance of the staging pose before the docked pose (m)"""
-    turning: Metres = 1.0
+    turning: Annotated[float, Field(gt=0, le=1.5)] = 1.0
     """Distance beyond the staging pose that a robot needs to turn its rear to the dock (m); `reverse` only"""
     housing: HousingConfig | None = None
     """Box that the gate lets the robot come near while it docks; null = the lidar sees nothing where the robot docks"""
