@@ -18,7 +18,6 @@ from monstertruckd.gate.approach import stopping
 from monstertruckd.gate.checks import Check, GateView, PaceLimit
 from monstertruckd.gate.motion import Course
 from monstertruckd.gate.obstacles import ObstacleGuard
-from monstertruckd.gate.scan_memory import spaced
 
 CHOICES: Final = 8
 """Number of turns to each side that are compared."""
@@ -136,7 +135,6 @@ class Assist(Check):
         needed = slowing + config.obstacle.ahead + config.assist.horizon
         footprint, margin = self.view.footprint, config.obstacle.side_clearance
         points = self._guard.points(needed + footprint.circumscribed_radius + margin, reverse=ahead < 0)
-        points = spaced(points, 0.02)  # m: the obstacle check sees them all
         if free_distances(np.array(twists[CHOICES : CHOICES + 1]), footprint, margin, points)[0] >= needed:
             return 0.0
         return nearest_free(turns, free_distances(np.array(twists), footprint, margin, points), needed)
