@@ -119,9 +119,9 @@ class DockCheck(Check):
                 yield PaceLimit(Reason.DOCKING, speed)
 
 
-def _agree(told: Array, dock: DockConfig) -> bool:
+def _agree(reported: Array, dock: DockConfig) -> bool:
     """Whether a reported dock, in map, is where the configuration has it."""
-    x, y, turn = between(facing(np.array((dock.x, dock.y, dock.yaw)), dock), told).tolist()
+    x, y, turn = between(facing(np.array((dock.x, dock.y, dock.yaw)), dock), reported).tolist()
     off = 0.3  # m and rad: localisation, and the place as it was entered
     return math.hypot(x, y) <= off and abs(turn) <= off
 

@@ -30,7 +30,7 @@ class Docking(Rig):
             dock["direction"] = "reverse"
         self.gate = make_gate(docks={"charger": DockConfig(**dock)}, obstacle=obstacle)
         self.place, self.yaw, self.way = [0.5, 0.0], yaw, way
-        self.told = 1.0
+        self.reported = 1.0
         self.dock, self.things = "charger", ()
 
     def sense(self):
@@ -44,7 +44,7 @@ class Docking(Rig):
             age=0.0,
         )  # fmt: skip
         self.gate.observe(odometry, topics.ODOMETRY)
-        target = None if self.dock is None else DockTarget(name=self.dock, pose=Pose2D(x=self.told, y=0.0, yaw=0.0))
+        target = None if self.dock is None else DockTarget(name=self.dock, pose=Pose2D(x=self.reported, y=0.0, yaw=0.0))
         state = BehaviourState(**header(self.now), frame="odom", running=True, kind="dock", dock=target)
         self.gate.observe(state, topics.BEHAVIOUR)
 
@@ -75,7 +75,7 @@ def test_a_docking_truck_touches_the_housing_slowly_and_goes_no_farther():
         ({"dock": "other"}, PLANNER),
         ({"place": [0.5, 0.2]}, PLANNER),
         ({"yaw": 0.4}, PLANNER),
-        ({"told": 1.31}, PLANNER),
+        ({"reported": 1.31}, PLANNER),
         ({"things": ((FACE, 0.0), (FACE - 0.1, 0.05))}, PLANNER),
         ({}, {"source": "ann"}),
     ],
