@@ -103,9 +103,7 @@ class DockCheck(Check):
         return DockArea(((at_x, at_y, yaw), dock.housing.depth + 0.03, dock.housing.width))
 
     def _place(self, now: int) -> Array | None:
-        """Base in map; without localisation the frame of odometry is the map."""
-        if self._located is None and self._slam is None:
-            return None if self._odometry is None else _base(self._odometry)
+        """Base in map, shape (3,); None if it is old or not known."""
         located = self._located
         if located is None or now - located.received > POSE.fresh_for() * SECOND or placeless(self._slam):
             return None

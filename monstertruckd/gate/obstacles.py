@@ -214,15 +214,17 @@ class ObstacleGuard:
             dock: points inside its housing do not count.
         """
         self._follow_limits()
-        if dock != self._dock:
+        if self._checked is None or (dock is None) != (self._dock is None):
+            # In base, as the points are: it is taken with each scan.
             self._dock, self._checked = dock, None
         rounded = frozenset((round(x / TWIST_STEP), round(y / TWIST_STEP), round(a / TWIST_STEP)) for x, y, a in twists)
         if self._checked != rounded:
             self._checked = rounded
             self._update_unseen(rounded)
             points, remembered, echoes = self._points, self.memory.points(), self.memory.echoes()
-            if dock is not None:
-                points, remembered, echoes = (some[dock.outside(some)] for some in (points, remembered, echoes))
+            if self._dock is not None:
+                outside = self._dock.outside
+                points, remembered, echoes = (some[outside(some)] for some in (points, remembered, echoes))
             self._free = min(self._free_distance(*twist, points, remembered, echoes) for twist in rounded)
             self._check_ground(rounded, np.concatenate((points, remembered)))
         return self._free

@@ -61,7 +61,7 @@ def test_the_truck_docks_and_charges_slowly():
 
 
 @pytest.mark.long
-def test_the_truck_turns_its_rear_to_the_dock_and_leaves_it_again():
+def test_the_truck_turns_its_rear_to_the_dock():
     dock = {"yaw": math.pi / 2}
     end, _, truth = docked((2.5, 1.6, -1.57), [{"do": "dock"}, {"do": "wait", "seconds": 1.0}], dock)
     assert end.reason is Reason.MISSION_DONE, end.text
@@ -69,3 +69,11 @@ def test_the_truck_turns_its_rear_to_the_dock_and_leaves_it_again():
     distance, turn = off(truth[-1, 1:4], DOCK | dock)
     assert distance < 0.01
     assert turn < 1.0
+
+
+def test_it_leaves_the_dock_slowly():
+    end, gate, truth = docked((2.5, 0.805, -math.pi / 2), [{"do": "undock"}])
+    assert end.reason is Reason.MISSION_DONE, end.text
+    assert not truth[:, 5].any(), "collided"
+    assert math.dist(truth[-1, 1:3], (DOCK["x"], DOCK["y"] + 0.7)) < 0.05, "not at the staging pose"
+    assert any(Reason.DOCKING in state.reasons for state in gate)

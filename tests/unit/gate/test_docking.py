@@ -30,7 +30,7 @@ class Docking(Rig):
             dock["direction"] = "reverse"
         self.gate = make_gate(docks={"charger": DockConfig(**dock)}, obstacle=obstacle)
         self.place, self.yaw, self.way = [0.5, 0.0], yaw, way
-        self.reported = 1.0
+        self.reported, self.located = 1.0, True
         self.dock, self.things = "charger", ()
 
     def sense(self):
@@ -44,6 +44,8 @@ class Docking(Rig):
             age=0.0,
         )  # fmt: skip
         self.gate.observe(odometry, topics.ODOMETRY)
+        if self.located:
+            self.gate.observe(odometry.model_copy(update={"frame": "map"}), topics.POSE)
         target = None if self.dock is None else DockTarget(name=self.dock, pose=Pose2D(x=self.reported, y=0.0, yaw=0.0))
         state = BehaviourState(**header(self.now), frame="odom", running=True, kind="dock", dock=target)
         self.gate.observe(state, topics.BEHAVIOUR)
@@ -76,6 +78,7 @@ def test_a_docking_truck_touches_the_housing_slowly_and_goes_no_farther():
         ({"place": [0.5, 0.2]}, PLANNER),
         ({"yaw": 0.4}, PLANNER),
         ({"reported": 1.31}, PLANNER),
+        ({"located": False}, PLANNER),
         ({"things": ((FACE, 0.0), (FACE - 0.1, 0.05))}, PLANNER),
         ({}, {"source": "ann"}),
     ],

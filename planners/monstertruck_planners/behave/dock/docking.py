@@ -332,9 +332,9 @@ class Undock:
         """Run one step."""
         base, located = _pose(inputs.of(ODOMETRY)), inputs.if_fresh(POSE)
         if state.start is None:
-            # Without localisation the frame of odometry is the map.
-            place = base if located is None else _pose(located)
-            x, y, turn = between(np.array((self._dock.x, self._dock.y, self._dock.yaw)), place).tolist()
+            if located is None:
+                return BehaviourStep(None, state, "leave", Reason.INPUT_STALE, "no fresh pose in the map")
+            x, y, turn = between(np.array((self._dock.x, self._dock.y, self._dock.yaw)), _pose(located)).tolist()
             if math.hypot(x, y) > 0.3 or abs(turn) > 0.3:  # a robot this far from the dock does not stand in it, m, rad
                 off = f"{math.hypot(x, y):.2f} m and {abs(math.degrees(turn)):.0f} degrees"
                 text = f"the robot is {off} from the dock {self._name}"

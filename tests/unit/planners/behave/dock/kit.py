@@ -38,6 +38,8 @@ class Robot:
     """Current of the charger (A)."""
     sensor: bool = True
     """Whether it measures the current."""
+    located: bool = True
+    """Whether its pose in the map is known."""
     trail: list[np.ndarray] = field(default_factory=list)
     phases: list[str] = field(default_factory=list)
 
@@ -102,7 +104,7 @@ class Robot:
         known = self.pose + self.rng.normal(0, (0.003, 0.003, 0.002))
         return Inputs({
             ODOMETRY.name: place(self.odom, "odom"),
-            POSE.name: place(known, "map"),
+            **({POSE.name: place(known, "map")} if self.located else {}),
             TAGS.name: self.tags,
             BATTERY.name: Battery(
                 **header, raw_voltage=23.0, cells=6, level=BatteryLevel.NORMAL,

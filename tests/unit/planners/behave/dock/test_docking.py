@@ -105,6 +105,11 @@ def test_it_undocks_to_the_staging_distance_and_only_from_a_dock(dock: DockConfi
     assert robot.error[0] == pytest.approx(dock.staging, abs=0.03)
     assert math.dist(robot.pose[:2], staging_pose(dock)[:2]) < 0.03
     assert robot.undocks().outcome is Reason.DOCK_MISSED
+    turned = Robot(dock, np.array((dock.x, dock.y, dock.yaw + 0.4)))
+    assert turned.undocks().outcome is Reason.DOCK_MISSED
+    lost = Robot(dock, np.array((dock.x, dock.y, dock.yaw)))
+    lost.located = False
+    assert lost.undocks().outcome is Reason.INPUT_STALE
 
 
 def test_a_dock_is_chosen_by_its_name():
