@@ -155,7 +155,7 @@ async def a_robot_that_has_yet_to_stand_is_shown_stopping_and_cannot_be_armed(pa
     for mode, name in ((GateMode.DISARMED, "Disarmed"), (GateMode.ESTOPPED, "Emergency stop")):
         await say(page, gate_says(mode, stopping=True))
         await page.wait_for_selector(f"#mode-name:text-is('{name}, stopping')")
-        assert await page.text_content("#chip-mode") == f"{name}, stopping"
+        await expect(page.locator("#chip-mode")).to_have_text(f"{name}, stopping")
         assert await page.is_disabled("#arm")
         await say(page, gate_says(mode))
         await page.wait_for_selector(f"#mode-name:text-is('{name}')")
@@ -193,7 +193,7 @@ async def an_unknown_way_is_taken_to_be_slow(page: Page) -> None:
     await say(page, {"kind": "goal", "m": {"number": 3, "phase": "driving", "remaining": 1.0, "goal": [1, 1, 0]}})
     assert await page.inner_text("#goal-text")
     await say(page, {"kind": "robot", "name": "truck"})
-    assert not await page.is_visible("#goal")
+    await expect(page.locator("#goal")).to_be_hidden()
 
 
 async def parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page: Page) -> None:
@@ -220,7 +220,7 @@ async def parts_of_the_map_outlive_the_whole_map_that_they_belong_to(page: Page)
 
 
 async def a_zone_is_drawn_on_the_map_and_turned_off(page: Page) -> None:
-    assert not await page.is_visible("#tool-zone"), "the robot keeps none"
+    await expect(page.locator("#tool-zone"), "the robot keeps none").to_be_hidden()
     zone = {"name": "ramp", "kind": "speed", "corners": [[0, 0], [1, 0], [1, 1]], "mask": None, "limit": 0.1}
     zone |= {"inside": "stop", "saved": True, "off_until": None}
     await say(page, {"kind": "zones", "m": {"zones": [zone], "inside": ["ramp"]}})
@@ -232,7 +232,7 @@ async def a_zone_is_drawn_on_the_map_and_turned_off(page: Page) -> None:
     await page.evaluate("void (window.sent = [])")
     await page.click("#zone-add")
     await page.click("#tab-tasks")
-    assert "ramp, speed limit 0.10 m/s, robot inside" in await page.inner_text("#zones")
+    await expect(page.locator("#zones")).to_contain_text("ramp, speed limit 0.10 m/s, robot inside")
     await page.click("#zones button >> nth=0")
     sent = json.loads(await page.evaluate("JSON.stringify(window.sent)"))
     add, off = (each for each in sent if each["do"] == "zone")
@@ -256,7 +256,7 @@ async def a_zone_is_drawn_on_the_map_and_turned_off(page: Page) -> None:
 
 
 async def places_are_marked_moved_renamed_driven_to_and_removed_on_the_map(page: Page) -> None:
-    assert not await page.is_visible("#tool-point"), "the robot keeps none"
+    await expect(page.locator("#tool-point"), "the robot keeps none").to_be_hidden()
     point = {"name": "door", "kind": "mark", "x": 1.0, "y": 0.0, "yaw": 0.0}
     tag = {"name": "tag-3", "kind": "tag", "x": -1.0, "y": 0.0, "yaw": 0.0}
     await say(page, {"kind": "points", "m": {"points": [point, tag]}})
@@ -309,7 +309,7 @@ async def places_are_marked_moved_renamed_driven_to_and_removed_on_the_map(page:
 async def a_mission_is_drawn_on_the_map_run_and_watched(page: Page) -> None:
     point = {"name": "door", "kind": "mark", "x": 1.0, "y": 0.0, "yaw": 0.0}
     await say(page, FACTS, {"kind": "points", "m": {"points": [point]}})
-    assert not await page.is_visible("#tool-mission"), "the robot has no planner"
+    await expect(page.locator("#tool-mission"), "the robot has no planner").to_be_hidden()
     await say(page, FACTS | {"goals": True})
     await page.click("#tool-mission")
     for place in ([0, 1], [1, 0], [0, -1], [-1, -1]):
@@ -377,14 +377,14 @@ async def answer(page: Page, command: dict[str, Any], **outcome: Any) -> None:
 
 
 async def a_robot_without_a_map_is_called_so(page: Page) -> None:
-    assert not await page.is_visible("#map-none")
+    await expect(page.locator("#map-none")).to_be_hidden()
     await say(page, FACTS | {"mapping": False})
-    assert await page.is_visible("#map-none")
+    await expect(page.locator("#map-none")).to_be_visible()
     await page.click("#tool-goal")
-    assert not await page.is_visible("#map-none"), "the hint of a tool has its place"
+    await expect(page.locator("#map-none"), "the hint of a tool has its place").to_be_hidden()
     await page.click("#tool-goal")
     await say(page, FACTS | {"mapping": True})
-    assert not await page.is_visible("#map-none")
+    await expect(page.locator("#map-none")).to_be_hidden()
 
 
 async def what_a_sensor_said_long_ago_is_not_shown_as_of_now(page: Page) -> None:
@@ -392,7 +392,7 @@ async def what_a_sensor_said_long_ago_is_not_shown_as_of_now(page: Page) -> None
     compass = {"kind": "compass", "m": {"roll": 0.0, "pitch": 0.0, "tilt_valid": True}}
     await say(page, battery, compass)
     await asyncio.sleep(0.2)
-    assert await page.inner_text("#chip-battery") == "24.8 V"
+    await expect(page.locator("#chip-battery")).to_have_text("24.8 V")
     await page.evaluate("void (window.passed += 2900)")
     await say(page, compass)
     await page.wait_for_function("() => /^24.8 V, . s old$/.test(document.querySelector('#chip-battery').textContent)")
@@ -421,17 +421,17 @@ async def a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page: Pa
     stopped = {"number": 0, "running": False, "resumable": True, "name": "round", "text": "interrupted at step 2"}
     await say(page, FACTS | {"goals": True}, {"kind": "mission", "m": stopped})
     await page.click("#tab-tasks")
-    assert await page.inner_text("#mission-state") == "interrupted at step 2"
-    assert not await page.is_visible("#mission-moved"), "unless the robot asks"
+    await expect(page.locator("#mission-state")).to_have_text("interrupted at step 2")
+    await expect(page.locator("#mission-moved"), "unless the robot asks").to_be_hidden()
     refused = {"ok": False, "reason": "pose_lost", "text": "its pose is 3.0 m from where round was interrupted"}
     await say(page, {"kind": "slam", "m": {"standing": "searching", "overlap": 0.0}})
     await press("#mission-resume", **refused | {"text": "its place on the saved map is not known (searching)"})
-    assert not await page.is_visible("#mission-moved"), "its pose is not right"
+    await expect(page.locator("#mission-moved"), "its pose is not right").to_be_hidden()
     await say(page, {"kind": "slam", "m": {"standing": "localised", "overlap": 0.9}})
     assert await press("#mission-resume", **refused) == {"do": "mission", "order": "resume"}
-    assert "3.0 m from where" in await page.inner_text("#refusal")
+    await expect(page.locator("#refusal")).to_contain_text("3.0 m from where")
     assert await press("#mission-moved", ok=True) == {"do": "mission", "order": "resume", "moved": True}
-    assert not await page.is_visible("#mission-moved")
+    await expect(page.locator("#mission-moved")).to_be_hidden()
     lines = [
         {"number": "1", "depth": 0, "text": "repeat 3 times", "active": True},
         {"number": "1.1", "depth": 1, "text": "goto <b>1 2 0", "active": True},
@@ -439,8 +439,8 @@ async def a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page: Pa
     ]
     running = {"number": 1, "running": True, "resumable": False, "lines": lines}
     await say(page, {"kind": "mission", "m": stopped | running})
-    assert not await page.is_visible("#mission-resume")
-    assert await page.inner_text("#mission-lines [aria-current]") == "1.1 goto <b>1 2 0", "as text"
+    await expect(page.locator("#mission-resume")).to_be_hidden()
+    await expect(page.locator("#mission-lines [aria-current]")).to_have_text("1.1 goto <b>1 2 0")
     assert await page.locator("#mission-lines li").count() == 3
 
 
@@ -467,7 +467,7 @@ async def a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page: 
     assert await asked(ok=True) == hold
     assert await asked(ok=False, reason="no_map", text="no map yet") == begin
     assert await asked(ok=True) == {"do": "order", "order": "disarm"}
-    assert "no map yet" in await page.inner_text("#refusal")
+    await expect(page.locator("#refusal")).to_contain_text("no map yet")
     await say(page, {"kind": "gate", "m": {"mode": "driving", "holder": "track", "reasons": [], "waiting": []}})
     await page.click("#explore-start")
     assert await asked(ok=True) == begin
@@ -477,9 +477,9 @@ async def a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page: 
 
 async def the_configured_path_is_started_by_its_name(page: Page) -> None:
     await say(page, FACTS)
-    assert not await page.is_visible("#path-start"), "this robot has none"
+    await expect(page.locator("#path-start"), "this robot has none").to_be_hidden()
     await say(page, FACTS | {"path": "lap", "tracks": True})
-    assert await page.inner_text("#path-start") == "Start lap"
+    await expect(page.locator("#path-start")).to_have_text("Start lap")
     await page.evaluate("void (window.sent = [])")
     await page.click("#path-start")
     asked = await page.evaluate("window.sent.find((each) => each.id !== undefined)")
@@ -497,7 +497,7 @@ async def the_configured_path_is_started_by_its_name(page: Page) -> None:
 
 async def an_emulated_robot_fails_and_gets_obstacles_by_hand(page: Page) -> None:
     await say(page, {"kind": "emulated", "faults": {}})
-    assert not await page.is_visible("#tab-tryout"), "this robot is real"
+    await expect(page.locator("#tab-tryout"), "this robot is real").to_be_hidden()
     await say(page, {"kind": "emulated", "faults": {"lidar": "none", "drive": "deaf"}, "obstacles": []})
     await page.click("#tab-tryout")
     assert await page.input_value("#fault-drive") == "deaf"
@@ -505,16 +505,16 @@ async def an_emulated_robot_fails_and_gets_obstacles_by_hand(page: Page) -> None
     await page.evaluate("void (window.sent = [])")
     await page.select_option("#fault-lidar", "unplugged")
     await page.click("#obstacle-add")
-    assert await page.get_attribute("#tool-goal", "aria-pressed") == "false"
+    await expect(page.locator("#tool-goal")).to_have_attribute("aria-pressed", "false")
     await page.click("#map", position={"x": 200, "y": 150})
-    assert await page.get_attribute("#obstacle-add", "aria-pressed") == "false"
-    assert not await page.is_visible("#goal-go"), "this place is no goal"
+    await expect(page.locator("#obstacle-add")).to_have_attribute("aria-pressed", "false")
+    await expect(page.locator("#goal-go"), "this place is no goal").to_be_hidden()
     asked = [each for each in await page.evaluate("window.sent") if "id" in each]
     assert [(each["do"], each.get("fault")) for each in asked] == [("fault", "unplugged"), ("obstacle", None)]
     assert len(asked[1]["at"]) == 2
     await say(page, {"kind": "answer", "id": asked[0]["id"], "ok": False, "reason": "input", "text": "no such device"})
     await page.wait_for_function("() => document.querySelector('#fault-lidar').value === 'none'")
-    assert "no such device" in await page.inner_text("#refusal")
+    await expect(page.locator("#refusal")).to_contain_text("no such device")
     await say(page, {"kind": "answer", "id": asked[1]["id"], "ok": True})
     await page.click("#tab-drive")
 
@@ -522,12 +522,12 @@ async def an_emulated_robot_fails_and_gets_obstacles_by_hand(page: Page) -> None
 async def a_goal_says_what_the_gate_lets_it_do(page: Page) -> None:
     goal = {"number": 3, "phase": "driving", "remaining": 1.0, "goal": {"x": 1, "y": 0, "yaw": 0}, "text": ""}
     await say(page, {"kind": "goal", "m": goal}, gate_says(GateMode.DRIVING))
-    assert await page.inner_text("#goal-text") == "Goal 3: driving, 1.0 m to go"
+    await expect(page.locator("#goal-text")).to_have_text("Goal 3: driving, 1.0 m to go")
     await say(page, gate_says(GateMode.DISARMED))
-    assert await page.inner_text("#goal-text") == "Goal 3: waits, the robot is disarmed, 1.0 m to go"
+    await expect(page.locator("#goal-text")).to_have_text("Goal 3: waits, the robot is disarmed, 1.0 m to go")
     ended = goal | {"phase": "idle", "goal": None, "outcome": "estopped", "text": "emergency stop is latched"}
     await say(page, {"kind": "goal", "m": ended})
-    assert await page.inner_text("#goal-text") == "Goal 3 was ended by an emergency stop"
+    await expect(page.locator("#goal-text")).to_have_text("Goal 3 was ended by an emergency stop")
     await say(page, {"kind": "goal", "m": goal | {"number": 0, "phase": "idle", "goal": None}})
 
 
@@ -538,10 +538,10 @@ async def armed_at_rest_is_called_armed(page: Page) -> None:
     await say(page, gate_says(GateMode.DRIVING, twist=twist, **fields))
     await page.wait_for_selector("#authority[data-mode=driving]")
     await expect(page.locator("#mode-name")).to_have_text("Armed")
-    assert await page.inner_text("#holder-name") == "You have control"
+    await expect(page.locator("#holder-name")).to_have_text("You have control")
     await say(page, gate_says(GateMode.DRIVING, twist=twist | {"vx": 0.1}, **fields))
     await expect(page.locator("#mode-name")).to_have_text("Driving")
-    assert await page.inner_text("#holder-name") == "You drive"
+    await expect(page.locator("#holder-name")).to_have_text("You drive")
 
 
 async def a_hand_on_a_disarmed_robot_hears_arm_first(page: Page) -> None:
@@ -597,7 +597,7 @@ async def the_link_that_failed_is_named_with_its_age(page: Page) -> None:
         "() => /^Browser to station: lost for . s$/.test(document.querySelector('#chip-link').textContent)"
     )
     text = "This browser has had no connection to the station for"
-    assert text in await page.inner_text("#banners")
+    await expect(page.locator("#banners")).to_contain_text(text)
 
 
 async def why_the_robot_stands_is_in_the_panel_with_time_and_remedy(page: Page) -> None:
