@@ -1,5 +1,7 @@
 """Kinematics: the library against a straight-line numpy script of the same formulas, and a control tick's calls.
 
+    python benchmarks/kinematics.py
+
 Last line: one JSON object with the figures, the goals and whether all are met.
 """
 

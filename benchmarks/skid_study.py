@@ -1,5 +1,7 @@
 """The skid-steer study in worlds with a hidden truth: does the analysis of noisy poses find it?
 
+    python benchmarks/skid_study.py [--seeds 20] [--figures FOLDER] [--stand]
+
 For each seed the world draws turning centres, effective radii, unequal wheels, a slide of the circle's centre and a
 turn at each reversal; the daemon drives a circle and passes to and fro, open loop, and its log is analysed.
 ``--figures FOLDER`` drives the paper's seven circles and its line instead, and draws its figures 6 to 15. ``--stand``

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mkdocs.structure.files import File, Files, InclusionLevel
-from pages import commands, configuration, devices, figures, never_tried, reasons, symptoms, topics
+from pages import benchmarks, commands, configuration, devices, figures, never_tried, reasons, source, symptoms, topics
 from pages.markdown import Page, join
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -40,6 +40,7 @@ def on_config(config: Any) -> Any:
         *topics.pages(),
         *configuration.pages(),
         *figures.pages(),
+        benchmarks.page(),
         never_tried.page(texts),
         symptoms.page(),
         reasons.page(),
@@ -65,12 +66,12 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Turn links to files of the repository into links of the site."""
+    """Show the marked code, and turn links to files of the repository into links of the site."""
     if page.is_homepage:
         page.meta["hide"] = ["navigation"]
     if page.file.src_uri.startswith(UNSEARCHED):
         page.meta["search"] = {"exclude": True}
-    return _to_site(markdown, page.file.src_uri)
+    return source.shown(_to_site(markdown, page.file.src_uri))
 
 
 def _to_site(markdown: str, uri: str) -> str:

@@ -16,7 +16,6 @@ from tests.unit.docs.command_lines import (
     ROOT,
     SHORTENED,
     Line,
-    commands_of,
     inline,
     is_ours,
     lines,
@@ -112,21 +111,8 @@ def test_what_the_head_of_a_configuration_names_is_there(file: Path):
 
 def _look_up(text: str) -> None:
     words = text.split()[1:]
-    if words[0] == "--install-completion":
+    if words[0] in {"--install-completion", "--help"}:
         return
     command, rest = resolve([word for word in words if not word.endswith(">")] if "<" in text else words)
     options = {word.partition("=")[0] for word in rest if re.match(r"--?[a-z]", word)}
     assert options <= options_of(command), (text, options - options_of(command))
-
-
-def test_the_table_names_every_command_and_no_other():
-    table = (ROOT / "docs" / "command-line.md").read_text().partition("## All commands")[2].partition("\n## ")[0]
-    rows = re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
-    named: set[str] = set()
-    for call in re.findall(r"`([^`]+)`", " ".join(row.replace("\\|", "/") for row in rows)):
-        first, *rest = call.split()
-        named |= {f"{first} {word}" for word in rest[0].split("/")} if rest and "/" in rest[0] else {first}
-    all_names = {" ".join(name) for name in commands_of(app)} | {name[0] for name in commands_of(app)}
-    assert named <= all_names
-    missing = {" ".join(name) for name in commands_of(app) if not {name[0], " ".join(name)} & named}
-    assert not missing

@@ -1,6 +1,7 @@
 """The documentation site is built without a warning and asks nobody for anything."""
 
 import html.parser
+import json
 import os
 import re
 import subprocess
@@ -82,6 +83,12 @@ def test_every_device_command_and_topic_has_its_place(site: Path):
     for topic in TOPICS:
         text = (site / "topics" / f"{topic.group}.html").read_text()
         assert topic.key("&lt;robot&gt;") in text
+
+
+def test_every_benchmark_with_figures_is_described(site: Path):
+    text = (site / "benchmark-runs.html").read_text()
+    commands = [json.loads(file.read_text())["command"] for file in (ROOT / "docs" / "figures").glob("*.json")]
+    assert [command for command in commands if f'id="{Path(command.split()[1]).stem}"' not in text] == []
 
 
 def test_what_was_never_tried_is_gathered_and_code_is_shown(site: Path):
