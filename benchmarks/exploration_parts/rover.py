@@ -19,7 +19,7 @@ from monstertruck_kinematics.se2 import Pose2, placed, points_relative
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.explore.config import AuthorConfig, ExplorerConfig
 from monstertruck_planners.explore.exchange import ExploreSetup, ExploreTask, Viewpoint
-from monstertruck_planners.explore.exploration import LEFT, REMEMBERED, STUCK, TRAIL, Attempts
+from monstertruck_planners.explore.exploration import STUCK, TRAIL, Attempts
 from monstertruck_planners.explore.explore_step import ExploringStep
 from monstertruck_planners.goals.config import PlannerConfig
 from monstertruck_planners.goals.exchange import PlanTask, Setup
@@ -28,6 +28,9 @@ from monstertruck_planners.goals.plan_step import PlanningStep
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_schemas.state import Grid
+
+REMEMBERED = 8
+LEFT = 0.3
 
 SPACING, TURN, DECIDE, AHEAD, SCANS = 0.1, 0.1, 0.4, 1.0, 3
 EFFORTS = 3000, 60_000

@@ -21,10 +21,16 @@ from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.track.config import MpcConfig
 from monstertruck_planners.track.error_model import LEAST_LAG
 from monstertruck_planners.track.lqr import GainTable
-from monstertruck_planners.track.mpc import APPROACH, FINE, GENTLE, MOST_PERIODS, Mpc
+from monstertruck_planners.track.mpc import Mpc
 from monstertruck_planners.track.path_tracker import Angles, PathTracker, TrackingState
 from navigation_parts import Options, Part
 from navigation_parts.tracking import built_in, drive, from_data
+
+GENTLE = 1e-6
+APPROACH = 0.3
+
+FINE = 0.05
+MOST_PERIODS = 30
 
 SPEEDS, AXLES = (0.5, 1.0), ("ideal", "lag")
 ROUNDS = 5

@@ -3,15 +3,10 @@
 import asyncio
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, cast
+from typing import cast
 
 from monstertruck_drivers.link import STREAM_LIMIT, Link
 from monstertruck_runtime.errors import DeviceLostError
-
-GRACE: Final = 1.0
-"""Time in which a program must end after SIGTERM (s)."""
-LAST_WORDS: Final = 400
-"""Bytes of its error output that are kept."""
 
 
 class CommandPort:
@@ -62,7 +57,7 @@ class _ProgramOutput(asyncio.SubprocessProtocol):
         if fd == 1:
             self.link.feed(data)
         else:
-            self._said = (self._said + data)[-LAST_WORDS:]
+            self._said = (self._said + data)[-400:]  # bytes
 
     def process_exited(self) -> None:
         """It ended by itself, or after SIGTERM."""
@@ -72,4 +67,4 @@ class _ProgramOutput(asyncio.SubprocessProtocol):
 
     def _end(self) -> None:
         self._program.terminate()
-        asyncio.get_running_loop().call_later(GRACE, self._program.close)
+        asyncio.get_running_loop().call_later(1.0, self._program.close)  # s to end after SIGTERM

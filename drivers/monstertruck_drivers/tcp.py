@@ -11,8 +11,6 @@ from monstertruck_runtime.errors import DeviceLostError
 
 CONNECT_TIMEOUT: Final = 2.0
 """Seconds within which a device must accept the connection."""
-MAX_AGE: Final = 0.5
-"""Age at which unacknowledged bytes end the connection (s): more than two retransmissions on a local network."""
 
 
 def parse_address(text: str) -> tuple[str, int] | None:
@@ -66,7 +64,8 @@ class _TcpProtocol(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Connected."""
         line: socket.socket = transport.get_extra_info("socket")
-        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(MAX_AGE * 1000))
+        # Age at which unacknowledged bytes end the connection (s): more than two retransmissions on a local network.
+        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(0.5 * 1000))
         stream = cast("asyncio.Transport", transport)
         self.link = Link(self._name, stream.write, stream.abort, limit=STREAM_LIMIT)
 

@@ -41,8 +41,6 @@ REQUEST_QUEUE: Final = 64
 """Requests of one topic that may wait for the loop."""
 
 
-MAX_OWNERS: Final = 64
-"""Owners whose rates are known; the least recent one is dropped for a new one."""
 TOGETHER: Final = 5.0
 """Ratio of the rate of all owners together to the rate of one owner: without certificates names can be invented."""
 
@@ -69,13 +67,6 @@ fits, and the map of a building: at the edges of its rooms a cell takes about on
 
 ORDER_RATE: Final = 5.0
 """Orders a second of one owner, those that stop not counted."""
-
-STOP_RATE: Final = 50.0
-"""Orders a second of one owner that stop and are taken at once; of further ones only the latest follows."""
-REPEAT: Final = 0.02
-"""Delay of that latest order, s."""
-MAX_REPEATS: Final = 8
-"""Owners of whom it does; one more replaces the one heard least recently, for others are stopping the truck then."""
 
 
 @dataclass(slots=True)
@@ -117,7 +108,8 @@ class OwnerRates:
         with self._lock:
             now = self._clock.now()
             budget = self._budgets.pop(owner, None) or _Budget(self._rate, now)
-            if len(self._budgets) >= MAX_OWNERS:
+            # The least recent owner gives way to a new one.
+            if len(self._budgets) >= 64:
                 del self._budgets[next(iter(self._budgets))]
             self._budgets[owner] = budget
             return budget.spend(now, self._rate) and self._together.spend(now, self._rate * TOGETHER)
@@ -188,12 +180,14 @@ class Repeats:
         with self._lock:
             first = not self._newest
             self._newest.pop(owner, None)
-            if len(self._newest) >= MAX_REPEATS:
+            # The owner heard least recently gives way: others are stopping the truck then.
+            if len(self._newest) >= 8:
                 del self._newest[next(iter(self._newest))]
             self._newest[owner] = order
         if first:
             with suppress(RuntimeError):  # the loop was closed meanwhile
-                self._loop.call_soon_threadsafe(self._loop.call_later, REPEAT, self._deliver_all)
+                # s; of further orders only the latest follows.
+                self._loop.call_soon_threadsafe(self._loop.call_later, 0.02, self._deliver_all)
 
     def _deliver_all(self) -> None:
         with self._lock:
@@ -229,7 +223,8 @@ class Intake:
         self._limit = LIMITS.get(topic.name, Limit())
         self._rates = None if self._limit.rate is None else OwnerRates(self._limit.rate, clock)
         self._order_rates = OwnerRates(ORDER_RATE, clock)
-        self._stop_rates = {order: OwnerRates(STOP_RATE, clock) for order in UNCONDITIONAL}
+        # Orders a second of one owner that stop and are taken at once; of further ones only the latest follows.
+        self._stop_rates = {order: OwnerRates(50.0, clock) for order in UNCONDITIONAL}
         self._refusals = Refusals(bus, clock, reporter)
 
         def deliver(request: Message) -> None:

@@ -38,8 +38,6 @@ from monstertruckd.gate.visibility import Sectors, Visibility
 _Steps = tuple[int, int, int]
 """A unit twist in steps of ``TWIST_STEP``."""
 
-POSES: Final = 20
-"""Minimum number of poses along the swept path; more if a corner moves faster than the base."""
 
 TWIST_STEP: Final = 0.005
 """Rounding of unit twists before the sweep, m/m and rad/m: most sweeps are cached; the error at the end is 2 mm."""
@@ -238,7 +236,8 @@ class ObstacleGuard:
     def _swept(self, x: int, y: int, turn: int) -> _Sweep:
         """Sweep a twist in steps of ``TWIST_STEP``; between two poses corners move no further than the base."""
         twist = (x * TWIST_STEP, y * TWIST_STEP, turn * TWIST_STEP)
-        distances = np.linspace(0.0, self._reach, math.ceil(POSES * max(self._footprint.corner_speed(twist), 1.0)))
+        # Minimum number of poses along the swept path; more if a corner moves faster than the base.
+        distances = np.linspace(0.0, self._reach, math.ceil(20 * max(self._footprint.corner_speed(twist), 1.0)))
         poses = swept_poses(twist, distances)
         ground = ground_ahead(self._footprint, self._outline, poses[::GROUND_STEP])
         before = np.repeat(distances[::GROUND_STEP][:-1], ground.shape[1])

@@ -26,8 +26,6 @@ STANDING: Final = 0.001
 MAP_SIZE: Final = 64
 MAP_CELL: Final = 0.05
 """Cells along each side of a survey, and cell size, m: the ground a truck covers in reverse until it has seen more."""
-ELSEWHERE: Final = 0.3
-"""Fraction of the beams with a range that must change to show that the robot was carried; passers-by change fewer."""
 
 
 class Beams(NamedTuple):
@@ -295,7 +293,8 @@ def elsewhere(before: LaserScan, now: LaserScan) -> bool:
     compared = known[0] & known[1] & (measured[0] | measured[1])
     changed = 0.1  # minimum change of a beam between two scans that is neither noise nor rounding, m
     differ = compared & (np.abs(first - second) > changed)
-    return bool(np.count_nonzero(differ) > ELSEWHERE * np.count_nonzero(compared))
+    # Fraction of the beams with a range that must change to show that the robot was carried; passers-by change fewer.
+    return bool(np.count_nonzero(differ) > 0.3 * np.count_nonzero(compared))
 
 
 def _towards(like: LaserScan, scan: LaserScan) -> LaserScan:

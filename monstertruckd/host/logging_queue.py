@@ -12,8 +12,6 @@ from collections.abc import Mapping
 from copy import copy
 from typing import Final, TextIO
 
-LOG_QUEUE: Final = 1000
-"""Maximum number of records waiting for a stuck terminal or journal; further ones are lost and counted."""
 PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 """Syslog levels, which journald reads from the start of a line."""
 
@@ -63,7 +61,8 @@ class LossyQueueHandler(logging.handlers.QueueHandler):
     """Queue handler; counts records that do not fit instead of waiting or raising."""
 
     def __init__(self) -> None:
-        self.records: queue.Queue[logging.LogRecord | None] = queue.Queue(LOG_QUEUE)
+        # Maximum number of records waiting for a stuck terminal or journal; further ones are lost and counted.
+        self.records: queue.Queue[logging.LogRecord | None] = queue.Queue(1000)
         super().__init__(self.records)
         self.lost = 0
 

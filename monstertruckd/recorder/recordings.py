@@ -27,10 +27,6 @@ LIST: Final = "recordings"
 READ: Final = "recording_read"
 DELETE: Final = "recording_delete"
 
-DOWNLOAD_CHUNK: Final = 65_536
-"""Maximum data per answer (bytes)."""
-DOWNLOAD_RATE: Final = 1_000_000.0
-"""Maximum total download rate (bytes/s)."""
 TURN: Final = 5.0
 """Time without a chunk until another source may download (s)."""
 NAME: Final = re.compile(r"[A-Za-z0-9_.-]{1,120}\.mcap(\.damaged(-\d{1,3})?)?")
@@ -132,14 +128,16 @@ class Recordings:
                 try:
                     with path.open("rb") as file:
                         file.seek(min(offset, row.bytes))  # empty beyond the end
-                        data = file.read(DOWNLOAD_CHUNK)
+                        # Maximum data per answer (bytes).
+                        data = file.read(65_536)
                 except OSError as error:
                     raise InputError(f"recording {row.name}: cannot be read: {error.strerror}") from error
                 return base64.b64encode(data).decode(), len(data), row.bytes
 
             text, size, whole = await self._offload(read)
             now = self._clock.now()
-            self._free = max(self._free, now) + round(size / DOWNLOAD_RATE * SECOND)
+            # Maximum total download rate (bytes/s).
+            self._free = max(self._free, now) + round(size / 1_000_000.0 * SECOND)
             self._until = now + round(TURN * SECOND) if offset + size < whole else now
         return {"data": text, "bytes": whole}
 

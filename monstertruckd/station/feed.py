@@ -32,12 +32,8 @@ M = TypeVar("M", bound=Message)
 
 FEED_PERIOD: Final = 0.05
 """Interval between checks for new messages (s)."""
-SAMPLING: Final = 0.09
-"""Interval between values of plots (s): every second check, for the checks come slightly early or late."""
 PING: Final = 1.0
 """Interval between measurements of the round trip to the robot (s)."""
-KEPT_EVENTS: Final = 200
-"""Maximum number of past events sent to a browser that starts to watch a robot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +142,8 @@ class RobotFeed:
         self._clock = clock
         self._viewers = Viewers()
         self._watched = asyncio.Event()
-        self._events: deque[str] = deque(maxlen=KEPT_EVENTS)
+        # Maximum number of past events sent to a browser that starts to watch a robot.
+        self._events: deque[str] = deque(maxlen=200)
         self._facts: str | None = None
         self._known = False
         """Whether ``_facts`` describe the running robot."""
@@ -277,7 +274,9 @@ class RobotFeed:
                     for event in events.drain():
                         self._take_event(event)
                     if now >= sampled:
-                        sampled = now + round(SAMPLING * SECOND)
+                        # Interval between values of plots (s): every second check, for the checks come slightly early
+                        # or late.
+                        sampled = now + round(0.09 * SECOND)
                         sampler.sample(self._viewers)
                     await self._clock.sleep(FEED_PERIOD)
             # The next browser starts with messages published then, not with stale ones.

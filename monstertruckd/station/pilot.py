@@ -60,12 +60,6 @@ from monstertruckd.station.viewer import Viewer
 
 LEASE: Final = 0.25
 """Validity of a heartbeat (s)."""
-LATEST: Final = 0.2
-"""Maximum delay of a heartbeat beyond the quickest ones (s); later ones are dropped."""
-OLDEST: Final = 1.5
-"""Maximum round trip of a heartbeat (s); slower ones are dropped, however slow the others were."""
-MEMORY: Final = 200
-"""Number of latest heartbeats to find the quickest among."""
 MOST_ASKED: Final = 16
 """Maximum number of pending commands of one browser."""
 SHORTEST: Final = 0.3
@@ -82,7 +76,8 @@ class DelayWatch:
     """
 
     def __init__(self) -> None:
-        self._ways: deque[float] = deque(maxlen=MEMORY)
+        # Number of latest heartbeats to find the quickest among.
+        self._ways: deque[float] = deque(maxlen=200)
 
     def late(self, heard: float, since: float, now: float) -> float | None:
         """Return the lateness of a heartbeat, or None if it is on time.
@@ -92,7 +87,8 @@ class DelayWatch:
         way = now - heard - max(since, 0.0)
         self._ways.append(way)
         late = way - min(self._ways)
-        return way if way > OLDEST else late if late > LATEST else None
+        # A round trip of 1.5 s is too long however slow the others were; 0.2 s beyond the quickest is late.
+        return way if way > 1.5 else late if late > 0.2 else None
 
 
 class Pilot:

@@ -9,8 +9,6 @@ COUNTING_WINDOW: Final = 60.0
 """Time over which lines are counted (s)."""
 BURST: Final = 20
 """Maximum number of lines per address in that time; further lines are counted, and reported at its end."""
-MOST_PEERS: Final = 32
-"""Maximum number of addresses counted separately in that time; all others share one count."""
 OTHERS: Final = "other addresses"
 LONGEST_LINE: Final = 300
 """Maximum length of a line (characters)."""
@@ -37,7 +35,8 @@ class Remarks:
     def add(self, peer: str | None, text: str, level: int = logging.WARNING) -> None:
         """Write ``text``, unless ``peer`` has already caused many lines."""
         known = peer or "?"
-        if known not in self._counts and len(self._counts) >= MOST_PEERS:
+        # Maximum number of addresses counted separately in that time; all others share one count.
+        if known not in self._counts and len(self._counts) >= 32:
             known = OTHERS
         self._counts[known] += 1
         if self._counts[known] <= BURST:

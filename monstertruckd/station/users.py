@@ -31,8 +31,6 @@ log = logging.getLogger(__name__)
 COST: Final = {"n": 2**14, "r": 8, "p": 1}
 """Parameters of scrypt: 16 MB and about 50 ms per attempt."""
 LENGTH: Final = 32
-MOST_ATTEMPTS: Final = 16
-"""Maximum number of waiting attempts of one address; further attempts fail at once."""
 HASH: Final = re.compile(rf"[0-9a-f]{{{2 * LENGTH}}}:[0-9a-f]{{{2 * LENGTH}}}")
 NO_HASH: Final = ":".join(("00" * LENGTH,) * 2)
 """Hash compared for unknown names, so that they take as long as known names."""
@@ -122,7 +120,8 @@ class StationUsers:
             name, password = credentials
             role, kept = self._rows.get(name, (AccessRole.OBSERVER, NO_HASH))
             user, network = StationUser(name, role, kept), network_of(address)
-            if self._turns.get(network, (None, 0))[1] >= MOST_ATTEMPTS:
+            # Maximum number of waiting attempts of one address; further attempts fail at once.
+            if self._turns.get(network, (None, 0))[1] >= 16:
                 return None
             async with self._turn(network):
                 async with self._hashing:

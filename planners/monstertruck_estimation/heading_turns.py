@@ -7,12 +7,9 @@ the wheels or of an inertial measurement unit.
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from monstertruck_estimation.transforms import wrap_angle
-
-LONGEST_TURN: Final = 3.0
-"""Distance within which it has to turn that much, m: a drift of the wheels over a long distance does not count."""
 
 
 class _Row(NamedTuple):
@@ -73,9 +70,8 @@ class HeadingTurns:
         rows.append(_Row(self._turn, self._distance, self._heading, self._correction))
         # turn of the robot over which the headings are compared, rad: several times the error that iron nearby causes
         proof = 0.25
-        while self._distance - rows[0].distance > LONGEST_TURN or (
-            len(rows) > 2 and abs(self._turn - rows[1].turn) >= proof
-        ):
+        # Within 3 m: a drift of the wheels over a long distance does not count.
+        while self._distance - rows[0].distance > 3.0 or (len(rows) > 2 and abs(self._turn - rows[1].turn) >= proof):
             rows.popleft()
         first, before = rows[0], self.contrary
         turn, heading = self._turn - first.turn, self._heading - first.heading

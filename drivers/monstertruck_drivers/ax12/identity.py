@@ -10,7 +10,6 @@ from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, Wrong
 
 IDS = range(1, 7)
 """Unit numbers to ping: the numbers on the robot's bus."""
-STORED = 19
 
 
 async def identify(link: Link, clock: Clock, settings: Ax12Config) -> dict[str, object]:
@@ -43,7 +42,7 @@ async def _describe(session: Ax12Session, unit: int) -> dict[str, object] | None
         return None
     known: dict[str, object] = {"id": unit, "errors": alarm_names(error)}
     try:
-        stored = (await session.read(unit, p.MODEL_NUMBER, STORED)).data
+        stored = (await session.read(unit, p.MODEL_NUMBER, 19)).data
         settings = (await session.read(unit, p.TORQUE_ENABLE, 12)).data
         present = Present.decode((await session.read(unit, p.PRESENT_POSITION, p.PRESENT_SIZE)).data)
     except (DeviceTimeoutError, ProtocolError) as failure:

@@ -39,8 +39,6 @@ QUIET = 0.55
 QUICK_ANSWER = 0.05
 """Maximum duration of the latest exchanges on a quick line (s): a byte that has not arrived by then is lost, not
 late."""
-HELD_BACK = 0.01
-"""Time within which bytes held back by an adapter or this host arrive (s)."""
 RECENT = 32
 """Exchanges whose duration is judged."""
 STRAY_LIMIT = 3
@@ -248,7 +246,8 @@ class Exchanger:
         if self._frame_timeout is None or self._failures >= BRIEF_SILENCES or may_come:
             self._silence, last = QUIET, self._clock.now()
         else:
-            rest = max(self.durations) / SECOND + HELD_BACK if quick else QUICK_ANSWER
+            # Time within which bytes held back by an adapter or this host arrive (s).
+            rest = max(self.durations) / SECOND + 0.01 if quick else QUICK_ANSWER
             self._silence = self._frame_timeout + rest
         self.quiet_until = last + round(self._silence * SECOND)
 

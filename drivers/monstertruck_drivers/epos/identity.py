@@ -10,8 +10,6 @@ from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError, WrongDeviceError
 
-SAMPLES = 5
-
 
 async def identify(link: Link, clock: Clock, settings: EposConfig) -> dict[str, Any]:
     """Handshake, identity, state, fault history and first samples; only reads.
@@ -46,7 +44,7 @@ async def _report(line: Exchanger, clock: Clock) -> dict[str, Any]:
     count = min(await line.read(od.ERROR_COUNT, ATTEMPTS), od.HISTORY_SIZE)
     history = [await line.read(entry, ATTEMPTS) & 0xFFFF for entry in od.ERROR_HISTORY[:count]]
     samples = []
-    for _ in range(SAMPLES):
+    for _ in range(5):
         samples.append(
             {
                 "position_counts": await line.read(od.POSITION, ATTEMPTS),

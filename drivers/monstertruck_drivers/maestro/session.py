@@ -1,20 +1,11 @@
 """Requests and replies, with a Maestro over one open link; shared by the driver and `identify`."""
 
-from typing import Final
-
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
 from monstertruck_drivers.maestro.protocol import CHANNELS, ERROR_MASK, POSITION_MAX, Encoder, error_names, words
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError, WrongDeviceError
-
-IDENTIFY_ATTEMPTS: Final = 3
-"""Tries to identify: another program may be talking into a freshly plugged port."""
-QUIET_AFTER_ANSWER: Final = 0.02
-"""Silence that ends an answer (s); a Maestro sends nothing without a request."""
-RESYNC_TRIES: Final = 4
-"""Tries to come into step with the answers again, at one time."""
 
 
 class MaestroSession:
@@ -69,7 +60,8 @@ class MaestroSession:
             DeviceTimeoutError: it does not come, or more than it does.
         """
         self._in_step = False
-        for _ in range(RESYNC_TRIES):
+        # Tries to come into step with the answers again, at one time.
+        for _ in range(4):
             if await self._speaks():
                 continue
             self._link.write(self.encode.get_position(0))
@@ -94,7 +86,8 @@ class MaestroSession:
             WrongDeviceError: bytes came that no Maestro sends.
         """
         heard = False
-        for _ in range(IDENTIFY_ATTEMPTS):
+        # Tries to identify: another program may be talking into a freshly plugged port.
+        for _ in range(3):
             heard |= await self._speaks()
             try:
                 *positions, errors = await self.ask(
@@ -120,7 +113,8 @@ class MaestroSession:
     async def _speaks(self) -> bool:
         """Whether unrequested bytes come; they are dropped."""
         try:
-            async with self._clock.deadline(QUIET_AFTER_ANSWER):
+            # Silence that ends an answer (s); a Maestro sends nothing without a request.
+            async with self._clock.deadline(0.02):
                 return bool(await self._link.read())
         except TimeoutError:
             return False

@@ -16,8 +16,6 @@ LISTEN: Final = 1.2
 """Seconds to receive a sentence of a streaming unit; also longer than it pauses after a setting."""
 LEAVE: Final = b"\x1b\r"
 """ESC leaves a command; where there was none it begins one, which CR, being no key, leaves again."""
-SAMPLES: Final = 6
-"""Number of sentences used to determine rate and fields."""
 
 
 class Os4000Session:
@@ -35,7 +33,7 @@ class Os4000Session:
         self._link = link
         self._clock = clock
 
-    async def listen(self, seconds: float, count: int = SAMPLES) -> list[tuple[int, Sentence]]:
+    async def listen(self, seconds: float, count: int = 6) -> list[tuple[int, Sentence]]:
         """Collect sentences with their arrival times until ``count`` came or ``seconds`` passed."""
         heard: list[tuple[int, Sentence]] = []
         try:

@@ -1,18 +1,16 @@
 """Settings that all scanners with a turning head share."""
 
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from monstertruck_schemas.base import FrameId, Schema
 
-UNSTATED: Final = 4.0
-"""Sight of a scanner whose settings state none (m), as for a URG-04LX."""
-
 
 def sight(settings: Any) -> float:
     """Return a scanner's sight: the distance within which it surely sees any obstacle, by its data sheet (m)."""
-    stated: float = getattr(settings, "sight", UNSTATED)
+    # Sight of a scanner whose settings state none (m), as for a URG-04LX.
+    stated: float = getattr(settings, "sight", 4.0)
     return stated
 
 

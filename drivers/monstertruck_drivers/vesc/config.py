@@ -9,7 +9,6 @@ from monstertruck_drivers.battery.config import PackConfig
 from monstertruck_drivers.shafts import MotorLimits, SteeringOutputs
 from monstertruck_schemas.base import Schema
 
-MOTORS = 4
 Seconds = Annotated[float, Field(gt=0)]
 Position = Annotated[float, Field(ge=0, le=1)]
 RAD_S_PER_RPM = 2 * math.pi / 60
@@ -69,7 +68,7 @@ class VescConfig(Schema):
     """
 
     kind: Literal["vesc"] = "vesc"
-    motors: Annotated[tuple[VescMotorConfig, ...], Field(strict=False, min_length=1, max_length=MOTORS)] = (
+    motors: Annotated[tuple[VescMotorConfig, ...], Field(strict=False, min_length=1, max_length=4)] = (
         VescMotorConfig(),
     )
     pole_pairs: Annotated[int, Field(ge=1, le=50)] = 2

@@ -7,8 +7,6 @@ LIDAR, CURRENT, COMPASS, COMPASS_FIXED, SLIP, ANALOG, SONAR, IMU, IMU_FIXED, SKI
 )
 """Streams of a robot."""
 
-PEOPLE = 100
-"""Stream of the people in a world."""
 GROUND_STREAM = 101
 """Stream of its ground."""
 

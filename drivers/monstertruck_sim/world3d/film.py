@@ -16,8 +16,6 @@ from monstertruck_sim.world3d.plant import RigidPlant
 
 FRAME_RATE: Final = 8
 """Frames a second."""
-FILM_SIZE: Final = (480, 320)
-"""Pixels."""
 _BEHIND, _ASIDE, _ABOVE = 1.25, 0.7, 0.95
 """Place of the camera from the robot, m; it swings round behind a robot that turns."""
 _PLAIN: Final = Image.Dither.NONE
@@ -44,7 +42,7 @@ class Film:
         if not isinstance(world.plant, RigidPlant):
             raise InputError(f"{file}: only sim.world.engine mujoco can be filmed")
         self._world, self._clock, self._plant = world, clock, world.plant
-        self._renderer = WorldRenderer(world.plant.model, *FILM_SIZE)
+        self._renderer = WorldRenderer(world.plant.model, 480, 320)
         self._heading = world.plant.pose[2]
         self._pictures = MovingPicture(file, 1 / FRAME_RATE)
 

@@ -16,8 +16,6 @@ from monstertruck_schemas.state import Grid
 UNKNOWN, FREE, WALL, ROBOT = range(4)
 COLOURS: Final = ("grey15", "grey82", "grey35", "red")
 """Of the four kinds of cells, by their number."""
-OCCUPIED: Final = 50
-"""Value of a grid's cell from which on it is a wall."""
 ARROWS: Final = "→↗↑↖←↙↓↘"
 """Headings in steps of 45 degrees."""
 
@@ -59,7 +57,8 @@ def map_text(grid: Grid, pose: Pose2D | None, columns: int, rows: int) -> Text:
     kinds = np.full((grid.height, grid.width), UNKNOWN, dtype=np.uint8)
     cells = grid.cells.reshape(grid.height, grid.width)
     kinds[cells >= 0] = FREE
-    kinds[cells >= OCCUPIED] = WALL
+    # Value of a grid's cell from which on it is a wall.
+    kinds[cells >= 50] = WALL
     known = np.argwhere(kinds)
     if not len(known):
         return Text("")

@@ -12,11 +12,6 @@ from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.logs.summary import info
 from monstertruckd.tools.simulation.operator import Lap
 
-LATE = 0.02
-"""Minimum lateness of a busy computer, s: one control tick."""
-GOAL_CLOSING = 0.3
-"""Maximum true closing error of the lap, m."""
-
 
 def log_figures(folder: Path) -> tuple[dict[str, int], int, tuple[Path, ...]]:
     """Messages by topic, bytes, and files of a run's folder."""
@@ -109,7 +104,8 @@ class Summary:
 
     def _busy_row(self) -> list[tuple[str, str]]:
         """Advice for a lap with stops on a busy computer; empty for others."""
-        if not (self.lap.stops and self.lateness_p99 > LATE):
+        # Minimum lateness of a busy computer, s: one control tick.
+        if not (self.lap.stops and self.lateness_p99 > 0.02):
             return []
         return [
             ("busy computer", f"ticks came {self.lateness_p99 * 1e3:.0f} ms late: end other programs, or use --fast")
@@ -118,7 +114,8 @@ class Summary:
     def _closing_row(self) -> list[tuple[str, str]]:
         if not self.closed:
             return []
-        return [("true closing error", f"{self.closing_error * 100:.1f} cm (goal {GOAL_CLOSING * 100:.0f} cm)")]
+        # Maximum true closing error of the lap, m.
+        return [("true closing error", f"{self.closing_error * 100:.1f} cm (goal {0.3 * 100:.0f} cm)")]
 
     def as_json(self) -> dict[str, object]:
         """Everything as plain data."""

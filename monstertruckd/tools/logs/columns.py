@@ -14,8 +14,6 @@ from monstertruck_runtime.errors import InputError
 
 KEPT_BYTES: Final = 16_000_000
 """Approximate limit of values in memory (bytes)."""
-PLAIN: Final = 64
-"""Bytes of a value that is neither array nor text."""
 
 
 class Spool:
@@ -80,7 +78,8 @@ class Column:
     def add(self, value: Any) -> None:
         """Add one: an array, a number, None, or what text is made of."""
         self._count += 1
-        size = PLAIN
+        # Bytes of a value that is neither array nor text.
+        size = 64
         if isinstance(value, np.ndarray):
             self._numbers = False
             self._dtypes.add(value.dtype)

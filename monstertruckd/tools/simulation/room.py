@@ -9,8 +9,6 @@ from monstertruck_sim.world.obstacles import Box, Disc, penetration
 from monstertruck_sim.world.world import World
 
 WORDS: Final = "room post X Y (an upright post at a place of the world, m), room clear (remove all posts)"
-RADIUS: Final = 0.1
-"""Radius of a post, m."""
 MOST: Final = 50
 """Posts at one time: every one costs time in each scan."""
 
@@ -38,7 +36,8 @@ class EmulatedRoom:
         match words:
             case ["post", x, y]:
                 try:
-                    post = Disc(float(x), float(y), RADIUS)
+                    # Radius of a post, m.
+                    post = Disc(float(x), float(y), 0.1)
                 except ValueError:
                     raise InputError(f"expected {WORDS}") from None
                 if not (math.isfinite(post.x) and math.isfinite(post.y)):

@@ -9,8 +9,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-OVERSHOOTS: Final = 0.6
-"""Minimum overshoot, as a fraction of the first error."""
 CALM: Final = 0.5
 """Maximum overshoot of calm gains, as a fraction."""
 FIRST_D, RAISE_D = 0.5, 1.8
@@ -63,7 +61,8 @@ def recipe(k_p: float) -> Generator[WallGains, RunVerdict, WallGains | None]:
     gains, runs = WallGains(k_p, 0.0), 1
     verdict = yield gains
     raise_p = 1.5, 1.2  # factors of K_p, at first and again later
-    while verdict.overshoot < OVERSHOOTS and runs < MOST_RUNS and gains.k_p * raise_p[0] <= 60.0:  # k_p that is tried
+    # Minimum overshoot, as a fraction of the first error.
+    while verdict.overshoot < 0.6 and runs < MOST_RUNS and gains.k_p * raise_p[0] <= 60.0:  # k_p that is tried
         gains, runs = WallGains(gains.k_p * raise_p[0], 0.0), runs + 1
         verdict = yield gains
     best: tuple[float, WallGains] | None = None

@@ -9,8 +9,6 @@ import math
 from collections import deque
 from typing import Final
 
-LEAST_ROW: Final = 40
-"""Minimum number of equal values in a row that such noise does not produce."""
 NOISE_READINGS: Final = 20
 """Number of values over which the noise is measured."""
 
@@ -34,7 +32,8 @@ class RepeatDetector:
         enough = 0.6  # minimum standard deviation of the noise, in digits, for a value to be judged
         known = self._windows >= 2 and self._noise >= enough * self._digit  # the noise is known after two windows
         longer = 8  # factor on the longest earlier row: quantisation and filters produce rows, too
-        return known and self._row >= max(LEAST_ROW, longer * self._longest)
+        # Minimum number of equal values in a row that such noise does not produce.
+        return known and self._row >= max(40, longer * self._longest)
 
     @property
     def row(self) -> int:
@@ -60,10 +59,6 @@ class RepeatDetector:
             spread = math.sqrt(math.fsum((one - mean) ** 2 for one in self._still) / NOISE_READINGS)
             self._noise, self._windows = min(self._noise, spread), self._windows + 1
             self._still.clear()
-
-
-MOVED: Final = 0.15
-"""Minimum motion (m or rad) that rules out repeats by chance, even without noise."""
 
 
 class WholeRepeats:
@@ -98,7 +93,8 @@ class WholeRepeats:
         self._different = 0
         self._moved += moved
         equal = 3  # equal ones in a row that are then no coincidence
-        self.frozen |= self._row >= equal and (self._noisy or self._moved >= MOVED)
+        # Minimum motion (m or rad) that rules out repeats by chance, even without noise.
+        self.frozen |= self._row >= equal and (self._noisy or self._moved >= 0.15)
 
     def pause(self) -> None:
         """Start a new row: the next one does not follow the last, or has too little content to be compared."""

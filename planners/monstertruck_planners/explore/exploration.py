@@ -19,24 +19,14 @@ from monstertruck_schemas.reasons import Reason
 
 MAPPING_TIME: Final = 1.5
 """Time after a goal until the map contains the view from there (s)."""
-CONFIRM: Final = 2
-"""Number of consecutive evaluations without a frontier that end the exploration."""
-RETURNS: Final = 6
-"""Maximum number of attempts to drive home."""
 NEAR_START: Final = 1.0
 """Maximum distance of a robot that is back at a blocked start, for example at a wall (m)."""
 AGAIN: Final = 2.0
 """Delay from a refused goal to the next (s); doubled after each failure while driving home."""
-STANDS: Final = 5.0
-"""Waiting time of a lost robot before it drives a short distance (s)."""
 STUCK: Final = 3
 """Number of consecutive failed goals at one place until the robot drives back out of it."""
-LEFT: Final = 0.3
-"""Minimum distance of a robot that has left that place (m)."""
 TRAIL: Final = 0.5
 """Distance between the poses kept for driving back (m)."""
-REMEMBERED: Final = 8
-"""Number of poses kept for driving back."""
 PASSING: Final = frozenset({Reason.PLANNER_STARTING, Reason.NO_MAP, Reason.LEASE_EXPIRED})
 """Goal outcomes that do not depend on the place."""
 BROKEN: Final = frozenset({Reason.WORKER_DIED, Reason.WORKER_TIMEOUT})
@@ -306,7 +296,7 @@ def _moved(run: Exploration, seen: Observed) -> Exploration:
     charge = seen.charge if run.charge is None else run.charge
     trail = run.trail
     if seen.pose is not None and (not trail or math.dist(trail[-1][:2], seen.pose[:2]) >= TRAIL) and not run.backing:
-        trail = (*trail, seen.pose)[-REMEMBERED:]
+        trail = (*trail, seen.pose)[-8:]
     return replace(
         run, before=seen.pose, counted=counted, travelled=run.travelled + distance, charge=charge, trail=trail,
         near_home=_near_home(run, seen.pose),
@@ -366,7 +356,8 @@ def _looking(run: Exploration, seen: Observed) -> Step:
         if run.now - run.since > 30.0:  # timeout (s) for a first map
             return _finish(run, answer.failure or Reason.NO_MAP, answer.text or "no map to explore")
         return replace(run, not_before=run.now + 1.0), ()
-    if run.nothing + 1 < CONFIRM:
+    # Two consecutive evaluations without a frontier end the exploration.
+    if run.nothing + 1 < 2:
         return replace(run, nothing=run.nothing + 1, not_before=run.now + MAPPING_TIME), ()
     attempts, unreached = run.attempts.released(run.now), run.unreached.released(run.now)
     if attempts is not None or unreached is not None:
@@ -424,7 +415,7 @@ def _counted(run: Exploration, seen: Observed, *, reached: bool) -> Exploration:
     if reached:
         return replace(run, stuck=0)
     assert seen.pose is not None
-    here = run.stuck_at is not None and math.dist(run.stuck_at[:2], seen.pose[:2]) < LEFT
+    here = run.stuck_at is not None and math.dist(run.stuck_at[:2], seen.pose[:2]) < 0.3
     if here and run.stuck > 0:
         return replace(run, stuck=run.stuck + 1)
     return replace(run, stuck=1, stuck_at=seen.pose, blameless=(run.attempts, run.unreached))
@@ -476,7 +467,8 @@ def _lost(run: Exploration, seen: Observed, config: ExplorerConfig) -> Step:
             return run, ()
         back = seen.ended is Reason.GOAL_REACHED and not run.goes_back
         return replace(run, target=None, goes_back=back, not_before=run.now + AGAIN), ()
-    if not config.around or seen.believed is None or run.now < max(run.since + STANDS, run.not_before):
+    # A lost robot waits 5 s before it drives a short distance.
+    if not config.around or seen.believed is None or run.now < max(run.since + 5.0, run.not_before):
         return run, ()
     if run.goes_back and run.came_from is not None:
         return replace(run, target=Viewpoint(run.came_from, run.came_from[:2])), (Go(run.came_from),)
@@ -511,7 +503,7 @@ def _returning(run: Exploration, seen: Observed) -> Step:
             if math.dist(seen.pose[:2], run.home[:2]) <= NEAR_START:
                 return _back_home(run, seen.pose)
             run = replace(run, blocked=run.blocked + 1)
-        if seen.ended in HOPELESS or seen.ended is Reason.CANCELLED or run.home_goals >= RETURNS:
+        if seen.ended in HOPELESS or seen.ended is Reason.CANCELLED or run.home_goals >= 6:
             text = f"{run.final_text}; not back at the start: {seen.ended_text or seen.ended.text}"
             return _end(run, seen.ended, text, Save())
         return replace(run, target=None, not_before=run.now + AGAIN * 2 ** (run.home_goals - 1)), ()

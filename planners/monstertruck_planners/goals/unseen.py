@@ -20,10 +20,6 @@ from monstertruck_planners.pose_path import PosePath
 
 SOON: Final = 5.0
 """Assumed time until a route begins (s)."""
-PACE: Final = 0.1
-"""Mean speed along a route (m/s), used to estimate its time of arrival at a place."""
-SHOWN: Final = 0.6
-"""Fraction of the ground that must be visible from a viewpoint."""
 BESIDE: Final = 0.03
 """Ground within this distance of the body is treated as under it (m), as in the gate."""
 
@@ -71,7 +67,8 @@ class Unseen:
         on_path = zip(path.poses[: last + 1], path.directions, travelled, changed, strict=False)
         for pose, direction, along, change in on_path:
             gaps = rectangle_distance(self.footprint, pose[None], places)[0]
-            unseen = left < SOON + along / PACE
+            # Mean speed along a route (m/s), used to estimate its time of arrival at a place.
+            unseen = left < SOON + along / 0.1
             if direction < 0 and (unseen & (gaps < -self.footprint.padding)).any():
                 # 0.6: unseen ground within this distance (m) of the reverse motion is closed to the next route: one
                 # truck length, since a route next to it would not be better
@@ -100,7 +97,8 @@ class Unseen:
             [(x + r * math.cos(a), y + r * math.sin(a), yaw) for r in (0.7, 1.1, 1.5) for a in around for yaw in around]
         )
         poses = poses[obstacles.free(self.footprint, poses, margin)]
-        shown = [self._visible(places, pose, obstacles).mean() >= SHOWN for pose in poses]
+        # Fraction of the ground that must be visible from a viewpoint.
+        shown = [self._visible(places, pose, obstacles).mean() >= 0.6 for pose in poses]
         return np.asarray(poses[np.array(shown, np.bool_)])
 
     def _visible(self, places: Array, pose: Array, obstacles: DistanceField) -> NDArray[np.bool_]:

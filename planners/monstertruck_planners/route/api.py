@@ -15,7 +15,7 @@ from monstertruck_planners.collision import OCCUPIED, DiscFootprint, DistanceFie
 from monstertruck_planners.distance_kernels import Box
 from monstertruck_planners.route.catalog import ROUTE_PLANNERS
 from monstertruck_planners.route.config import DriveCosts, GoalConfig, Unknown
-from monstertruck_planners.route.heuristic import COARSE_CELL, CellRule, fill_cell_costs
+from monstertruck_planners.route.heuristic import CellRule, fill_cell_costs
 from monstertruck_planners.route.motion import MotionPath, moved
 from monstertruck_planners.route.reeds_shepp import ReedsShepp
 from monstertruck_planners.route.search import CostLayer
@@ -131,7 +131,8 @@ class RouteMap:
     @property
     def coarse_factor(self) -> int:
         """Cells of the grid per cell of the coarse one, each way."""
-        return max(round(COARSE_CELL / self.field.resolution), 1)
+        # Approximate maximum size of a coarse cell (m).
+        return max(round(0.1 / self.field.resolution), 1)
 
     @property
     def coarse_cell(self) -> float:

@@ -42,8 +42,6 @@ from monstertruck_schemas.reasons import Reason
 
 LEVEL: Final = 0.0005
 """Step for comparing clearances (m)."""
-SPARE_MARGIN: Final = 0.002
-"""Extra margin at the end of a departure (m): the first motion of a search may come a little nearer."""
 CHECK: Final = 0.004
 """Distance between two checked poses (m)."""
 BRANCH: Final = 0.2
@@ -214,7 +212,8 @@ def departures(
 
 def _wanted(margin: float) -> int:
     """Return the clearance at the end, in steps of LEVEL."""
-    return int(np.ceil((margin + CHECK_MARGIN + SPARE_MARGIN) / LEVEL))
+    # Extra margin at the end of a departure (m): the first motion of a search may come a little nearer.
+    return int(np.ceil((margin + CHECK_MARGIN + 0.002) / LEVEL))
 
 
 def _arcs(vehicle: Vehicle) -> list[Array]:

@@ -33,9 +33,6 @@ NEIGHBOURS = np.array([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -
 """Column and row of each neighbour, counter-clockwise."""
 
 
-COARSE_CELL = 0.1
-"""Approximate maximum size of a coarse cell (m)."""
-
 TABLE_REACH = 4.0
 """Half size of the Reeds-Shepp table, turning radii."""
 

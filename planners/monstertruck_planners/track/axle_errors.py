@@ -27,26 +27,13 @@ Angles = tuple[float, float]
 
 BASE: Final = 0.25
 """Minimum time between two compared poses (s): the noise of single poses hardly matters any more."""
-KEPT: Final = 32
-"""Maximum age of a late heading, in control steps."""
 FREEDOM: Final = 4.0
 """Degrees of freedom of Student's t for the residual weights."""
 BELIEVED: Final = 5.0
 """Weight of the assumed noise, in intervals."""
 FADE: Final = 1.0 - 1.0 / 150.0
 """Fraction of the residual sums that remains after each interval."""
-FORGET: Final = 200.0
-"""Distance that reduces the weight of older knowledge to a third (m): parts wear."""
-NOISE: Final = (0.003, 0.002)
-"""Standard deviation of a turn (rad) and of a sideways motion (m) before any comparison."""
 
-GAIN: Final = 0.15
-"""Standard deviation of the gain of an undriven truck: the spread of hobby servos in pulse per angle."""
-TOOTH: Final = 0.047
-"""Standard deviation of the trim, rad: a servo horn put on up to half of a tooth of 25 off, uniformly, at 0.64 rad of
-the axle per rad of the servo."""
-COMPLIANCE: Final = 0.03
-"""Standard deviation of the compliance, rad s^2/m: rubber tyres under a light truck."""
 DEAD_BAND: Final = 0.0012
 """Standard deviation of the servo's stop position (rad of the axle): a dead band of 2 us to either side, uniformly."""
 
@@ -150,7 +137,10 @@ class AxleErrorEstimator:
     def __init__(self, geometry: FourWheelSteering, freedom: Freedom | None = "both") -> None:
         self._geometry = geometry
         self.state: Array = np.zeros(6)
-        alone = np.diag(np.square((GAIN, TOOTH, COMPLIANCE)))
+        # Standard deviations of an undriven truck: of the gain, the spread of hobby servos in pulse per angle; of the
+        # trim (rad), a servo horn put on up to half of a tooth of 25 off, uniformly, at 0.64 rad of the axle per rad of
+        # the servo; of the compliance (rad s^2/m), rubber tyres under a light truck.
+        alone = np.diag(np.square((0.15, 0.047, 0.03)))
         self._prior: Array = sum((np.kron(np.outer(e, e), alone) for e in INDEPENDENT[freedom]), np.zeros((6, 6)))
         self.covariance: Array = self._prior.copy()
         self.errors = AxleErrors()
@@ -163,7 +153,8 @@ class AxleErrorEstimator:
 
     def restart(self) -> None:
         """Begin a new interval, because the axles do not match the requests or were recomputed."""
-        self._sums: deque[_Sums] = deque(maxlen=KEPT)
+        # Maximum age of a late heading, in control steps.
+        self._sums: deque[_Sums] = deque(maxlen=32)
         self._begin: _Mark | None = None
 
     def observe(self, motion: AxleMotion, delay_deviation: float) -> bool:
@@ -260,7 +251,8 @@ class AxleErrorEstimator:
 
     def _forget(self, way: float) -> None:
         """Let the covariance grow back towards the prior."""
-        keep = math.exp(-way / FORGET)
+        # Distance that reduces the weight of older knowledge to a third (m): parts wear.
+        keep = math.exp(-way / 200.0)
         self.covariance = keep * self.covariance + (1.0 - keep) * self._prior
         self.metres += way
         self.samples += 1
@@ -269,7 +261,8 @@ class AxleErrorEstimator:
         """Add one measurement: turn (0) or sideways motion (1); ``known`` is the variance of modelled effects."""
         by = row[1:]
         residual = measured - float(row[0] + by @ self.state)
-        noise = (self._squares[kind] + BELIEVED * NOISE[kind] ** 2) / (self._counts[kind] + BELIEVED) + known
+        # Standard deviation of a turn (rad) and of a sideways motion (m) before any comparison.
+        noise = (self._squares[kind] + BELIEVED * (0.003, 0.002)[kind] ** 2) / (self._counts[kind] + BELIEVED) + known
         spread = self.covariance @ by
         predicted = float(by @ spread)
         weight = (FREEDOM + 1.0) / (FREEDOM + residual**2 / (predicted + noise))

@@ -14,11 +14,6 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.track.axle_errors import AxleErrorEstimator
 from monstertruck_schemas.plan import AxleDeviation
 
-SURE: Final = 4.0
-"""Threshold of a reported difference, in standard deviations: the difference is then known to a quarter."""
-CALIBRATED: Final = (0.025 / 1.96, math.radians(0.5) * 0.64 / 1.96)
-"""Standard deviations of gain and trim (rad) of a calibrated axle: `calibrate steering` aims at intervals (95 %) of
-2.5 % for the scale and half a degree of the servo for the centre; the axle turns 0.64 times as far."""
 NAMES: Final[tuple[Literal["front", "rear"], ...]] = ("front", "rear")
 
 TURN: Final = np.array(((0.5, 0, 0, 0.5, 0, 0), (0, 1.0, 0, 0, -1.0, 0), (0, 0, 0.5, 0, 0, 0.5)))
@@ -37,7 +32,8 @@ class _Estimate(NamedTuple):
     @property
     def sure(self) -> bool:
         """Whether the value differs from 0 for certain."""
-        return abs(self.value) > SURE * self.deviation
+        # Threshold of a reported difference, in standard deviations: the difference is then known to a quarter.
+        return abs(self.value) > 4.0 * self.deviation
 
     @property
     def gone(self) -> bool:
@@ -136,7 +132,9 @@ def _finding(name: Name, rows: Array, state: Array, covariance: Array, wheelbase
     # Lateral acceleration per rad that minimises the combined variance of gain and slip.
     grip = max(float(spread[0, 2] / spread[2, 2]), 0.0) if spread[2, 2] > 0.0 else 0.0
     both = float(spread[0, 0] - 2.0 * grip * spread[0, 2] + grip**2 * spread[2, 2])
-    gain, trim = CALIBRATED
+    # Standard deviations of gain and trim (rad) of a calibrated axle: `calibrate steering` aims at intervals (95 %)
+    # of 2.5 % for the scale and half a degree of the servo for the centre; the axle turns 0.64 times as far.
+    gain, trim = (0.025 / 1.96, math.radians(0.5) * 0.64 / 1.96)
     known = float(np.abs(rows[1]).sum())
     return _Finding(
         name,

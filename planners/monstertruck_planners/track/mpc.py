@@ -12,7 +12,6 @@ a step that meets limits takes hardly longer than one that meets none, and equal
 
 import math
 from dataclasses import dataclass
-from typing import Final
 
 import daqp
 import numpy as np
@@ -26,14 +25,6 @@ from monstertruck_planners.track.path_tracker import STEEPEST, Angles, PathTrack
 from monstertruck_planners.track.response import Response
 from monstertruck_planners.track.segments import ReferenceStates
 from monstertruck_schemas.plan import Steering
-
-MOST_PERIODS: Final = 30
-FINE: Final = 0.05
-"""Maximum integration step of the errors (s)."""
-APPROACH: Final = 0.3
-"""Limit of the distance from the path, as a fraction of the distance to be driven."""
-GENTLE: Final = 1e-6
-"""Weight that keeps inputs without effect unchanged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +68,9 @@ class Mpc(PathTracker[MpcConfig]):
 
     def __init__(self, config: MpcConfig, geometry: FourWheelSteering) -> None:
         super().__init__(config, geometry)
-        self._periods = min(max(math.ceil(config.preview * config.rate), 2), MOST_PERIODS)
-        per = max(math.ceil(self.period / FINE - 1e-9), 1)
+        self._periods = min(max(math.ceil(config.preview * config.rate), 2), 30)
+        # Maximum integration step of the errors (s).
+        per = max(math.ceil(self.period / 0.05 - 1e-9), 1)
         self._h = self.period / per
         self._fine = self._periods * per
         self._times = (np.arange(self._periods, dtype=np.float64) + 0.5) * self.period
@@ -169,7 +161,8 @@ class Mpc(PathTracker[MpcConfig]):
         self, state: TrackingState, reference: ReferenceStates, turn: Array, slip: Array, steps: Array
     ) -> Array:
         """Return the errors along the plan in the path's curved frame; ``steps``: lengths of the fine steps (m)."""
-        furthest = APPROACH * float(state.distances(self._times[-1:])[0] - state.s)
+        # Limit of the distance from the path, as a fraction of the distance to be driven.
+        furthest = 0.3 * float(state.distances(self._times[-1:])[0] - state.s)
         side, turned = min(max(state.lateral_error, -furthest), furthest), state.heading_error
         bend = state.run.direction * reference.curvature
         sides, yaws = [], []
@@ -229,7 +222,8 @@ class Solver:
         n = count * m
         self._change = np.eye(n) - np.eye(n, k=-m)
         weight = 1.0 / (period * config.rate_scale**2)
-        self._smooth = weight * self._change.T @ self._change + GENTLE * np.eye(n)
+        # Weight that keeps inputs without effect unchanged.
+        self._smooth = weight * self._change.T @ self._change + 1e-6 * np.eye(n)
         self._pull = weight
         self._m = m
         self._most = np.concatenate((np.full(n, config.angle), np.full(n, config.steering_rate * period)))

@@ -20,19 +20,15 @@ from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.state import GateMode
 from monstertruck_schemas.topics import ESTOP_WAY, EVENT, REQ_CONTROL, REQ_DRIVE, REQ_GOAL, REQ_PATH, Topic
 from monstertruckd.bus.access import EVERYTHING, OBSERVING, Grant, Sender
-from monstertruckd.bus.intake import (
-    LIMITS,
-    MAX_OWNERS,
-    MAX_REPEATS,
-    ORDER_RATE,
-    REPEAT,
-    REQUEST_QUEUE,
-    STOP_RATE,
-    Intake,
-    Refusals,
-)
+from monstertruckd.bus.intake import LIMITS, ORDER_RATE, REQUEST_QUEUE, Intake, Refusals
 from monstertruckd.bus.local import Bus
 from tests.unit.gate.rig import make_gate
+
+MAX_REPEATS = 8
+REPEAT = 0.02
+
+STOP_RATE = 50.0
+MAX_OWNERS = 64
 
 HEADER: dict[str, Any] = {
     "stamp": 1,

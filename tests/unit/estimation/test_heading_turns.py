@@ -4,7 +4,9 @@ import math
 
 import pytest
 
-from monstertruck_estimation.heading_turns import LONGEST_TURN, HeadingTurns
+from monstertruck_estimation.heading_turns import HeadingTurns
+
+LONGEST_TURN = 3.0
 
 
 def contradicted(share, turn=1.0, distance=1.0, start=3.0, steps=40):

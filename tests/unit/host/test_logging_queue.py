@@ -11,7 +11,6 @@ import pytest
 
 from monstertruckd.host import logging_queue
 from monstertruckd.host.logging_queue import (
-    LOG_QUEUE,
     LONGEST_RECORD,
     LossyQueueHandler,
     PlainFormatter,
@@ -20,6 +19,8 @@ from monstertruckd.host.logging_queue import (
     shown,
     start_logging,
 )
+
+LOG_QUEUE = 1000
 
 
 class StuckStream(io.StringIO):

@@ -11,9 +11,12 @@ from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.errors import BusyError, InputError, NotFoundError
 from monstertruck_runtime.threads import inline
 from monstertruckd.bus.rpc import Rpc
-from monstertruckd.recorder.recordings import DOWNLOAD_CHUNK, DOWNLOAD_RATE, TURN, Recordings
+from monstertruckd.recorder.recordings import TURN, Recordings
 from monstertruckd.recorder.repair import in_use
 from monstertruckd.station.recordings import fetch_recording
+
+DOWNLOAD_RATE = 1_000_000.0
+DOWNLOAD_CHUNK = 65_536
 
 
 @pytest.fixture

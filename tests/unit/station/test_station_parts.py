@@ -27,11 +27,17 @@ from monstertruckd.station import commands, frames
 from monstertruckd.station import feed as feed_module
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.commands import GiveOrder, Heartbeat
-from monstertruckd.station.feed import KEPT_EVENTS, MapStore, RobotFeed
-from monstertruckd.station.pilot import LATEST, MEMORY, MOST_ASKED, OLDEST, DelayWatch, Pilot
+from monstertruckd.station.feed import MapStore, RobotFeed
+from monstertruckd.station.pilot import MOST_ASKED, DelayWatch, Pilot
 from monstertruckd.station.server import PAGE, Place
 from monstertruckd.station.users import StationUsers, add_user
 from monstertruckd.station.viewer import MOST_ANSWERS, MOST_TILES, Viewer
+
+MEMORY = 200
+OLDEST = 1.5
+
+LATEST = 0.2
+KEPT_EVENTS = 200
 
 
 def grid(width: int = 4, height: int = 3, x: float = 0.0) -> Grid:

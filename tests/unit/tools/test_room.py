@@ -6,7 +6,9 @@ import pytest
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.obstacles import Disc
-from monstertruckd.tools.simulation.room import MOST, RADIUS, EmulatedRoom
+from monstertruckd.tools.simulation.room import MOST, EmulatedRoom
+
+RADIUS = 0.1
 
 
 class Space:

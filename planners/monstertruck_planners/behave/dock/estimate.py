@@ -5,7 +5,6 @@ because the frame drifts with odometry.
 """
 
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 
@@ -13,9 +12,6 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, between, compose, compose_jacobians, inverse, wrap
 from monstertruck_planners.behave.dock.config import DockConfig
 from monstertruck_schemas.points import TagPose
-
-DRIFT: Final = (0.02, 0.02, 0.03)
-"""Standard deviation of odometry (x, y, yaw) after a metre (m, m, rad); it grows with the root of the distance."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +56,8 @@ def seen(estimate: TagEstimate | None, tag: TagPose, base: Array) -> TagEstimate
 def driven(estimate: TagEstimate, base: Array, distance: float) -> TagEstimate:
     """Return the estimate after the robot, now at ``base`` (3,), has travelled a ``distance`` (m)."""
     by_base = compose_jacobians(base, between(base, estimate.mean))[0]
-    drift = np.diag(np.square(DRIFT)) * distance
+    # Standard deviation of odometry (x, y, yaw) after a metre (m, m, rad); it grows with the root of the distance.
+    drift = np.diag(np.square((0.02, 0.02, 0.03))) * distance
     return replace(estimate, covariance=estimate.covariance + by_base @ drift @ by_base.T)
 
 

@@ -8,20 +8,14 @@ import pytest
 
 from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.emulator import EposEmulator
-from monstertruck_drivers.epos.exchange import (
-    HELD_BACK,
-    QUICK_ANSWER,
-    QUIET,
-    RECENT,
-    Exchanger,
-    ObjectError,
-    _HeldUpError,
-)
+from monstertruck_drivers.epos.exchange import QUICK_ANSWER, QUIET, RECENT, Exchanger, ObjectError, _HeldUpError
 from monstertruck_drivers.epos.protocol import ObjectSegment, answer, segment_request
 from monstertruck_drivers.link import Link
 from monstertruck_runtime.clock import SECOND, VirtualClock, VirtualLoop, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError
 from tests.unit.drivers.epos.rig import on_line
+
+HELD_BACK = 0.01
 
 DISABLED = 0x1340
 O, F = b"O", b"F"  # noqa: E741

@@ -8,9 +8,13 @@ import pytest
 
 from monstertruck_drivers.link import Link
 from monstertruck_drivers.maestro.protocol import ERROR_MASK, POSITION_MAX, Encoder
-from monstertruck_drivers.maestro.session import IDENTIFY_ATTEMPTS, QUIET_AFTER_ANSWER, RESYNC_TRIES, MaestroSession
+from monstertruck_drivers.maestro.session import MaestroSession
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError, ProtocolError, WrongDeviceError
+
+RESYNC_TRIES = 4
+QUIET_AFTER_ANSWER = 0.02
+IDENTIFY_ATTEMPTS = 3
 
 TIMEOUT = 0.1
 CENTRE = 6000

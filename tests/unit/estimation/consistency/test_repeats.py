@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from monstertruck_estimation.consistency.repeats import LEAST_ROW, RepeatDetector, WholeRepeats
+from monstertruck_estimation.consistency.repeats import RepeatDetector, WholeRepeats
+
+LEAST_ROW = 40
 
 
 def shown(values, digit):

@@ -13,6 +13,10 @@ from monstertruck_planners.explore.exploration import Attempts, Cancel, Choose, 
 from monstertruck_schemas.plan import ExplorationPhase as Phase
 from monstertruck_schemas.reasons import Reason
 
+STANDS = 5.0
+RETURNS = 6
+CONFIRM = 2
+
 HOME = (1.0, 2.0, 0.5)
 CONFIG = InformationConfig()
 FIRST, SECOND = Viewpoint((3.0, 2.0, 0.0), (4.0, 2.0), 2.0, 1.0), Viewpoint((0.0, 5.0, 1.0), (0.0, 6.0), 3.0, 2.0)
@@ -51,7 +55,7 @@ class SteppedExploration:
         self.step(answer=answer)
 
     def exhaust(self) -> None:
-        for _ in range(exploration.CONFIRM):
+        for _ in range(CONFIRM):
             self.look(NOTHING)
 
     def saved(self) -> Exploration:
@@ -187,7 +191,7 @@ def test_lost_it_drives_to_and_fro_until_it_is_found():
     stepped.drive()
     stepped.pose, here = None, (2.0, 1.0, math.pi / 2)
     stepped.step(believed=here)
-    stepped.step(exploration.STANDS - 1.0, believed=here)
+    stepped.step(STANDS - 1.0, believed=here)
     assert stepped.actions == (), "whoever carried it is still there"
     stepped.step(1.5, believed=here)
     assert stepped.actions[0] == Go(pytest.approx((2.0, 1.6, math.pi / 2)))
@@ -291,7 +295,7 @@ def test_the_way_home_is_tried_again_and_given_up_in_the_end():
     while stepped.run.phase is Phase.RETURNING and stepped.now < 300:
         stepped.step(1.0, ended=Reason.STUCK if stepped.run.target is not None else None)
         sent += Go(HOME) in stepped.actions
-    assert sent == exploration.RETURNS
+    assert sent == RETURNS
     assert stepped.now > 60.0, "somebody in a door goes on meanwhile"
     assert stepped.saved().outcome is Reason.STUCK
     assert "not back at the start" in stepped.run.text

@@ -13,7 +13,7 @@ from monstertruck_planners.goals.config import EscapeConfig, PlannerConfig
 from monstertruck_planners.goals.escape import escape
 from monstertruck_planners.goals.exchange import PlanTask, RouteAnswer, SeenGround, Setup
 from monstertruck_planners.goals.plan_step import PlanningStep
-from monstertruck_planners.goals.unseen import BESIDE, PACE, SOON, Unseen, unseen_around
+from monstertruck_planners.goals.unseen import BESIDE, SOON, Unseen, unseen_around
 from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.config import HybridConfig, LatticeConfig
@@ -22,6 +22,8 @@ from monstertruck_planners.route.motion import MotionPath
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.state import Grid
+
+PACE = 0.1
 
 FOOTPRINT = Footprint()
 BACK = FOOTPRINT.half_length - FOOTPRINT.offset

@@ -10,7 +10,7 @@ from monstertruck_planners.collision import Footprint
 from monstertruck_planners.route import departure as departure_module
 from monstertruck_planners.route.api import Budget, RouteMap, Vehicle
 from monstertruck_planners.route.config import GridAstarConfig, HybridConfig, LatticeConfig
-from monstertruck_planners.route.departure import SPARE_MARGIN, departures
+from monstertruck_planners.route.departure import departures
 from monstertruck_planners.route.grid_astar import GridAstarPlanner
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_planners.route.lattice import LatticePlanner
@@ -18,6 +18,8 @@ from monstertruck_planners.route.motion import MotionPath
 from monstertruck_planners.route.replan import remaining_route, replan
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground, room
+
+SPARE_MARGIN = 0.002
 
 DIFFERENTIAL = Vehicle.truck("2ws", geometry=FourWheelSteering(cg_split=1.0))
 BODIES = {"4ws": TRUCK, "2ws": CAR, "differential": DIFFERENTIAL}

@@ -33,6 +33,8 @@ from monstertruckd.tools.logs.ros2 import export_ros2
 from tests.unit.recorder.conftest import scan
 from tests.unit.tools.logs.log_kit import MAY_2026, Writer, clock, gate, odometry
 
+PLAIN = 64
+
 JPEG = b"\xff\xd8picture\xff\xd9"
 
 
@@ -299,7 +301,7 @@ def columns_of(values: list[Any], folder: Path) -> dict[str, Any]:
     ],
 )
 def test_a_column_has_the_type_of_all_its_values_however_late_they_come(values, dtype, tmp_path, monkeypatch):
-    monkeypatch.setattr(columns, "KEPT_BYTES", 10 * columns.PLAIN)
+    monkeypatch.setattr(columns, "KEPT_BYTES", 10 * PLAIN)
     found = columns_of(values, tmp_path)["file"]
     assert found.dtype == dtype
     if dtype.startswith("<U"):

@@ -19,10 +19,12 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
 from monstertruck_schemas.topics import BEHAVIOUR, GATE
 from monstertruckd.tools.cli.main import app
-from monstertruckd.tools.tune.recipe import CALM, MOST_RUNS, OVERSHOOTS, RunVerdict, judged, recipe
+from monstertruckd.tools.tune.recipe import CALM, MOST_RUNS, RunVerdict, judged, recipe
 from monstertruckd.tools.tune.runs import draw, tune
 from tests.bus_kit import gate_state
 from tests.unit.planners.behave.wall_kit import Robot, drive
+
+OVERSHOOTS = 0.6
 
 WALL = [(-50.0, 0.35, 200.0, 0.35)]
 
