@@ -6,16 +6,18 @@ order. A kind is a product with its driver, the value of ``kind:``. Other distri
 and ``--help`` cost nothing.
 """
 
+import json
 import re
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Final, Literal, NamedTuple, cast
+from functools import partial
+from typing import Any, Final, Literal, NamedTuple
 
 from monstertruck_drivers.arduino_bridge.protocol import BOARD_BAUD
 from monstertruck_drivers.ax12.protocol import AX12_BAUD
 from monstertruck_drivers.bno085.protocol import BNO085_BAUD
-from monstertruck_drivers.emulation import EmulatorFactory
+from monstertruck_drivers.emulation import Emulator, EmulatorSetup, FileEmulator
 from monstertruck_drivers.epos.protocol import EPOS_BAUD
 from monstertruck_drivers.ld19.protocol import LD19_BAUD
 from monstertruck_drivers.link import Framing
@@ -26,15 +28,11 @@ from monstertruck_drivers.vesc.protocol import VESC_BAUD
 from monstertruck_drivers.wt61.protocol import WT61_BAUD
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.plugins import Catalog, Plugin, load
+from monstertruck_runtime.plugins import Catalog, Plugin
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.roles import SHAFTS, DeviceRole, ServiceName
 from monstertruck_schemas.topics import CMD_DRIVES, DRIVES, Topic, Writer
-
-Identify = Callable[..., Awaitable[dict[str, Any]]]
-"""Identifies a device without motion; takes what ``DeviceKind.identify`` opens, the clock, and the driver's settings.
-Returns JSON-able facts."""
 
 
 class Duty(StrEnum):
@@ -247,9 +245,11 @@ class DeviceKind(Plugin):
     roles: tuple[RoleSpec, ...]
     """Roles it can take."""
     emulator: str
-    """Place ``module:function`` of its ``EmulatorFactory``."""
+    """Place ``module:function``: builds an ``Emulator``, or a ``FileEmulator`` for a monitor, from an
+    ``EmulatorSetup``."""
     identity: str
-    """Place ``module:function`` of its ``Identify``."""
+    """Place ``module:function``: awaits what ``identify`` opens, the clock and the driver's settings; returns facts for
+    JSON by name, without motion."""
     also: Mapping[str, Topic[Any]] = field(default_factory=dict)
     """Topics written in addition to the role's topics, by the driver's parameter. The driver gets None if the topic is
     the main topic of another configured device."""
@@ -266,9 +266,18 @@ class DeviceKind(Plugin):
         """Its primary role."""
         return self.roles[0]
 
-    def emulator_factory(self) -> EmulatorFactory:
-        """Makes an emulated device; loads its module."""
-        return cast("EmulatorFactory", load(self.emulator))
+    def emulated(self, setup: EmulatorSetup) -> Any:
+        """Return an emulated device: an ``Emulator``, or a ``FileEmulator`` for a monitor; loads its module.
+
+        Raises:
+            InputError: the factory does not load, or returns something else.
+        """
+        made, wanted = self.called(self.emulator, setup), FileEmulator if self.opens == "computer" else Emulator
+        if not isinstance(made, wanted):
+            missing = ", ".join(name for name in ("name", "run", "power_cycle", "inject") if name not in dir(made))
+            text = f"expected an emulator, found {type(made).__name__} without {missing}"
+            raise InputError(f"kind {self.name}: {self.emulator}: {text}")
+        return made
 
     async def identify(self, where: Any, clock: Clock, settings: Schema | None = None) -> dict[str, Any]:
         """Identify the device at a place, without motion.
@@ -288,13 +297,25 @@ class DeviceKind(Plugin):
             WrongDeviceError: another device.
             PortBusyError: another process holds the port.
         """
-        ask = cast("Identify", load(self.identity))
-        settings = settings or self.settings_class()()
+        ask = partial(self.called, self.identity)
+        settings = settings or self.default_settings()
         if self.opens not in ("serial", "i2c"):
-            return await ask(where, clock, settings)
+            return self._facts(await ask(where, clock, settings))
         async with await where.open() as link:
-            facts = await ask(link, clock, settings)
+            facts = self._facts(await ask(link, clock, settings))
         return {"device": self.doc, "port": where.name, **facts}
+
+    def _facts(self, found: Any) -> dict[str, Any]:
+        """What identifies a device, by name, as JSON can write it."""
+        place = f"kind {self.name}: {self.identity}"
+        if not isinstance(found, dict):
+            raise InputError(f"{place}: expected a dict of facts, found {found!r}")
+        for name, value in found.items():
+            try:
+                json.dumps({name: value})
+            except (TypeError, ValueError) as error:
+                raise InputError(f"{place}: {name}: expected a value for JSON, found {value!r}") from error
+        return found
 
 
 RESERVED: Final = frozenset(
@@ -317,6 +338,10 @@ class DeviceCatalog(Catalog[DeviceKind]):
             return fault
         if not row.roles:
             return "expected at least one role"
+        if row.baud is not None and row.baud <= 0:
+            return f"baud: expected bits per second above 0, found {row.baud}"
+        if row.usb is not None and not re.fullmatch(r"[0-9a-f]{4}:[0-9a-f]{4}", row.usb.usb_id):
+            return f"usb.usb_id: expected vendor:product such as 0403:6001, found {row.usb.usb_id!r}"
         for role in row.roles:
             if not re.fullmatch(r"[a-z][a-z0-9_]*", role.name) or not role.writes:
                 return f"role {role.name!r}: expected a name of small letters, digits and _ that writes a topic"
@@ -352,6 +377,8 @@ class DeviceCatalog(Catalog[DeviceKind]):
         """
         kinds = (self[name],) if name in self else self.of_role(name)
         if not kinds:
+            if broken := [str(one) for one in self.broken if one.name == name]:
+                raise InputError(f"unusable device {broken[0]}")
             known = ", ".join(f"{kind.name} ({kind.role.name})" for kind in self.values())
             raise InputError(f"unknown device {name!r}; known: {known}")
         return kinds[0]

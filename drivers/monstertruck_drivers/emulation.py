@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, Protocol, SupportsIndex
+from typing import Any, Final, Literal, NamedTuple, Protocol, SupportsIndex, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +63,7 @@ class ReceivedBytes(bytearray):
             del self[: -self.KEPT]
 
 
+@runtime_checkable
 class Emulator(Protocol):
     """Device side of a protocol, byte for byte, with the device's persistent state.
 
@@ -91,6 +92,7 @@ def signals_of(emulator: object) -> Signals | None:
     return found if isinstance(found, Signals) else None
 
 
+@runtime_checkable
 class FileEmulator(Protocol):
     """Part of the computer that appears as files below /proc and /sys."""
 
@@ -355,7 +357,3 @@ class EmulatorSetup:
     """Folder with proc and sys of the emulated computer."""
     offload: Offload = in_thread
     """Runs long computations."""
-
-
-EmulatorFactory = Callable[[EmulatorSetup], Any]
-"""Builds an ``Emulator``, or a ``FileEmulator`` for a monitor."""

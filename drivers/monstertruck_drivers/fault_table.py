@@ -18,6 +18,9 @@ class FaultTable:
     Args:
         device: name of the device, for messages.
         rows: faults of the device.
+
+    Raises:
+        InputError: see ``add``.
     """
 
     def __init__(self, device: str, rows: FaultRows) -> None:
@@ -29,8 +32,14 @@ class FaultTable:
         self.add(rows)
 
     def add(self, rows: FaultRows) -> None:
-        """Add faults to the table."""
+        """Add faults to the table.
+
+        Raises:
+            InputError: the value of a row is neither a function nor a number.
+        """
         for usage, value in rows.items():
+            if not callable(value) and not isinstance(value, int | float):
+                raise InputError(f"{self._device}: fault {usage}: expected a function or a number, found {value!r}")
             for fault in usage.split()[0].split("|"):
                 self._usages[fault] = usage
                 if callable(value):

@@ -252,6 +252,9 @@ class Signals:
         rng: the device's randomness; the faults' randomness is spawned from it.
         codes: minimum of the measured values, by array; lower values are codes, which arithmetic faults do not
             change.
+
+    Raises:
+        InputError: a kind is no ``SignalKind``.
     """
 
     def __init__(
@@ -262,6 +265,10 @@ class Signals:
         codes: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         self.kinds = dict(kinds)
+        for name, kind in self.kinds.items():
+            if kind not in SignalKind.__members__.values():
+                expected = " or ".join(f"SignalKind.{one}" for one in SignalKind.__members__)
+                raise InputError(f"signal {name}: expected {expected}, found {kind!r}")
         self._codes = dict(codes)
         self._now = now
         self._rng = rng.spawn(1)[0]

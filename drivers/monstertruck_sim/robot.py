@@ -60,7 +60,7 @@ class SimulatedRobot:
         def emulated(role: str, kind: DeviceKind, settings: Schema) -> Any:
             port = ports.get(role) or MemoryPort(role)
             setup = EmulatorSetup(role, settings, clock, self.world, config.seed, port, root, offload)
-            return kind.emulator_factory()(setup)
+            return kind.emulated(setup)
 
         self.monitored: dict[str, FileEmulator] = {
             role: emulated(role, kind_of(settings), settings) for role, settings in monitors.present().items()

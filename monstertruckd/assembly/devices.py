@@ -163,8 +163,8 @@ def build_drivers(
             name: None if topic in unmeasured else _publisher(role, topic, roles, config, bus)
             for name, topic in written.items()
         }
-        driver = kind.implementation_class()
-        drivers[role.name] = driver(settings[role.name], where, clock, **ends, events=bus.event_sink(), name=role.name)
+        ends |= {"events": bus.event_sink(), "name": role.name}
+        drivers[role.name] = kind.build(settings[role.name], where, clock, **ends)
     return drivers
 
 

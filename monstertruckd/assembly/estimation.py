@@ -122,7 +122,7 @@ def build_estimation(
     context = OdometryContext(
         body.chassis, clock, bus, compass=compass, slam=config.slam is not None, imu=turned, encoders=encoders
     )
-    yield ODOMETRY.implementation(config.odometry)(config.odometry, context)
+    yield ODOMETRY.build(config.odometry, config.odometry, context)
     if config.consistency is not None:
         yield _build_consistency(config, config.consistency, bus, clock, body, actors)
     ground = _build_ground(config, bus, clock, run)

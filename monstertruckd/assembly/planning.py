@@ -131,7 +131,7 @@ def build_planners(
     if goals is not None:
         yield _build_missions(config, bus, clock, MissionParts(goals, behaviours, explorer, config.docks))
     if config.devices.stabiliser is not None and config.devices.compass is not None:
-        yield LEVELLING.implementation(config.levelling)(config.levelling, clock, bus)
+        yield LEVELLING.build(config.levelling, config.levelling, clock, bus)
     if config.map is not None and config.devices.lidar is not None:
         yield MapService(
             config.map,

@@ -32,6 +32,7 @@ from monstertruck_runtime.plugins import models_in
 from monstertruck_runtime.small_files import make_folder, replace_file, require_file
 from monstertruck_runtime.yaml_files import DEEPEST, LARGEST_YAML, bounded_yaml
 from monstertruck_schemas.base import LiveValue, Schema, field_docs, live_settings
+from monstertruck_schemas.entry_points import left_out
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values, unused
 from monstertruckd.config.real_ports import mixed
 from monstertruckd.config.renamed import RENAMED
@@ -729,6 +730,8 @@ def _explain(tree: Tree, path: Path, model: type[Schema], error: ValidationError
         yield f"{origin}: {dotted}: {_sentence(detail, model, key)}"
     if (more := len(mistakes) - most_mistakes) > 0:
         yield f"{path}: {more} more mistakes"
+    if {"extra_forbidden", "union_tag_invalid"} & {detail["type"] for detail in mistakes.values()}:
+        yield from (f"plug-in left out: {broken}" for broken in left_out())
 
 
 def _first_mistake(data: Any, error: ValidationError) -> str:

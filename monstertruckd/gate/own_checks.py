@@ -32,7 +32,7 @@ class OwnCheck(Check):
     def __init__(self, view: GateView, name: str, config: CheckConfig) -> None:
         super().__init__(view)
         self._name = name
-        self._check: Check = GATE_CHECKS.implementation(config)(config, view)
+        self._check: Check = GATE_CHECKS.build(config, config, view)
         self._error: str | None = None
         self.reasons = tuple(dict.fromkeys((*self._check.reasons, Reason.OWN_CHECK)))
         self.reads = tuple(self._check.reads)

@@ -86,4 +86,4 @@ def build_chassis(body: BodyConfig, dimensions: Any) -> Any:
         InputError: the body does not load.
         KinematicsError: dimensions no robot can have.
     """
-    return BODIES.implementation(body)(dimensions, **body.model_dump(exclude={"kind"}))
+    return BODIES.build(body, dimensions, **body.model_dump(exclude={"kind"}))

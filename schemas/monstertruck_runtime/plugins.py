@@ -9,12 +9,13 @@ distributions add rows through entry points that name a ``Plugin``::
 """
 
 import importlib
-from collections.abc import Iterator, Mapping
+import inspect
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic, Literal, TypeVar, cast, get_args, get_origin
 
-from pydantic import BaseModel, GetCoreSchemaHandler
+from pydantic import BaseModel, GetCoreSchemaHandler, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, core_schema
 
@@ -57,13 +58,63 @@ class Plugin:
         """Implementation; loads its module.
 
         Raises:
-            InputError: it does not load.
+            InputError: it does not load, or is no class.
+        """
+        return self.callable_at(self.implementation)
+
+    def build(self, *arguments: Any, **named: Any) -> Any:
+        """Return an instance of the implementation.
+
+        Raises:
+            InputError: it does not load, or takes other arguments.
+        """
+        return self.called(self.implementation, *arguments, **named)
+
+    def callable_at(self, place: str) -> Callable[..., Any]:
+        """Class or function at ``module:name``; loads its module.
+
+        Raises:
+            InputError: it does not load, or cannot be called.
         """
         try:
-            return load(self.implementation)
+            found = load(place)
         except (ImportError, AttributeError) as error:
             needs = "" if self.extra is None else f"needs the extra [{self.extra}]: "
-            raise InputError(f"kind {self.name}: {needs}{error}") from error
+            raise InputError(f"kind {self.name}: {place}: {needs}{error}") from error
+        except (Exception, SystemExit) as error:  # whatever the plug-in's module does
+            raise InputError(f"kind {self.name}: {place}: {type(error).__name__}: {error}") from error
+        if not callable(found):
+            raise InputError(f"kind {self.name}: {place}: expected a class or a function, found {found!r}")
+        return cast("Callable[..., Any]", found)
+
+    def called(self, place: str, *arguments: Any, **named: Any) -> Any:
+        """Call the class or function at ``module:name``.
+
+        Raises:
+            InputError: see ``callable_at``; or it takes other arguments.
+        """
+        make = self.callable_at(place)
+        signature = inspect.signature(make)
+        try:
+            signature.bind(*arguments, **named)
+        except TypeError as error:
+            given = ", ".join([*(type(one).__name__ for one in arguments), *(f"{name}=" for name in named)])
+            text = f"expected to be called with ({given}), found {signature}: {error}"
+            raise InputError(f"kind {self.name}: {place}: {text}") from error
+        return make(*arguments, **named)
+
+    def default_settings(self) -> Schema:
+        """Settings without any key from a configuration.
+
+        Raises:
+            InputError: a field has no default.
+        """
+        model = self.settings_class()
+        try:
+            return model()
+        except ValidationError as error:
+            keys = ", ".join(str(one["loc"][-1]) for one in error.errors(include_url=False) if one["loc"])
+            raise InputError(f"kind {self.name}: {self.settings}: {keys}: expected a default") from error
 
 
 P = TypeVar("P", bound=Plugin)
@@ -117,6 +168,19 @@ class Catalog(ExtensibleTable[P], Generic[P]):
             InputError: no such kind, or it does not load.
         """
         return self.find(str(vars(config).get("kind"))).implementation_class()
+
+    def build(self, config: Schema, *arguments: Any, **named: Any) -> Any:
+        """Return an instance of the implementation for settings of one of the kinds.
+
+        Args:
+            config: The settings.
+            arguments: For the implementation, the settings included.
+            named: Likewise.
+
+        Raises:
+            InputError: no such kind, or the implementation does not load or takes other arguments.
+        """
+        return self.find(str(vars(config).get("kind"))).build(*arguments, **named)
 
     def section(self, default: str | None = None) -> "KindSection":
         """Annotation of a configuration field that holds the settings of one of the kinds.

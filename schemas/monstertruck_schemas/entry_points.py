@@ -6,9 +6,12 @@ A broken entry point is reported and skipped: it never keeps the robot from star
 import importlib.metadata
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from enum import EnumType
 from functools import cache, cached_property
-from typing import Any, Final, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, NamedTuple, Protocol, TypeVar, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
 
 OURS: Final = "monstertruckd"
 """Origin of rows in this repository."""
@@ -76,7 +79,7 @@ class ExtensibleTable(Mapping[str, R]):
                     if entry.name in rows
                     else f"the entry point is called {entry.name}, what it points to {row.name}"
                     if getattr(row, "name", entry.name) != entry.name
-                    else self.fault(row)
+                    else wrong_value(row) or self.fault(row)
                 )
             except (Exception, SystemExit) as raised:  # noqa: BLE001  # whatever the plug-in's module does
                 error = f"{type(raised).__name__}: {raised}"
@@ -84,6 +87,7 @@ class ExtensibleTable(Mapping[str, R]):
                 rows[entry.name], origins[entry.name] = row, origin
             else:
                 broken.append(Broken(self.group, entry.name, origin, error))
+        _LEFT_OUT[self.group] = tuple(broken)
         return _Read(rows, origins, tuple(broken))
 
     def __getitem__(self, name: str) -> R:
@@ -104,6 +108,49 @@ class ExtensibleTable(Mapping[str, R]):
     def broken(self) -> tuple[Broken, ...]:
         """Entry points that were left out."""
         return self._read.broken
+
+
+_LEFT_OUT: Final[dict[str, tuple[Broken, ...]]] = {}
+
+
+def left_out() -> Iterator[Broken]:
+    """Yield the entry points left out of the tables that this process has read."""
+    for broken in _LEFT_OUT.values():
+        yield from broken
+
+
+def wrong_value(row: Any) -> str | None:
+    """Return the first field of a row whose value its annotation does not allow, with what is allowed; None if all fit.
+
+    Rows within the row are checked as well.
+
+    Args:
+        row: A dataclass; anything else fits.
+    """
+    if not is_dataclass(row):
+        return None
+    hints = get_type_hints(type(row))
+    for field in fields(row):
+        value = getattr(row, field.name)
+        try:
+            TypeAdapter(hints[field.name]).validate_python(value, strict=True)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            place = "".join(f".{part}" if isinstance(part, str) else f"[{part}]" for part in first["loc"])
+            expected = _choices(hints[field.name]) or first["msg"].removeprefix("Input should be ")
+            return f"{field.name}{place}: expected {expected}, found {first['input']!r}"
+        inner = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, tuple) else ()
+        for key, row_within in inner:
+            if wrong := wrong_value(row_within):
+                return f"{field.name}[{key!r}].{wrong}"
+    return None
+
+
+def _choices(annotation: Any) -> str | None:
+    """Return the members of an enumeration as code writes them; None for another annotation."""
+    if not isinstance(annotation, EnumType):
+        return None
+    return " or ".join(f"{annotation.__name__}.{name}" for name in annotation.__members__)
 
 
 @cache

@@ -41,7 +41,7 @@ def pages() -> Iterator[Page]:
 
 def _page(kind: DeviceKind) -> Page:
     driver, identify = kind.implementation_class(), load(kind.identity)
-    emulator = get_type_hints(kind.emulator_factory())["return"]
+    emulator = get_type_hints(kind.callable_at(kind.emulator))["return"]
     models = Definitions(kind.settings_class())
     text = join(
         f"# {kind.doc}",

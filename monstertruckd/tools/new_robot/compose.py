@@ -70,7 +70,7 @@ def twin(own: str, simulation: str) -> Section:
 
 def _chassis(answers: Answers) -> Chassis:
     train = DriveTrain(answers.drive_ratio, answers.wheel_radius)
-    built: Chassis = BODIES[answers.body].implementation_class()(Dimensions(train, answers.wheelbase, answers.track))
+    built: Chassis = BODIES[answers.body].build(Dimensions(train, answers.wheelbase, answers.track))
     return built
 
 

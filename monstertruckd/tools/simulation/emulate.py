@@ -75,7 +75,7 @@ async def _served(
     kind: DeviceKind, device: str, port: EmulatedPort, clock: Clock, seed: int
 ) -> AsyncIterator[Emulated]:
     setup = EmulatorSetup(kind.role.name, None, clock, World(WorldConfig(), seed), seed, port)
-    emulator = kind.emulator_factory()(setup)
+    emulator = kind.emulated(setup)
     task = asyncio.create_task(emulator.run(port.device), name=f"emulator {device}")
     port.plug()
     try:

@@ -383,4 +383,4 @@ def make_explorer(config: ExplorerConfig) -> Explorer:
     Raises:
         InputError: settings without a kind of explorer, or a missing dependency.
     """
-    return cast("Explorer", EXPLORERS.implementation(config)(config))
+    return cast("Explorer", EXPLORERS.build(config, config))

@@ -46,4 +46,4 @@ def make_local_planner(vehicle: "Vehicle", config: LocalPlannerConfig) -> "Local
     Raises:
         InputError: settings without a kind of local planner, or what it needs is not installed.
     """
-    return cast("LocalPlanner", LOCAL_PLANNERS.implementation(config)(vehicle, config))
+    return cast("LocalPlanner", LOCAL_PLANNERS.build(config, vehicle, config))

@@ -403,4 +403,4 @@ def make_planner(vehicle: Vehicle, config: GoalConfig) -> RoutePlanner:
     Raises:
         InputError: settings without a kind of route planner, or a required package is not installed.
     """
-    return cast("RoutePlanner", ROUTE_PLANNERS.implementation(config)(vehicle, config))
+    return cast("RoutePlanner", ROUTE_PLANNERS.build(config, vehicle, config))

@@ -54,4 +54,4 @@ def build_tracker(config: TrackerConfig, steering: FourWheelSteering) -> "PathTr
     Raises:
         InputError: no such kind, or what it needs is not installed.
     """
-    return cast("PathTracker[Any]", TRACKERS.implementation(config)(config, steering))
+    return cast("PathTracker[Any]", TRACKERS.build(config, config, steering))

@@ -51,7 +51,7 @@ def test_plugins_are_listed_with_their_origin_and_what_is_wrong_with_them(instal
     rows = {row["name"]: row for row in json.loads(CliRunner().invoke(app, ["plugins", "--json"]).stdout)}
     assert (rows["mpc"]["origin"], rows["mpc"]["error"]) == (OURS, None)
     assert rows["other"]["origin"] == "other-trackers 1.0"
-    assert rows["other"]["error"] == "kind other: No module named 'other_missing'"
+    assert rows["other"]["error"] == "kind other: other_missing:Other: No module named 'other_missing'"
     assert rows["gone"]["error"] == "AttributeError: module 'other' has no attribute 'GONE'"
     assert "No module named 'other_missing'" in CliRunner().invoke(app, ["plugins"]).stdout
 

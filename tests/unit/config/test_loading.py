@@ -9,7 +9,9 @@ import pytest
 from pydantic import Field
 
 from monstertruck_runtime.errors import ConfigError
+from monstertruck_schemas import entry_points
 from monstertruck_schemas.base import Schema
+from monstertruck_schemas.entry_points import Broken
 from monstertruckd.config.load import included, load_config, load_tree, resolved
 from monstertruckd.config.migrate import plan
 
@@ -115,6 +117,14 @@ def test_every_mistake_names_file_line_and_expectation(tmp_path: Path, text: str
     said = complaint(tmp_path, text)
     assert f"{tmp_path / 'truck.yaml'}:{line}" in said or "neither text" in expected
     assert expected in said
+
+
+def test_a_plug_in_that_was_left_out_is_named_with_an_unknown_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    broken = Broken("monstertruck.devices", "mb7360", "truck-sonar 1.0", "baud: expected a valid integer, found '9'")
+    monkeypatch.setitem(entry_points._LEFT_OUT, broken.group, (broken,))
+    said = complaint(tmp_path, "version: 2\nname: t\nranger: {}\n").splitlines()
+    assert said[1] == f"plug-in left out: {broken}"
+    assert "plug-in" not in complaint(tmp_path, "version: 2\nname: []\n")
 
 
 BOMB = "version: 2\nname: t\na0: &a0 [1, 1]\n" + "".join(

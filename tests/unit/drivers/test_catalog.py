@@ -1,23 +1,27 @@
 """Roles and kinds: everything that lists devices agrees with them, and what does not fit is refused by name."""
 
 import ast
+import asyncio
 import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args, get_type_hints
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from monstertruck_drivers.catalog import DEVICES, LIDAR, RESERVED, DeviceKind, Duty, RoleSpec, start_order
+from monstertruck_drivers.catalog import DEVICES, LIDAR, RESERVED, DeviceKind, Duty, RoleSpec, UsbIdentity, start_order
 from monstertruck_drivers.config import Device, Devices, Monitors, _Devices, _Monitors
+from monstertruck_drivers.emulation import EmulatorSetup
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_runtime.errors import ConfigError, InputError
 from monstertruck_runtime.plugins import load
 from monstertruck_runtime.ports import Publisher, Subscription
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Schema, field_docs
+from monstertruck_schemas.entry_points import wrong_value
 from monstertruck_schemas.roles import DeviceRole, ServiceName
 from monstertruckd.config.load import load_truck
 
@@ -46,7 +50,7 @@ def test_a_driver_takes_the_ends_of_its_roles_topics(kind: DeviceKind):
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 def test_every_kind_has_an_emulator_and_identifies_its_device(kind: DeviceKind):
-    emulator = get_type_hints(kind.emulator_factory())["return"]
+    emulator = get_type_hints(kind.callable_at(kind.emulator))["return"]
     assert hasattr(emulator, "run")
     assert hasattr(emulator, "inject")
     taken = get_type_hints(load(kind.identity))["settings"]
@@ -181,3 +185,45 @@ def test_two_devices_that_publish_one_topic_are_refused(monkeypatch):
     monkeypatch.setitem(DEVICES._roles, "compass", dataclasses.replace(DEVICES.roles["compass"], writes=LIDAR.writes))
     with pytest.raises(ValidationError, match="lidar and compass both publish sensor/scan"):
         Devices.model_validate({"compass": port, "lidar": lidar}, strict=False)
+
+
+SENSING = dataclasses.replace(LIDAR, duty="sensor")
+LISTED = dataclasses.replace(LIDAR, writes=[topics.SCAN])
+LETTERS = dataclasses.replace(LIDAR, writes={"out": dataclasses.replace(topics.SCAN, rate="7")})
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("opens", "uart", "opens: expected 'serial', 'i2c', 'video' or 'computer', found 'uart'"),
+        ("baud", "9600", "baud: expected a valid integer, found '9600'"),
+        ("roles", LIDAR, "roles: expected a valid tuple, found RoleSpec"),
+        (
+            "roles",
+            (dataclasses.replace(LIDAR, duty="sensor"),),
+            r"roles\[0\]\.duty: expected Duty.ACTUATOR or .* 'sensor'",
+        ),
+        ("roles", (LISTED,), r"roles\[0\]\.writes: expected a valid dictionary"),
+        ("roles", (LETTERS,), r"roles\[0\]\.writes\['out'\]\.rate: expected a valid number, found '7'"),
+        ("usb", UsbIdentity("0403:6001", "FT232R", "ttyS"), "usb.node: expected 'ttyACM', 'ttyUSB' or 'video', found"),
+    ],
+)
+def test_a_value_that_a_field_does_not_take_is_named(field: str, value: object, said: str):
+    assert wrong_value(DEVICES["ld19"]) is None
+    assert re.match(said, wrong_value(dataclasses.replace(DEVICES["ld19"], **{field: value})))
+
+
+def test_a_kind_says_what_its_parts_should_be():
+    kind = dataclasses.replace(DEVICES["ld19"], emulator=f"{__name__}:no_emulator", identity=f"{__name__}:no_facts")
+    with pytest.raises(InputError, match=r"kind ld19: \S+: expected an emulator, found dict without name, run, power"):
+        kind.emulated(EmulatorSetup("lidar", None, None, None))
+    with pytest.raises(InputError, match=r"kind ld19: \S+: range: expected a value for JSON, found array"):
+        asyncio.run(dataclasses.replace(kind, opens="computer").identify(None, None))
+
+
+def no_emulator(setup):
+    return {}
+
+
+async def no_facts(where, clock, settings):
+    return {"range": np.array(1)}

@@ -52,3 +52,8 @@ def test_the_next_answers_come_late():
     late = LateAnswers()
     late.start("0.2", "2")
     assert [late.take(0.001) for _ in range(3)] == [0.2, 0.2, 0.001]
+
+
+def test_a_row_that_starts_nothing_is_named():
+    with pytest.raises(InputError, match=r"ranger: fault deaf on\|off: expected a function or a number, found 'off'"):
+        FaultTable("ranger", {"deaf on|off": "off"})

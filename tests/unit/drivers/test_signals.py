@@ -199,3 +199,8 @@ def test_codes_in_an_array_are_spared_by_faults_that_calculate():
     signals.inject("range", "off")
     signals.inject("range", "mirrored")
     assert signals.report("range", np.array((0, 19, 20, 500))).tolist() == [500, 20, 19, 0]
+
+
+def test_a_kind_of_signal_that_does_not_exist_is_named():
+    with pytest.raises(InputError, match=r"signal range: expected SignalKind\.NUMBER or .*, found 'nummer'"):
+        Signals(lambda: 0, {"range": "nummer"}, np.random.default_rng(0))

@@ -56,7 +56,7 @@ def test_a_catalog_names_its_kinds_and_loads_them_on_use():
     assert list(catalog) == ["ball", "cube"]
     assert catalog.origin("ball") == "monstertruckd"
     assert catalog.implementation(BallConfig()) is json.dumps
-    with pytest.raises(InputError, match=r"cube: needs the extra \[toys\]: No module named 'no_such_module'"):
+    with pytest.raises(InputError, match=r"cube: \S+: needs the extra \[toys\]: No module named 'no_such"):
         catalog.implementation(CubeConfig(kind="cube"))
     with pytest.raises(InputError, match="no kind 'kite': expected one of ball, cube"):
         catalog.find("kite")
@@ -144,3 +144,29 @@ def test_settings_of_another_distribution_travel_to_another_machine(install):
     assert codec.from_json(codec.to_json(Task(top(kind="top", turns=7)))) == Task(top(kind="top", turns=7))
     with pytest.raises(InputError, match="no Plugin travels"):
         codec.to_json(catalog["top"])
+
+
+class Painter:
+    def __init__(self, config, *, colour):
+        self.colour = colour
+
+
+def test_an_implementation_that_takes_other_arguments_is_named():
+    plugin = row("ball", "BallConfig", f"{__name__}:Painter")
+    assert plugin.build(BallConfig(), colour="red").colour == "red"
+    with pytest.raises(InputError, match=r"kind ball: \S+:Painter: expected to be called with \(BallConfig, hue=\)"):
+        plugin.build(BallConfig(), hue="red")
+    with pytest.raises(InputError, match=r"kind ball: \S+:GROUP: expected a class or a function, found 'monstertruck"):
+        plugin.callable_at(f"{__name__}:GROUP")
+    with pytest.raises(InputError, match=r"kind ball: json\.dumps: No module"):
+        plugin.callable_at("json.dumps")
+
+
+def test_settings_without_a_default_are_named():
+    class Wanting(Schema):
+        kind: Literal["ball"] = "ball"
+        size: float
+
+    globals()["Wanting"] = Wanting
+    with pytest.raises(InputError, match=r"kind ball: \S+:Wanting: size: expected a default"):
+        row("ball", "Wanting").default_settings()

@@ -28,7 +28,7 @@ def test_the_answer_names_faults_of_the_device_and_of_its_cable(device: str, wor
         clock, port = VirtualClock(loop), MemoryPort(device)
         kind = DEVICES.named(device)
         setup = EmulatorSetup(kind.role.name, None, clock, World(WorldConfig(), 0), 0, port)
-        emulated = Emulated(kind.emulator_factory()(setup), port)
+        emulated = Emulated(kind.emulated(setup), port)
         with pytest.raises(InputError) as refused:
             emulated.command(list(words))
         assert "known:" in str(refused.value)

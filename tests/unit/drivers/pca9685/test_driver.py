@@ -265,7 +265,7 @@ def test_the_emulated_kinds_take_their_settings():
         world = World(WorldConfig(), 0)
         for kind, settings in (("pca9685", Pca9685Config(address=0x55)), ("pca9685_esc", None)):
             setup = EmulatorSetup("steering", settings, clock, world)
-            emulator = DEVICES[kind].emulator_factory()(setup)
+            emulator = DEVICES[kind].emulated(setup)
             assert isinstance(emulator, Pca9685Emulator)
             assert emulator.address == (0x40 if settings is None else 0x55)
         assert math.isfinite(emulator.oscillator)

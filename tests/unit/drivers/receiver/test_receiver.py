@@ -300,7 +300,7 @@ def test_without_settings_emulator_and_probe_of_a_kind_speak_its_protocol(name):
 
     async def main(clock: VirtualClock) -> None:
         port = MemoryPort("hand")
-        emulator = kind.emulator_factory()(EmulatorSetup("hand", None, clock, None, port=port))
+        emulator = kind.emulated(EmulatorSetup("hand", None, clock, None, port=port))
         async with background(emulator.run(port.device)):
             port.plug()
             found = await kind.identify(port, clock)

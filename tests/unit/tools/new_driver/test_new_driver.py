@@ -54,7 +54,7 @@ def test_the_catalog_takes_its_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert DEVICES.fault(row) is None
     assert row.settings_class()().kind == row.name
     assert callable(row.implementation_class())
-    assert callable(row.emulator_factory())
+    assert row.callable_at(row.emulator)
 
 
 def test_nothing_is_overwritten_and_odd_names_are_refused(tmp_path: Path):
