@@ -160,6 +160,8 @@ class ShaftWatch:
         """Stamp of the first feedback without motion, ns; None while the shaft moves."""
         self.driven = False
         """Whether the motor may turn the shaft, by the latest feedback."""
+        self.powered_since = 0
+        """Stamp of the last feedback with the power stage off before it was switched on, ns; 0 while it is off."""
         self._name = name
         self._before: DriveFeedback | None = None
         self.measures_current = False
@@ -193,6 +195,10 @@ class ShaftWatch:
         """
         before, self._before = self._before, feedback
         velocity = feedback.velocity * metres
+        if feedback.mode not in POWERED:
+            self.powered_since = 0
+        elif before is not None and before.mode not in POWERED:
+            self.powered_since = before.stamp
         self._take_current(feedback, before)
         driven = self.driven = self._is_driven(feedback, config)
         if before is None or feedback.stamp <= before.stamp:
@@ -479,7 +485,11 @@ class RunawayCheck(Check):
         self._take(found, now)
 
     def _take_unshown(self, motion: UnshownMotion, now: int) -> None:
-        driven = self._pulled(now)
+        """Judge proven motion of the body from the time on since which a motor could cause it."""
+        driven, powered = self._pulled(now), min(watch.powered_since for watch in self._shafts)
+        if motion.stamp <= powered:
+            self._unjudged = None
+            return
         # The drive polls its current less often than its velocity: keep the motion until the next current decides.
         self._unjudged = None if driven or now - motion.stamp > SCAN.fresh_for() * SECOND else motion
         if self._unjudged is not None:
@@ -490,7 +500,7 @@ class RunawayCheck(Check):
             motion.stamp,
             moved,
             self._config,
-            stood=max(self._stood, self._found_at),
+            stood=max(self._stood, self._found_at, powered),
             now=now,
             driven=driven,
         )

@@ -549,6 +549,28 @@ def test_a_drive_that_reads_rest_need_not_obey_any_further_if_its_current_shows_
     assert bool(rig.reported(Reason.UNCOMMANDED_MOTION)) is (current is not None)
 
 
+@pytest.mark.parametrize("current", [0.3, None])
+@pytest.mark.parametrize("later", [0, 12])
+def test_a_motion_from_before_the_power_stage_was_switched_on_is_none_of_a_motor(current, later):
+    """Scans that change while the robot waits, for instance those of a faulty lidar."""
+    rig = Rig().armed()
+    rig.current, rig.driver, rig.mode = current and 0.0, {"speed": 0.0}, DriveMode.DISABLED
+    rig.tick(30)
+    since = rig.now
+    rig.tick(30)
+    shown(rig, since, 0.03)
+    rig.mode, rig.current = DriveMode.ENABLED, current
+    rig.tick(later)
+    shown(rig, since, 0.03)
+    rig.tick(3)
+    assert not rig.reported(Reason.UNCOMMANDED_MOTION)
+    since = rig.now
+    rig.tick(30)
+    shown(rig, since, 0.03)
+    rig.tick()
+    assert rig.reported(Reason.UNCOMMANDED_MOTION)
+
+
 def test_a_motion_that_is_proven_before_the_current_is_measured_is_judged_by_it():
     rig = Rig().armed()
     rig.current, rig.driver = 0.3, {"speed": 0.0}
