@@ -117,6 +117,10 @@ class RangeSource(Protocol):
         """
 
 
+SIGMAS: Final = 2.0
+"""Standard deviations of a range within the error bound of a data sheet."""
+
+
 class RangeSheet(NamedTuple):
     """Ranges of a scanner according to its data sheet."""
 
@@ -130,6 +134,11 @@ class RangeSheet(NamedTuple):
     """Error bound at longer range, as a fraction of the range."""
     dark: float | None = None
     """Maximum range to a surface of 10 % reflectivity (m); None if the data sheet covers white surfaces only."""
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of a range close by (m): the error bound holds for `SIGMAS` standard deviations."""
+        return self.error / SIGMAS
 
     @property
     def sure(self) -> float:

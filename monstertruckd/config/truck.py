@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from monstertruck_drivers.config import Devices, Monitors
-from monstertruck_drivers.scanning.config import sight
+from monstertruck_drivers.scanning.config import sheet
 from monstertruck_drivers.shafts import MotorLimits, SteeringOutputs, motor_limits
 from monstertruck_drivers.usb.config import UsbConfig
 from monstertruck_estimation.catalog import AnyOdometry
@@ -261,7 +261,7 @@ class TruckConfig(Schema):
             mass=geometry.mass,
             pull=geometry.pull,
             motor_speed=min(speeds, default=None),
-            sight=None if lidar is None else sight(lidar.driver) - geometry.length / 2 + lidar.mount.x,
+            sight=None if lidar is None else sheet(lidar.driver).sure - geometry.length / 2 + lidar.mount.x,
         )
 
     def weakened(self) -> tuple[str, ...]:

@@ -36,6 +36,8 @@ class LaserScan(Message):
     """Shape (n,): intensity of the returns in the sensor's own unit, 0 without a return; None if not measured."""
     tilt: Annotated[float, Field(ge=0)] | None = None
     """Angle between the scanning plane and the horizontal in the middle of the scan (rad); None if not measured."""
+    range_noise: Annotated[float, Field(ge=0)] | None = None
+    """Standard deviation of a range close by (m), by the sensor's data sheet; None if it is not known."""
 
     @property
     def angle_increment(self) -> float:

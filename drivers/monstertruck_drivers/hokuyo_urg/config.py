@@ -4,6 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from monstertruck_drivers.emulation import RangeSheet
 from monstertruck_drivers.hokuyo_urg.models import LX, URG_04LX
 from monstertruck_drivers.scanning.config import ReturnsConfig
 from monstertruck_schemas.base import FrameId, Schema
@@ -38,6 +39,11 @@ class ScipConfig(Schema):
     clock_samples: Annotated[int, Field(ge=1, le=100)] = 12
     """Exchanges of the start-up clock comparison; the quickest one counts."""
 
+    @property
+    def sheet(self) -> RangeSheet:
+        """See ``scanning.config.sheet``."""
+        return URG_04LX.ranges
+
 
 class HokuyoConfig(ScipConfig):
     """URG-04LX."""
@@ -45,11 +51,6 @@ class HokuyoConfig(ScipConfig):
     SERIES = ("URG",)
 
     kind: Literal["hokuyo_urg"] = "hokuyo_urg"
-
-    @property
-    def sight(self) -> float:
-        """See ``scanning.config.sight``."""
-        return URG_04LX.ranges.sure
 
 
 class HokuyoLxConfig(ScipConfig, ReturnsConfig):
@@ -66,6 +67,6 @@ class HokuyoLxConfig(ScipConfig, ReturnsConfig):
     """Scan intervals allowed for the first scan after starting."""
 
     @property
-    def sight(self) -> float:
-        """See ``scanning.config.sight``."""
-        return LX[self.model].ranges.sure
+    def sheet(self) -> RangeSheet:
+        """See ``scanning.config.sheet``."""
+        return LX[self.model].ranges

@@ -460,6 +460,7 @@ class HokuyoDriver:
                 range_max=min(longest, greatest_2char) if config.scan_format == "MS" else longest,
                 ranges=ranges,
                 codes=codes,
+                range_noise=config.sheet.noise,
             )
         )
         self.scans += 1

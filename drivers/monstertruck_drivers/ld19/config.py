@@ -2,6 +2,7 @@
 
 from typing import Literal
 
+from monstertruck_drivers.emulation import RangeSheet
 from monstertruck_drivers.ld19.protocol import MODELS
 from monstertruck_drivers.scanning.config import TurningHeadConfig
 
@@ -14,6 +15,6 @@ class Ld19Config(TurningHeadConfig):
     """Which one it is: they send the same, but reach and measure differently"""
 
     @property
-    def sight(self) -> float:
-        """See ``scanning.config.sight``."""
-        return MODELS[self.model].ranges.sure
+    def sheet(self) -> RangeSheet:
+        """See ``scanning.config.sheet``."""
+        return MODELS[self.model].ranges

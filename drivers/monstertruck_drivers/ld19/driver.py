@@ -109,7 +109,7 @@ class Ld19Driver:
             WrongDeviceError: nothing that comes at the start is of an LD19.
             PortBusyError: another process holds the port.
         """
-        config, limits = self._config, MODELS[self._config.model].ranges
+        config, sheet = self._config, MODELS[self._config.model].ranges
         async with await self._port.open() as link:
             stream, cutter, samples = packet_stream(link, self._clock), TurnCutter(), PacketSamples()
             transfer = 0.001  # seconds assumed from the end of a packet on the line to its arrival
@@ -125,7 +125,7 @@ class Ld19Driver:
                         self._events(Reason.DEVICE_READY, Severity.INFO, self.name, MODELS[config.model].title)
                     due, first, usable = self._clock.now() + round(config.stale * SECOND), False, False
                     stamp = self._watch.stamp(mapping, packets[-1].stamp, stream.arrival, link.name)
-                    publish(turn, stamp - samples.elapsed, stream.arrival, limits[:2], config, self._out)
+                    publish(turn, stamp - samples.elapsed, stream.arrival, sheet, config, self._out)
                 if self._clock.now() >= due:
                     raise self._stale(link.name, usable)
                 packets = await stream.next(config.silence)

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from monstertruck_drivers.emulation import RangeSheet
 from monstertruck_drivers.rplidar.protocol import MODELS
 from monstertruck_drivers.scanning.config import TurningHeadConfig
 
@@ -32,6 +33,6 @@ class RplidarConfig(TurningHeadConfig):
         return MODELS[self.model].baud
 
     @property
-    def sight(self) -> float:
-        """See ``scanning.config.sight``."""
-        return MODELS[self.model].ranges.sure
+    def sheet(self) -> RangeSheet:
+        """See ``scanning.config.sheet``."""
+        return MODELS[self.model].ranges

@@ -9,7 +9,6 @@ from monstertruck_drivers.link import Link, Port
 from monstertruck_drivers.rplidar.config import RplidarConfig
 from monstertruck_drivers.rplidar.protocol import (
     COUNTS,
-    MODELS,
     SIZES,
     TURN_Q6,
     DataType,
@@ -162,7 +161,7 @@ class RplidarDriver:
             lambda data: decoder.feed(data, float(stream.arrival - begin)),
             batch=round(records) * SIZES[mode.answer],
         )
-        limits = MODELS[config.model].ranges.least, mode.longest
+        sheet = config.sheet._replace(greatest=mode.longest)
         due, first, measured = begin + round(config.first_scan * SECOND), True, False
         patience = config.first_scan
         while True:
@@ -181,7 +180,7 @@ class RplidarDriver:
                         self._report_ready(unit, mode)
                     due, first, measured = clock.now() + round(config.stale * SECOND), False, False
                     patience = config.silence
-                    publish(turn, begin, stream.arrival, limits, config, self._out)
+                    publish(turn, begin, stream.arrival, sheet, config, self._out)
             if clock.now() >= due:
                 if measured:
                     raise DeviceTimeoutError(f"{self._port.name}: samples, but no whole revolution")

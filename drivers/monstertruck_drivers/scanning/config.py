@@ -4,13 +4,14 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from monstertruck_drivers.emulation import RangeSheet
 from monstertruck_schemas.base import FrameId, Schema
 
 
-def sight(settings: Any) -> float:
-    """Return a scanner's sight: the distance within which it surely sees any obstacle, by its data sheet (m)."""
-    # Sight of a scanner whose settings state none (m), as for a URG-04LX.
-    stated: float = getattr(settings, "sight", 4.0)
+def sheet(settings: Any) -> RangeSheet:
+    """Return a scanner's ranges by its data sheet: the attribute ``sheet`` of its settings."""
+    # Ranges of a scanner whose settings state none, as for a URG-04LX.
+    stated: RangeSheet = getattr(settings, "sheet", RangeSheet(0.02, 4.0, 0.01, 0.01))
     return stated
 
 

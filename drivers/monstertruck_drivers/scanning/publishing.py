@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from monstertruck_drivers.emulation import RangeSheet
 from monstertruck_drivers.scanning.config import TurningHeadConfig
 from monstertruck_drivers.scanning.turns import HeadTurn, codes_of
 from monstertruck_runtime.clock import SECOND
@@ -15,7 +16,7 @@ def publish(
     turn: HeadTurn,
     origin: int,
     received: int,
-    limits: tuple[float, float],
+    sheet: RangeSheet,
     config: TurningHeadConfig,
     out: Publisher[LaserScan],
 ) -> None:
@@ -25,7 +26,7 @@ def publish(
         turn: the revolution.
         origin: daemon's time at the zero of the samples' clock (ns).
         received: arrival time of its last sample (ns).
-        limits: minimum and maximum range of the scanner (m).
+        sheet: ranges and noise of the scanner.
         config: settings of the scanner.
         out: publisher of the scans.
     """
@@ -41,10 +42,11 @@ def publish(
             end_angle=start - math.tau * turn.step * (count - 1),
             time_increment=turn.period * turn.step / SECOND,
             scan_time=turn.period / SECOND,
-            range_min=limits[0],
-            range_max=limits[1],
+            range_min=sheet.least,
+            range_max=sheet.greatest,
             ranges=np.where(turn.ranges > 0.0, turn.ranges, np.inf),
             codes=codes_of(turn, free=config.no_return == "free"),
             intensities=turn.intensities,
+            range_noise=sheet.noise,
         )
     )

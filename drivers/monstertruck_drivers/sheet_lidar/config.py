@@ -64,11 +64,6 @@ class SheetLidarConfig(ReturnsConfig):
         """Ranges and errors."""
         return RangeSheet(self.range_min, self.range_max, self.error, self.relative_error, self.range_dark)
 
-    @property
-    def sight(self) -> float:
-        """See ``scanning.config.sight``."""
-        return self.sheet.sure
-
     @model_validator(mode="after")
     def _ranges_in_order(self) -> Self:
         if not self.range_min < (self.range_dark or self.range_max) <= self.range_max:

@@ -85,6 +85,7 @@ class SheetLidarDriver:
                 range_max=config.range_max,
                 ranges=np.where(met, scan.ranges / 1000.0, np.inf),
                 codes=np.where(met, VALID_BEAM, self._without).astype(np.uint8),
+                range_noise=config.sheet.noise,
             )
         )
 

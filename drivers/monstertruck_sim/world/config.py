@@ -10,6 +10,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
+from monstertruck_drivers.emulation import SIGMAS
 from monstertruck_kinematics.chassis import Chassis, Dimensions
 from monstertruck_kinematics.polynomials import AxlePolynomials, SteeringPolynomials
 from monstertruck_kinematics.truck import DriveTrain
@@ -296,7 +297,7 @@ class LidarConfig(Schema):
     """Minimum range, m; null: from the device's data sheet."""
     max_range: Positive | None = None
     """Maximum range, m; null: from the device's data sheet."""
-    accuracy_sigmas: Positive = 2.0
+    accuracy_sigmas: Positive = SIGMAS
     """Error bound of the data sheet in standard deviations."""
     dropout: Fraction = 0.002
     """Probability that a single beam fails."""

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from monstertruck_drivers.battery.config import PackConfig
 from monstertruck_drivers.catalog import DEVICES
-from monstertruck_drivers.scanning.config import sight
+from monstertruck_drivers.scanning.config import sheet
 from monstertruck_drivers.usb.config import UsbPortConfig
 from monstertruck_drivers.usb.tree import TreeSnapshot, parent_of, port_of
 from monstertruck_kinematics.chassis import Chassis, Dimensions
@@ -249,7 +249,7 @@ def _navigation(answers: Answers, chassis: Chassis, tracker: Section) -> Section
     """What differs from the part for mapping and exploring."""
     lidar = answers.lidar_driver
     settings = DEVICES[answers.lidar_kind].settings_class().model_validate(lidar, strict=False)
-    reach = sight(settings)
+    reach = sheet(settings).sure
     noticed = 0.3  # seconds until three scans have shown the route blocked
     stop = answers.speed * noticed + answers.speed**2 / (2 * tracker["deceleration"])
     views = {"hokuyo_urg": math.radians(239.0), "hokuyo_lx": math.radians(270.0)}

@@ -18,7 +18,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Twist2
 
 RANGE_NOISE: Final = 0.012
-"""Standard deviation of a range close by, m (URG-04LX and SICK LMS200 manuals: 10 to 15 mm)."""
+"""Least standard deviation of a range close by, m (URG-04LX and SICK LMS200 manuals: 10 to 15 mm)."""
 RELATIVE_NOISE: Final = 0.005
 """Increase per metre of range (beam width, URG-04LX: 1 % of the range as limits)."""
 REACH: Final = 0.2
@@ -46,6 +46,8 @@ class ScanGeometry:
     """Seconds between neighbouring beams."""
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Pose of the sensor in base, m and rad."""
+    noise: float = 0.0
+    """Standard deviation of a range close by, m; counts from ``RANGE_NOISE`` on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +122,7 @@ def prepare(
         geometry.time_increment,
         np.array((xs, ys, yaw)),
         np.array(twist, dtype=np.float64),
+        max(geometry.noise, RANGE_NOISE),
     )
     return Scan(*elements)
 
@@ -139,6 +142,7 @@ def prepare_input(inputs: ScanInput, longest: float, twist: Twist2 = (0.0, 0.0, 
         inputs.range_max,
         inputs.time_increment,
         inputs.mount,
+        inputs.range_noise or 0.0,
     )
     return prepare(level_ranges(inputs), geometry, twist if inputs.odom is None else inputs.twist, longest)
 
@@ -168,7 +172,7 @@ def level_ranges(inputs: ScanInput) -> Array:
 
 
 @njit(cache=True)
-def _prepare(ranges, start, increment, shortest, longest, beam_time, mount, twist):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _prepare(ranges, start, increment, shortest, longest, beam_time, mount, twist, near):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     """Arrays of ``Scan``; see there."""
     n = 0
     for r in ranges:
@@ -204,14 +208,14 @@ def _prepare(ranges, start, increment, shortest, longest, beam_time, mount, twis
     extents = np.zeros(n)
     joined = np.zeros(n + 1, np.bool_)  # with the point before
     for i in range(1, n):
-        joined[i] = _joined(points, beams, reach, abs(increment), i - 1, i)
+        joined[i] = _joined(points, beams, reach, abs(increment), near, i - 1, i)
     for i in range(n):
-        _surface(points, origins, joined, reach, abs(increment), i, normals, variances, extents)
+        _surface(points, origins, joined, reach, abs(increment), near, i, normals, variances, extents)
     return points, normals, variances, extents
 
 
 @njit(cache=True)
-def _joined(points, beams, reach, increment, a, b):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _joined(points, beams, reach, increment, near, a, b):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     """Whether the neighbouring points ``a`` and ``b`` plausibly lie on one surface."""
     gap = beams[b] - beams[a]
     if gap > 3:
@@ -220,13 +224,13 @@ def _joined(points, beams, reach, increment, a, b):  # type: ignore[no-untyped-d
     apart = math.hypot(points[a, 0] - points[b, 0], points[a, 1] - points[b, 1])
     # Neighbouring beams hit one surface if the line through their ends is steeper to the beam than this, rad.
     grazing = 0.12
-    return apart < r * increment * gap / grazing + 3.0 * (RANGE_NOISE + RELATIVE_NOISE * r)
+    return apart < r * increment * gap / grazing + 3.0 * (near + RELATIVE_NOISE * r)
 
 
 @njit(cache=True)
-def _surface(points, origins, joined, reach, increment, i, normals, variances, extents):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+def _surface(points, origins, joined, reach, increment, near, i, normals, variances, extents):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     """Normal and variances of point ``i`` from its neighbours in beam order."""
-    noise = RANGE_NOISE + RELATIVE_NOISE * reach[i]
+    noise = near + RELATIVE_NOISE * reach[i]
     spacing = reach[i] * increment
     window = max(REACH, 2.5 * spacing)
     sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0

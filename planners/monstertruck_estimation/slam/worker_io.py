@@ -56,6 +56,8 @@ class ScanInput:
     """Height of the sensor above the ground (m); None if unknown: hits of the ground are not removed."""
     ceiling: float | None = None
     """Height of the ceiling above the ground (m)."""
+    range_noise: float | None = None
+    """Standard deviation of a range close by (m); None if it is not known."""
 
     @classmethod
     def of(cls, scan: LaserScan, mount: Pose2) -> Self:
@@ -69,6 +71,7 @@ class ScanInput:
             range_max=scan.range_max,
             time_increment=scan.time_increment,
             mount=mount,
+            range_noise=scan.range_noise,
         )
 
 

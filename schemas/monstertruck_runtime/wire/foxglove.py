@@ -157,6 +157,8 @@ def _write_scan(scan: LaserScan, proto: Any) -> None:
         proto.intensities = scan.intensities.astype(np.float64).tobytes()
     if scan.tilt is not None:
         proto.tilt = _packed(scan.tilt)
+    if scan.range_noise is not None:
+        proto.range_noise = _packed(scan.range_noise)
 
 
 def _read_scan(proto: Any) -> _Fields:
@@ -172,6 +174,7 @@ def _read_scan(proto: Any) -> _Fields:
         "codes": np.frombuffer(proto.codes, np.uint8),
         "intensities": _array(proto.intensities).astype(np.uint8) if proto.intensities else None,
         "tilt": _unpacked(proto.tilt, 1)[0] if proto.tilt else None,
+        "range_noise": _unpacked(proto.range_noise, 1)[0] if proto.range_noise else None,
     }
 
 

@@ -67,6 +67,7 @@ scans = st.integers(0, 20).flatmap(
         codes=hnp.arrays(np.uint8, n),
         intensities=st.none() | hnp.arrays(np.uint8, n) if n else st.none(),
         tilt=st.none() | st.floats(0, 2),
+        range_noise=st.none() | st.floats(0, 0.1),
     )
 )
 echoes = st.lists(

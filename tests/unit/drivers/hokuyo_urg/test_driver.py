@@ -47,7 +47,7 @@ def test_every_start_state_ends_in_a_stream(state: str):
     assert scan.end_angle == pytest.approx((725 - 384) * 2 * np.pi / 1024)
     assert scan.time_increment == pytest.approx(0.1 / 1024)
     assert scan.scan_time == pytest.approx(0.1)
-    assert (scan.range_min, scan.range_max) == (0.02, 5.6)
+    assert (scan.range_min, scan.range_max, scan.range_noise) == (0.02, 5.6, 0.005)
     assert scan.frame == "lidar"
     assert rig.events.reasons() == [Reason.DEVICE_READY]
     assert rig.events.kept[0][3]["serial"] == "H0706400"

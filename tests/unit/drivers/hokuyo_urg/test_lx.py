@@ -64,6 +64,7 @@ def test_scans_of_a_turning_robot_show_the_room(model: Any, rate: float):
             assert len(scan.ranges) == 1081
             assert (scan.start_angle, scan.end_angle) == pytest.approx((-FIELD / 2, FIELD / 2))
             assert scan.scan_time == 0.025
+            assert scan.range_noise == {"utm_30lx": 0.015}.get(model, 0.02)
             assert (scan.codes == VALID_BEAM).all()
             assert rig.room.off(scan).max() < 0.01, "every beam by its own instant"
             assert 0.018 < (scan.received - scan.stamp) / SECOND < 0.03

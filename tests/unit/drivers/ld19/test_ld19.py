@@ -57,6 +57,7 @@ def test_scans_of_a_turning_robot_show_the_room(model, rate):
             assert scan.angle_increment < 0.0, "clockwise"
             assert len(scan.ranges) == pytest.approx(count, abs=2)
             assert scan.scan_time == pytest.approx(0.1, rel=0.02)
+            assert scan.range_noise == 0.0225
             off = rig.room.off(scan)
             assert off[ahead(scan)].max() < 0.01
             assert off.max() < 4.3 * abs(scan.angle_increment)

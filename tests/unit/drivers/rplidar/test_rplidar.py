@@ -69,6 +69,7 @@ def test_scans_of_every_model_in_every_mode_show_the_room(model, mode):
             assert len(scan.ranges) == pytest.approx(1 / listed.sample_time / sheet.frequency, rel=0.02)
             assert (scan.codes == VALID_BEAM).mean() > 0.95
             assert scan.range_max == listed.longest
+            assert scan.range_noise == sheet.ranges.error / 2
             off = rig.room.off(scan)
             assert np.percentile(off[ahead(scan)], 95) < 0.01
             assert off.max() < 4.3 * abs(scan.angle_increment) + 0.01

@@ -1,9 +1,19 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.scans import Scan, ScanGeometry, downsample_indices, prepare
+from monstertruck_estimation.slam.scans import (
+    RANGE_NOISE,
+    RELATIVE_NOISE,
+    Scan,
+    ScanGeometry,
+    downsample_indices,
+    prepare,
+    prepare_input,
+)
+from monstertruck_estimation.slam.worker_io import ScanInput
 from tests.unit.estimation.slam.kit import BEAMS, LIDAR, ROOM, box, ranges
 
 FAN = ScanGeometry(-math.pi / 2, math.pi / 180, 0.1, 30.0)
@@ -40,6 +50,16 @@ def test_a_lone_point_says_the_same_in_all_directions():
     values[90] = 2.0
     scan = prepare(values, FAN)
     assert scan.variances[0, 0] == scan.variances[0, 1]
+
+
+def test_points_are_as_unsure_as_the_data_sheet_says():
+    values = ranges(ROOM, (2.0, 0.0, 1.5))
+    sheet = {"start_angle": LIDAR.start_angle, "angle_increment": LIDAR.angle_increment, "range_min": 0.02}
+    inputs = ScanInput(stamp=0, ranges=values, range_max=5.6, **sheet)
+    for stated, near in ((None, RANGE_NOISE), (0.005, RANGE_NOISE), (0.0225, 0.0225)):
+        least = (near + RELATIVE_NOISE * values.min()) ** 2
+        found = prepare_input(replace(inputs, range_noise=stated), 4.0).variances[:, 0].min()
+        assert found == pytest.approx(least, rel=0.05), stated
 
 
 def test_motion_during_the_scan_is_undone():
