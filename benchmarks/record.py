@@ -3,7 +3,7 @@
     python benchmarks/record.py NAME --measures PATH [PATH ...] -- benchmarks/deaths.py --trials 20
 
 NAME is that of the file. The benchmark's last line gives figures and goals; Markdown tables in its output become the
-tables ``1``, ``2`` ... ``python docs/site/figures.py`` then updates the pages that include the file.
+tables ``1``, ``2`` ... Pages that link them show them on the site.
 """
 
 import argparse

@@ -1,7 +1,6 @@
-"""Distributions made from a documentation page's own code blocks, installed outside the tree without network."""
+"""Distributions that documentation pages show (``docs/examples/``), installed outside the tree without network."""
 
 import os
-import re
 import subprocess
 import sys
 import zipfile
@@ -12,12 +11,13 @@ import pytest
 from monstertruck_schemas import entry_points
 
 ROOT = Path(__file__).resolve().parents[1]
-BLOCK = re.compile(r'^```\w+ title="(?P<file>[^"]+)"\n(?P<text>.*?)^```$', re.DOTALL | re.MULTILINE)
 
 
-def files_of(page: Path) -> dict[str, str]:
-    """Code blocks of a page by their titles, the names of the files they are."""
-    return {block["file"]: block["text"] for block in BLOCK.finditer(page.read_text(encoding="utf-8"))}
+def files_of(example: str) -> dict[str, str]:
+    """Files of a package in ``docs/examples``, by their places in it."""
+    folder = ROOT / "docs" / "examples" / example
+    files = [file for file in folder.rglob("*") if file.suffix in {".py", ".toml", ".yaml"}]
+    return {file.relative_to(folder).as_posix(): file.read_text(encoding="utf-8") for file in files}
 
 
 def written(files: dict[str, str], folder: Path) -> Path:

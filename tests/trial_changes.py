@@ -127,7 +127,7 @@ def _in_place(package: str, folder: str) -> Callable[[str], str]:
 
 def _sensor() -> Trial:
     """The range finder of the how-to of drivers, as a device of this repository with a role of its own."""
-    page = files_of(ROOT / "docs" / "writing-a-driver.md")
+    page = files_of("driver")
     moved = _in_place("truck_sonar", "monstertruck_drivers.mb7360")
     message = page["truck_sonar/message.py"].partition("class SonarRange")[2]
     own = {
@@ -210,7 +210,7 @@ class TwinConfig(EposConfig):
 
 def _body() -> Trial:
     """The tracked vehicle of the how-to of bodies, as a body of this repository."""
-    page = files_of(ROOT / "docs" / "writing-a-robot-body.md")
+    page = files_of("robot_body")
     settings = page["truck_tracked/config.py"].partition("class TrackedBody")[2]
     row = page["truck_tracked/plugin.py"].partition("TRACKED = ")[2].rstrip()
     row = row.replace("truck_tracked.config", "monstertruck_schemas.body")

@@ -66,12 +66,12 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Show the marked code, and turn links to files of the repository into links of the site."""
+    """Show linked code and figures, and turn links to files of the repository into links of the site."""
     if page.is_homepage:
         page.meta["hide"] = ["navigation"]
     if page.file.src_uri.startswith(UNSEARCHED):
         page.meta["search"] = {"exclude": True}
-    return source.shown(_to_site(markdown, page.file.src_uri))
+    return _to_site(figures.shown(source.shown(markdown)), page.file.src_uri)
 
 
 def _to_site(markdown: str, uri: str) -> str:

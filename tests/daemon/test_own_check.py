@@ -36,7 +36,7 @@ print(stop.reason, "|", stop.text)
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page's files, next to the configurations that they include."""
-    folder = written(files_of(ROOT / "docs" / "writing-a-gate-check.md"), tmp_path_factory.mktemp("bumper"))
+    folder = written(files_of("gate_check"), tmp_path_factory.mktemp("bumper"))
     (folder / "configs").symlink_to(ROOT / "configs")
     return folder
 

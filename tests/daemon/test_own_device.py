@@ -21,7 +21,7 @@ pytestmark = pytest.mark.timeout(180)
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page's files, next to the configurations that they include."""
-    folder = written(files_of(ROOT / "docs" / "writing-a-driver.md"), tmp_path_factory.mktemp("sonar"))
+    folder = written(files_of("driver"), tmp_path_factory.mktemp("sonar"))
     (folder / "configs").symlink_to(ROOT / "configs")
     return folder
 

@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 @pytest.fixture(scope="module")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page's files, next to the configurations that they include."""
-    folder = written(files_of(ROOT / "docs" / "writing-a-planner.md"), tmp_path_factory.mktemp("linear"))
+    folder = written(files_of("planner"), tmp_path_factory.mktemp("linear"))
     (folder / "configs").symlink_to(ROOT / "configs")
     return folder
 

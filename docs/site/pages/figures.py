@@ -1,8 +1,7 @@
 """Measured figures: one file a benchmark in ``docs/figures``, included in the pages by name.
 
-A block below ``<!-- figures: FILE -->`` holds the figures and goals of a file, a block below
-``<!-- figures: FILE.TABLE -->`` one of its tables. A test fails if a block differs from its file, or if a page of
-``OWNED`` holds a measured number outside a block.
+On the site a paragraph ``[Figures](figures/FILE.json)`` becomes the figures and goals of a file, and
+``[Figures](figures/FILE.json "TABLE")`` one of its tables. A test fails if a page of ``OWNED`` holds a measured number.
 """
 
 import json
@@ -18,10 +17,7 @@ DOCS = Path(__file__).resolve().parents[2]
 FOLDER = DOCS / "figures"
 OWNED = ("benchmarks.md", "safety-case.md")
 """Pages whose measured numbers all come from files."""
-BLOCK = re.compile(
-    r"^(?P<mark><!-- figures: (?P<file>\w+)(?:\.(?P<table>\w+))? -->)\n(?:\n?(?:\|.*\n)+)?(?:\n?Measured by .*\n)?",
-    re.MULTILINE,
-)
+LINK = re.compile(r'^\[Figures\]\(figures/(?P<file>\w+)\.json(?: "(?P<table>\w+)")?\)$', re.MULTILINE)
 NOT_PROSE = re.compile(r"^```.*?^```|`[^`\n]*`|\]\([^)]*\)|<!--.*?-->", re.MULTILINE | re.DOTALL)
 UNITS = r"(?:[num]?s|%|[kM]?B|[cm]?m|x|Hz|rad|degrees|seconds|minutes|metres)"
 NUMBER = re.compile(rf"(?<![\w.-])\d[\d ]*(?:\.\d+)? ?{UNITS}(?![\w-])")
@@ -74,8 +70,8 @@ def read(file: Path) -> Figures:
         raise ValueError(f"{file.name}: {error!r}") from error
 
 
-def refreshed(markdown: str) -> str:
-    """Return ``markdown`` with the current figures below every mark.
+def shown(markdown: str) -> str:
+    """Return ``markdown`` with tables in place of every paragraph that links to figures.
 
     Raises:
         OSError: no such file.
@@ -85,9 +81,9 @@ def refreshed(markdown: str) -> str:
     def block(found: re.Match[str]) -> str:
         figures = read(FOLDER / f"{found['file']}.json")
         rows = figures.tables[found["table"]] if found["table"] else _values(figures)
-        return f"{found['mark']}\n\n{table(rows[0], rows[1:])}\n\n{figures.source}\n"
+        return f"{table(rows[0], rows[1:])}\n\n{figures.source}"
 
-    return BLOCK.sub(block, markdown)
+    return LINK.sub(block, markdown)
 
 
 def pages() -> Iterator[Page]:
@@ -102,10 +98,8 @@ def pages() -> Iterator[Page]:
 
 
 def unowned(markdown: str) -> list[str]:
-    """Return the numbers with units that stand outside figures blocks, code, and columns of requirements."""
-    text = re.sub(
-        r"^```.*?^```|`[^`\n]*`|\]\([^)]*\)|<!--.*?-->", "", BLOCK.sub("", markdown), flags=re.MULTILINE | re.DOTALL
-    )
+    """Return the numbers with units that stand outside code and columns of requirements."""
+    text = NOT_PROSE.sub("", markdown)
     return [found[0] for line in _without_requirements(text.splitlines()) for found in NUMBER.finditer(line)]
 
 

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.timeout(600)
 
 
 def project(page: str, folder: Path) -> Path:
-    written(files_of(ROOT / "docs" / f"writing-a-{page}.md"), folder)
+    written(files_of(page.replace("-", "_")), folder)
     (folder / "configs").symlink_to(ROOT / "configs")
     return folder
 

@@ -1,0 +1,1 @@
+"""MaxBotix MB7360, an ultrasonic range finder, for monstertruckd."""

@@ -1,0 +1,1 @@
+"""A bumper that stops the truck."""

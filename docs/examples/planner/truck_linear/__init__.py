@@ -1,0 +1,1 @@
+"""Linear state feedback, a path tracker for monstertruckd."""
