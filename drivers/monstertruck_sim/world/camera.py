@@ -140,8 +140,8 @@ class SimulatedView:
             panels += [person_panel(*person, place) for person in self.crowd.people_at(time_ns)]
         if (board := self.board_at(time_ns)) is not None:
             panels.append(board)
-        grain = self.grain(time_ns)
-        return lambda: grain(painter.picture(ranges, panels, place))
+        sensor = self.sensor(time_ns)
+        return lambda: sensor(painter.picture(ranges, panels, place))
 
     def board_at(self, time_ns: int) -> FlatPanel | None:
         """The board that a person holds before it, or None."""
@@ -156,13 +156,13 @@ class SimulatedView:
             self._painters[size] = Painter(self.config, size, self._wall_height)
         return self._painters[size]
 
-    def grain(self, time_ns: int) -> Callable[[Picture], Picture]:
-        """Adds the sensor's noise at an instant."""
-        if self._seed is None or not self.config.noise:
-            return lambda picture: picture
-        seed, noise = self._seed, self.config.noise
+    def sensor(self, time_ns: int) -> Callable[[Picture], Picture]:
+        """Return what light, lens and sensor make of a drawn picture at an instant."""
+        config, seed = self.config, self._seed
+        if seed is None or not config.noise:
+            return lambda picture: lit(picture, config)
         row, column = generator(seed, CAMERA, self.plant.slot(time_ns, 1_000_000)).integers(0, _GRAIN, 2).tolist()
-        return lambda picture: _grainy(picture, seed, noise, row, column)
+        return lambda picture: _grainy(lit(picture, config), seed, config.noise, row, column)
 
     def _in_view(self, place: CameraPlace) -> list[FlatPanel]:
         """Tags before the camera that show it their front, the farthest one first."""
@@ -411,6 +411,21 @@ def _palette() -> NDArray[np.uint8]:
     rows[FLOOR:SKY] = (60, 55, 50) + ramp * (60, 55, 45)
     rows[SKY:] = (215, 220, 225) - ramp * (95, 65, 25)
     return rows.astype(np.uint8)
+
+
+def lit(picture: Picture, config: CameraConfig) -> Picture:
+    """Return a picture in the light, and as sharp, as configured.
+
+    Raises:
+        NotInstalledError: the extra ``vision``, needed for ``blur``, is not installed.
+    """
+    if config.brightness != 1.0 or config.gradient:
+        gain = config.brightness * (1.0 + config.gradient * np.linspace(1.0, -1.0, picture.shape[1], dtype=np.float32))
+        picture = np.minimum(picture * gain[:, None], 255.0).astype(np.uint8)
+    if config.blur:
+        cv2 = opencv("sim.world.camera.blur")
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), config.blur), dtype=np.uint8)
+    return picture
 
 
 def _grainy(picture: Picture, seed: int, noise: float, row: int, column: int) -> Picture:

@@ -336,6 +336,12 @@ class CameraConfig(Schema):
     """Radial distortion coefficient, fourth order."""
     noise: Annotated[float, Field(ge=0, le=50)] = 0.0
     """Standard deviation of the pixel noise, grey levels of 255."""
+    brightness: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """Brightness of the image relative to the drawn one; values above 255 saturate."""
+    gradient: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    """Relative change in brightness from the image's centre to its left edge; the opposite to its right edge."""
+    blur: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Standard deviation of the defocus, in pixels."""
     reach: Positive = 30.0
     """Maximum drawing distance, m."""
     rendered: bool = False

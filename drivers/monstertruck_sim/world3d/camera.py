@@ -52,14 +52,14 @@ class RenderedView(SimulatedView):
         there = [] if crowd is None else standing(crowd.people_at(time_ns), self._rigid.ground)
         robots = () if crowd is None else crowd.robots_beside(self._rigid)
         renderer.arrange(self._rigid.data, pose, people=there, robots=robots, hidden=self.HIDDEN)
-        grain = self.grain(time_ns)
+        sensor = self.sensor(time_ns)
         board = self.board_at(time_ns)
 
         def draw() -> Picture:
             picture = _bent(self._thread.submit(renderer.render).result(), wider, painter)
             if board is not None:
                 painter.draw(picture, board, place, np.full(len(painter.azimuths), np.inf))
-            return grain(picture)
+            return sensor(picture)
 
         return draw
 

@@ -125,6 +125,28 @@ def test_a_distorted_noisy_lens_moves_the_tag_as_its_coefficients_say():
     assert bent == pytest.approx(ideal * factor * FOCAL + (319.5, 239.5), abs=0.5)
 
 
+def test_light_falls_off_to_one_side_and_saturates():
+    plain, dark, bright = (
+        world_with((), noise=0.0, **light).view.exposure(SECOND, SIZE)().astype(float)
+        for light in ({}, {"brightness": 0.5, "gradient": 0.4}, {"brightness": 4.0})
+    )
+    left, centre, right = (dark[:, at] / plain[:, at] for at in (0, 320, 639))
+    assert np.median(left) == pytest.approx(0.7, abs=0.02)
+    assert np.median(centre) == pytest.approx(0.5, abs=0.02)
+    assert np.median(right) == pytest.approx(0.3, abs=0.02)
+    assert bright.max() == 255
+
+
+def test_defocus_flattens_the_edges_of_a_tag_and_keeps_its_place():
+    tag = TagConfig(tag=7, x=0.305, y=3.95 + 0.1, z=0.3, yaw=0.0)
+    sharp, blurred = world_with((tag,), noise=0.0), world_with((tag,), noise=0.0, blur=1.0)
+    edges = [
+        np.abs(np.diff(w.view.exposure(SECOND, SIZE)()[..., 0].astype(int), axis=1)).max() for w in (sharp, blurred)
+    ]
+    assert edges[1] < 0.6 * edges[0]
+    assert seen(blurred)[7] == pytest.approx(seen(sharp)[7], abs=0.2)
+
+
 def test_a_tag_is_hidden_by_a_person_and_has_no_back():
     tag = TagConfig(tag=7, x=0.305, y=3.95, yaw=0.0)
     walker = PersonConfig(waypoints=(Spot(x=0.8, y=3.95), Spot(x=0.8, y=4.2)), pause=1000.0)
