@@ -50,31 +50,32 @@ def free_distances(twists: Array, footprint: Footprint, margin: float, points: A
     Returns:
         Shape (k,), m.
     """
-    if not len(points):
-        return np.full(len(twists), math.inf)
+    result = np.full(len(twists), math.inf)
     places, radius = footprint.covering_discs()
     radius += margin
     vx, vy, turn = twists.T
     # 1e-3: a straight line is computed as a circle of 1000 m, 1 mm off after 1.4 m
     turn = np.where(np.abs(turn) < 1e-3, 1e-3, turn)
-    side = np.sign(turn)[:, None]
     centre = np.column_stack((-vy / turn, vx / turn))
-    arms = points[None] - centre[:, None]
-    reach, bearing = np.hypot(arms[..., 0], arms[..., 1]), np.arctan2(arms[..., 1], arms[..., 0])
-    result = np.full(len(twists), math.inf)
+    # A disc meets the points in the ring that it sweeps around the centre, and no others.
+    square = (points**2).sum(axis=1) - 2.0 * centre @ points.T + (centre**2).sum(axis=1)[:, None]
+    sizes = np.hypot(places - centre[:, :1], centre[:, 1:])
+    inner, outer = np.maximum(sizes.min(axis=1) - radius, 0.0), sizes.max(axis=1) + radius
+    # 1e-6: rounding of a square of 1000 m, m^2
+    of, met = np.nonzero((square >= (inner**2 - 1e-6)[:, None]) & (square <= (outer**2 + 1e-6)[:, None]))
+    points, centre, turn, vx, vy = points[met], centre[of], turn[of], vx[of], vy[of]
+    arms = points - centre
+    reach, bearing = np.hypot(*arms.T), np.arctan2(*arms.T[::-1])
     for disc in places.tolist():
         arm = np.array((disc, 0.0)) - centre
-        size, begin = np.hypot(*arm.T)[:, None], np.arctan2(arm[:, 1], arm[:, 0])[:, None]
+        size, begin = np.hypot(*arm.T), np.arctan2(*arm.T[::-1])
         cosine = (reach**2 + size**2 - radius**2) / np.maximum(2.0 * reach * size, 1e-12)
-        distance = np.full(reach.shape, math.inf)
-        met = cosine <= 1.0
-        ahead = np.mod((side * (bearing - begin))[met], math.tau) - np.arccos(np.maximum(cosine[met], -1.0))
-        distance[met] = np.maximum(ahead, 0.0) / np.broadcast_to(np.abs(turn)[:, None], reach.shape)[met]
+        ahead = np.mod(np.sign(turn) * (bearing - begin), math.tau) - np.arccos(np.clip(cosine, -1.0, 1.0))
+        distance = np.where(cosine <= 1.0, np.maximum(ahead, 0.0) / np.abs(turn), math.inf)
         dx, dy = points[:, 0] - disc, points[:, 1]
-        towards = vx[:, None] * dx + (vy + turn * disc)[:, None] * dy > 0.0
+        towards = vx * dx + (vy + turn * disc) * dy > 0.0
         inside = np.hypot(dx, dy) <= radius
-        distance = np.where(inside, np.where(towards, 0.0, math.inf), distance)
-        result = np.minimum(result, distance.min(axis=1))
+        np.minimum.at(result, of, np.where(inside, np.where(towards, 0.0, math.inf), distance))
     return result
 
 
