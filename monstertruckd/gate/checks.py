@@ -51,19 +51,29 @@ class PaceLimit(NamedTuple):
 
 
 class DockArea(NamedTuple):
-    """Area in front of a dock, in base."""
+    """Area in front of a dock, in base at the latest scan."""
 
-    housing: tuple[Pose2, float, float] | None
-    """Near face of the dock's housing (pose of its middle, x away from the robot), depth and width (m); None without
-    one."""
+    docked: Pose2
+    """Pose of the docked robot, turned so that its x axis leads into the dock."""
+    corridor: tuple[float, float, float]
+    """Ground on the axis of the dock: first and last x and the greatest distance from the axis, relative to ``docked``
+    (m)."""
+    housing: tuple[float, float, float] | None
+    """Part of the dock that the lidar sees: first and last x and half its width, relative to ``docked`` (m); None
+    without one."""
 
     def outside(self, points: Array) -> NDArray[np.bool_]:
         """Whether each point (n, 2) in base (m) is no part of the housing."""
-        if self.housing is None:
-            return np.ones(len(points), np.bool_)
-        face, depth, width = self.housing
-        x, y = points_relative(points, face).T
-        return np.asarray((x < 0.0) | (x > depth) | (np.abs(y) > width / 2))
+        return np.ones(len(points), np.bool_) if self.housing is None else ~self._within(self.housing, points)
+
+    def on_axis(self, points: Array) -> NDArray[np.bool_]:
+        """Whether each point (n, 2) in base (m) lies in the corridor."""
+        return self._within(self.corridor, points)
+
+    def _within(self, box: tuple[float, float, float], points: Array) -> NDArray[np.bool_]:
+        first, last, half = box
+        x, y = points_relative(points, self.docked).T
+        return np.asarray((x >= first) & (x <= last) & (np.abs(y) <= half))
 
 
 class GateView:

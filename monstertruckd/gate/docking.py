@@ -9,19 +9,20 @@ behaviour says in ``plan/behaviour``; the gate believes it only within these bou
   than the staging pose, and no more than ``docking.beyond`` past the docked pose. A robot that docks in reverse also
   looks at the dock, and backs off to turn about: either end may face the dock, as far as ``turning`` beyond staging.
 
-Within them the pace is at most ``docking.speed``, lidar returns inside the housing do not count as obstacles, and
-ground on the axis counts as seen. All other rules stay in force, and contact is detected as for an operator on unseen
-ground.
+Within them the pace is at most ``docking.speed``, lidar returns inside the housing do not count as obstacles, and the
+corridor of a robot within these bounds counts as seen ground. All other rules stay in force, and contact is detected as
+for an operator on unseen ground.
 """
 
 import math
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import between, compose
+from monstertruck_kinematics.se2 import between, compose, interpolate
 from monstertruck_planners.behave.dock.config import DockConfig
 from monstertruck_planners.behave.dock.estimate import facing
 from monstertruck_planners.goals.exchange import placeless
@@ -55,7 +56,7 @@ class DockCheck(Check):
         super().__init__(view)
         self._docks = docks
         self._behaviour: BehaviourState | None = None
-        self._odometry: Odometry | None = None
+        self._trail: deque[Odometry] = deque(maxlen=64)  # odometry kept, more than 1 s: the age of a fresh scan
         self._located: Odometry | None = None
         """Latest pose in map."""
         self._slam: SlamHealth | None = None
@@ -69,14 +70,15 @@ class DockCheck(Check):
         elif isinstance(seen, SlamHealth):
             self._slam = seen
         elif isinstance(seen, Odometry) and topic is ODOMETRY:
-            self._odometry = seen
+            self._trail.append(seen)
         elif isinstance(seen, Odometry) and topic is POSE:
             self._located = seen
 
     def _area(self, now: int) -> DockArea | None:
-        behaviour, odometry = self._behaviour, self._odometry
-        if behaviour is None or odometry is None or not behaviour.running or behaviour.dock is None:
+        behaviour, scan = self._behaviour, self.view.samples.scan
+        if behaviour is None or not behaviour.running or behaviour.dock is None or not self._trail or scan is None:
             return None
+        odometry = self._trail[-1]
         dock = self._docks.get(behaviour.dock.name)
         late = now - behaviour.received > FRESH or now - odometry.received > ODOMETRY.fresh_for() * SECOND
         if dock is None or late or self.view.planner != ServiceName.BEHAVIOURS.value:
@@ -95,12 +97,18 @@ class DockCheck(Check):
         inside = -far - limits.across <= x <= limits.beyond
         if not inside or abs(y) > limits.across or abs(turn) > limits.turn:
             return None
-        if dock.housing is None:
-            return DockArea(None)
-        # 0.03: noise of lidar returns before the housing, m
-        face = compose(at_dock, np.array((self.view.footprint.length / 2 - 0.03, 0.0, 0.0)))
-        at_x, at_y, yaw = between(here, face).tolist()
-        return DockArea(((at_x, at_y, yaw), dock.housing.depth + 0.03, dock.housing.width))
+        # A scan shows the dock from where the robot was at its stamp.
+        stamps = np.array([sample.stamp for sample in self._trail])
+        poses = np.array([_base(sample) for sample in self._trail])
+        there = interpolate(stamps, poses, np.array([min(scan.stamp, scan.received)]))[0]
+        at_x, at_y, yaw = between(there, at_dock).tolist()
+        body = self.view.footprint
+        end = body.length / 2
+        side = limits.across + body.half_length * math.sin(limits.turn) + body.half_width * math.cos(limits.turn)
+        # Past ``beyond`` there is no area. 0.03: noise of lidar returns before the housing, m
+        box = dock.housing
+        housing = None if box is None else (end - 0.03, end + box.depth, box.width / 2)
+        return DockArea((at_x, at_y, yaw), (-far - limits.across - end, math.inf, side), housing)
 
     def _place(self, now: int) -> Array | None:
         """Base in map, shape (3,); None if it is old or not known."""

@@ -209,7 +209,7 @@ class ObstacleGuard:
 
         Args:
             twists: motions of the base; the shortest distance of all is returned.
-            dock: points inside its housing do not count.
+            dock: points inside its housing do not count, and ground in its corridor counts as seen.
         """
         self._follow_limits()
         if self._checked is None or (dock is None) != (self._dock is None):
@@ -296,12 +296,14 @@ class ObstacleGuard:
             self.known = min(self.known, known + self._further(twist, known))
 
     def _unknown(self, twist: _Steps, ground: Array) -> NDArray[np.bool_]:
-        """Whether each ground point (n, 2) along a motion is unseen by all scans.
+        """Whether each ground point (n, 2) along a motion is unseen by all scans, and not on the axis of a dock.
 
         A motion ahead leads into the lidar's field of view, where sectors and points decide (``unseen``).
         """
         unknown = ~self._visibility.covers(ground) if _is_ahead(twist) else np.ones(len(ground), np.bool_)
         unknown[unknown] = ~self.memory.seen(ground[unknown])
+        if self._dock is not None:
+            unknown[unknown] = ~self._dock.on_axis(ground[unknown])
         return unknown
 
     def _further(self, twist: _Steps, known: float) -> float:
@@ -409,9 +411,7 @@ class ObstacleCheck(Check):
     def _into_unseen(self, allowed: float, fastest: float) -> Iterator[PaceLimit]:
         """Limits before unseen ground, which allows a pace of ``allowed``, for motions up to ``fastest`` (m/s)."""
         config = self.view.config.obstacle
-        if self.view.dock is not None:
-            allowed = max(allowed, self.view.config.docking.speed)
-        elif config.unseen == "slow" or self.view.calibrates:
+        if config.unseen == "slow" or self.view.calibrates:
             allowed = max(allowed, config.unseen_speed)
         elif self.view.confirmed and allowed < config.confirmed_speed:
             self._before_unseen = False

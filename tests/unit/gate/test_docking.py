@@ -11,7 +11,9 @@ from monstertruck_schemas.plan import BehaviourState, DockTarget
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Role
 from monstertruck_schemas.state import Odometry
-from tests.unit.gate.rig import ANY_GROUND, Rig, header, make_gate
+from monstertruckd.gate.docking import DockCheck
+from monstertruckd.gate.obstacles import ObstacleCheck
+from tests.unit.gate.rig import ANY_GROUND, TICK, Rig, check_of, header, make_gate, scan
 
 HOUSING = HousingConfig(width=0.3, depth=0.2)
 FACE = 1.0 + 0.47 / 2
@@ -32,12 +34,17 @@ class Docking(Rig):
         self.place, self.yaw, self.way = [0.5, 0.0], yaw, way
         self.reported, self.located = 1.0, True
         self.dock, self.things = "charger", ()
+        self.late = 0
+        """Age of a scan on arrival (ns)."""
 
     def sense(self):
         self.place[0] += self.speed * 0.02 * self.way
         c = self.way
         self.obstacles = [(c * (x - self.place[0]), c * (y - self.place[1])) for x, y in self.things]
+        self.silent = {"scan"}
         super().sense()
+        seen = scan(self.now, *self.obstacles).model_copy(update={"stamp": self.now - self.late})
+        self.gate.observe(seen, topics.SCAN)
         odometry = Odometry(
             **header(self.now), frame="odom", pose=Pose2D(x=self.place[0], y=self.place[1], yaw=self.yaw),
             twist=Twist2D(vx=self.speed, vy=0.0, wz=0.0), pose_covariance=(0.0,) * 9, twist_covariance=(0.0,) * 9,
@@ -106,3 +113,36 @@ def test_a_truck_reverses_into_a_dock_over_ground_that_no_sensor_has_seen():
     rig.driver = {"speed": -0.1, **PLANNER}
     rig.tick(100)
     assert rig.speed == pytest.approx(-0.05)
+
+
+def test_unseen_ground_is_allowed_on_the_axis_only():
+    rig = Docking(way=-1, obstacle={"unseen_speed": 1.0})
+    rig.place = [0.5, 0.14]
+    rig.armed()
+    rig.driver = {"speed": -0.1, **PLANNER}
+    rig.tick(40)
+    assert rig.speed == pytest.approx(-0.05)
+    guard = check_of(rig.gate, ObstacleCheck).guard
+    assert guard.known == math.inf
+    rig.driver = {"speed": -0.1, "front": -0.3, "rear": 0.3, **PLANNER}
+    rig.tick(40)
+    assert guard.known < 0.2
+
+
+def test_a_truck_reaches_the_docked_pose_in_reverse():
+    rig = Docking(way=-1, obstacle={"unseen_speed": 1.0})
+    rig.place = [0.9, 0.0]
+    rig.armed()
+    rig.driver = {"speed": -0.1, **PLANNER}
+    rig.tick(200)
+    assert 1.015 < rig.place[0] < 1.03
+    assert rig.speed == 0.0
+
+
+def test_the_dock_is_where_the_scan_has_seen_it():
+    rig = Docking()
+    rig.late = 4 * TICK
+    rig.driving(speed=0.2, ticks=80, **PLANNER)
+    area = check_of(rig.gate, DockCheck).view.dock
+    assert rig.speed == pytest.approx(0.05)
+    assert area.docked[0] == pytest.approx(1.0 - rig.place[0] + 4 * 0.02 * 0.05)
