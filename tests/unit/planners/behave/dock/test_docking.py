@@ -97,6 +97,39 @@ def test_a_robot_that_would_miss_the_dock_tries_again():
     assert robot.error[0] < 0.01
 
 
+def test_a_tag_that_is_hidden_on_the_way_ends_with_the_reason_at_rest():
+    robot = staged(FORWARD)
+    move = robot.move
+
+    def hide(vx: float, wz: float) -> None:
+        robot.hidden |= robot.error[0] < 0.4
+        move(vx, wz)
+
+    robot.move = hide
+    step = robot.docks()
+    assert step.outcome is Reason.DOCK_NOT_SEEN, step.text
+    assert step.motion is None
+    assert "was not seen within 6 s" in step.text
+    assert robot.error[0] > 0.2, "it went on without the tag"
+
+
+def test_a_dock_that_is_moved_meanwhile_is_found_again():
+    robot = staged(FORWARD, 2)
+    move, moved = robot.move, []
+
+    def shift(vx: float, wz: float) -> None:
+        if robot.error[0] < 0.3 and not moved:
+            moved.append(True)
+            robot.dock = FORWARD.model_copy(update={"x": 2.04, "y": 1.05})
+        move(vx, wz)
+
+    robot.move = shift
+    step = robot.docks()
+    assert step.outcome is Reason.BEHAVIOUR_DONE, step.text
+    assert robot.phases.count("retreat") == 1
+    assert robot.error[0] < 0.01
+
+
 @pytest.mark.parametrize("dock", [FORWARD, REVERSE])
 def test_it_undocks_to_the_staging_distance_and_only_from_a_dock(dock: DockConfig):
     robot = Robot(dock, np.array((dock.x, dock.y, dock.yaw)))
