@@ -12,6 +12,7 @@ import numpy as np
 from monstertruck_estimation.consistency.exchange import REFUTING, ScanVerdict
 from monstertruck_estimation.slam.registration import Cloud, fitting, register
 from monstertruck_estimation.slam.scans import Scan
+from monstertruck_kinematics.beams import nearest_beams
 from monstertruck_kinematics.elementary import Array
 
 
@@ -20,6 +21,10 @@ class Revolution(NamedTuple):
 
     ranges: Array
     """Ranges, shape (n,) (m); not finite for beams without a range."""
+    start_angle: float
+    """Angle of the first beam (rad)."""
+    angle_increment: float
+    """Angle between neighbouring beams (rad)."""
     scan: Scan
     """Scan in base."""
     origin: tuple[float, float]
@@ -42,9 +47,7 @@ def scale_change(newest: Revolution, earlier: Revolution, motions: list[Array]) 
         if np.count_nonzero(~fits[-1]) < REFUTING:
             return None
     moved = max(fits, key=np.count_nonzero)
-    if len(newest.ranges) != len(earlier.ranges):
-        return None
-    factor = _factor(newest.ranges, earlier.ranges)
+    factor = _factor(newest, earlier)
     if factor is None:
         return None
     rescaled = _rescaled(newest.scan, newest.origin, 1.0 / factor)
@@ -58,11 +61,16 @@ def _fits(scan: Scan, cloud: Cloud, motion: Array) -> np.ndarray[tuple[int], np.
     return fitting(scan, cloud, register(scan, cloud, motion).pose)
 
 
-def _factor(newest: Array, earlier: Array) -> float | None:
-    both = np.isfinite(newest) & np.isfinite(earlier) & (newest > 0.0) & (earlier > 0.0)
+def _factor(newest: Revolution, earlier: Revolution) -> float | None:
+    """Compare beams of the same bearing: their number and the first one's bearing may differ between revolutions."""
+    bearings = newest.start_angle + newest.angle_increment * np.arange(len(newest.ranges))
+    beams = nearest_beams(bearings, earlier.start_angle, earlier.angle_increment)
+    met = beams < len(earlier.ranges)
+    new, old = newest.ranges[met], earlier.ranges[beams[met]]
+    both = np.isfinite(new) & np.isfinite(old) & (new > 0.0) & (old > 0.0)
     if np.count_nonzero(both) < 30:  # minimum number of beams with a range in both revolutions
         return None
-    return math.exp(float(np.median(np.log(newest[both] / earlier[both]))))
+    return math.exp(float(np.median(np.log(new[both] / old[both]))))
 
 
 def _rescaled(scan: Scan, origin: tuple[float, float], factor: float) -> Scan:

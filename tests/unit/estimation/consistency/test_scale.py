@@ -1,5 +1,7 @@
 """All ranges change by one factor from one revolution to the next."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.exchange import StepOutput
 from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
 from monstertruck_estimation.consistency.scale import Revolution, scale_change
-from monstertruck_estimation.slam.scans import prepare
+from monstertruck_estimation.slam.scans import ScanGeometry, prepare
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.state import DoubtKind
 from tests.unit.estimation.consistency.kit import PERIOD, SENSORS, Lies, drive, straight
@@ -45,11 +47,27 @@ def test_a_part_of_the_view_that_a_hand_covers_is_no_change():
     assert not any(doubt.kind is DoubtKind.SCALE for doubt in found.values())
 
 
+def revolution(seen, geometry=LIDAR):
+    return Revolution(seen, geometry.start_angle, geometry.angle_increment, prepare(seen, geometry), (0.0, 0.0))
+
+
+@pytest.mark.parametrize("beams", [448, 449, 451])
+def test_a_change_is_found_though_the_number_of_beams_and_the_first_ones_bearing_vary(beams):
+    """As of heads whose speed varies: LD19, RPLIDAR."""
+    pose, earlier = np.array(LANE[0][:3], float), ScanGeometry(math.pi, -math.tau / 450, 0.02, 12.0)
+    newest = ScanGeometry(math.pi - 0.01, -math.tau / beams, 0.02, 12.0)
+    before, after = ranges(HALL, pose, earlier, 450), ranges(HALL, pose, newest, beams)
+    for factor in (0.6, 1.5):
+        found = scale_change(revolution(factor * after, newest), revolution(before, earlier), [np.zeros(3)])
+        assert found == pytest.approx(factor, rel=0.02)
+    assert scale_change(revolution(after, newest), revolution(before, earlier), [np.zeros(3)]) is None
+
+
 def test_a_wall_that_the_robot_approaches_far_between_two_revolutions_changes_no_scale():
     """All ranges shrink by one factor; the wheels lead the registration, which does not reach so far by itself."""
     wall, moved = [((2.0, -20.0), (2.0, 20.0))], np.array((0.5, 0.0, 0.0))
     before, after = (ranges(wall, pose) for pose in (np.array((-2.0, 0.0, 0.0)), np.array((-1.5, 0.0, 0.0))))
-    earlier, newest = (Revolution(seen, prepare(seen, LIDAR), (0.0, 0.0)) for seen in (before, after))
+    earlier, newest = (revolution(seen) for seen in (before, after))
     assert scale_change(newest, earlier, [np.zeros(3)]) == pytest.approx(0.875, abs=0.01)
     assert scale_change(newest, earlier, [moved, np.zeros(3)]) is None
 
