@@ -32,9 +32,12 @@ from monstertruck_sim.world.obstacles import Disc
 MORE_DRIVES: Final = ("drive_2", "drive_3", "drive_4")
 DRIVES: Final = ("drive", *MORE_DRIVES)
 """Roles of controllers of one motor."""
-SERIAL: Final = ("drive", "steering", "lidar", "compass", "stabiliser", *MORE_DRIVES, "wheels", "sonar", "imu")
-"""Roles of devices on a serial line."""
-VITAL: Final = ("drive", "steering", "lidar", "compass", *MORE_DRIVES, "wheels", "sonar")
+SERIAL: Final = (
+    *("drive", "steering", "lidar", "compass", "stabiliser"),
+    *(*MORE_DRIVES, "wheels", "actuators", "sonar", "imu"),
+)
+"""Roles of devices whose kinds are on a serial line, most of them."""
+VITAL: Final = ("drive", "steering", "lidar", "compass", *MORE_DRIVES, "wheels", "actuators", "sonar")
 """The robot stops when one of these sends nothing; the sonars where they guard it, without a lidar."""
 SHORT_WRITES: Final = 19
 """Maximum number of consecutive writes cut in half."""
@@ -315,7 +318,9 @@ class FaultCatalog:
         workers: tuple[str, ...] = (),
         unguarded: Collection[str] = (),
     ) -> None:
-        self._roles = tuple(devices.present())
+        present = devices.present()
+        self._roles = tuple(present)
+        self._serial = tuple(role for role in SERIAL if role in present and present[role].kind.opens == "serial")
         self._guarded = tuple(role for role in self._roles if role not in unguarded)
         self._drives = tuple(role for role in DRIVES if role in self._roles)
         self._vital = frozenset(VITAL) - ({"sonar"} if "lidar" in self._roles else frozenset())
@@ -342,19 +347,7 @@ class FaultCatalog:
         return self._makers[kinds[rng.integers(len(kinds))]](rng)
 
     def _of_devices(self) -> Iterator[tuple[FaultKind, Maker]]:
-        serial, vital = tuple(role for role in SERIAL if role in self._roles), self._vital
-        guarded = tuple(role for role in serial if role in self._guarded)
-        if self._guarded:
-            yield FaultKind.UNPLUG, lambda rng: _unplug(rng, _pick(rng, self._guarded), vital)
-        if guarded:
-            yield FaultKind.STALL, lambda rng: _stall(rng, _pick(rng, guarded), vital)
-        yield FaultKind.GARBAGE, lambda rng: _garbage(rng, _pick(rng, serial))
-        yield FaultKind.BIT_ERRORS, lambda rng: _bit_errors(rng, _pick(rng, serial))
-        yield FaultKind.SLOW, lambda rng: _slow(rng, _pick(rng, serial))
-        yield FaultKind.SHORT_WRITE, lambda rng: _short_write(rng, _pick(rng, serial), guarded)
-        yield FaultKind.RESET, lambda rng: _once(rng, FaultKind.RESET, _pick(rng, serial), "power-cycle")
-        if len(guarded) > 1:
-            yield FaultKind.WRONG_DEVICE, lambda rng: _wrong(rng, guarded, vital)
+        yield from self._of_lines()
         yield FaultKind.CLOCK_JUMP, _clock_jump
         if self._all_hubs and self._guarded == self._roles:
             yield FaultKind.LOOP_STALL, _loop_stall
@@ -376,6 +369,22 @@ class FaultCatalog:
             yield FaultKind.ECHO, lambda rng: _cable(rng, FaultKind.ECHO, "stabiliser", *_switch("echo"))
             yield FaultKind.RAIL_12V, _rail_12v
         yield from self._of_wheels_and_sonars()
+
+    def _of_lines(self) -> Iterator[tuple[FaultKind, Maker]]:
+        serial, vital = self._serial, self._vital
+        guarded = tuple(role for role in serial if role in self._guarded)
+        if self._guarded:
+            yield FaultKind.UNPLUG, lambda rng: _unplug(rng, _pick(rng, self._guarded), vital)
+        if guarded:
+            yield FaultKind.STALL, lambda rng: _stall(rng, _pick(rng, guarded), vital)
+        if serial:
+            yield FaultKind.GARBAGE, lambda rng: _garbage(rng, _pick(rng, serial))
+            yield FaultKind.BIT_ERRORS, lambda rng: _bit_errors(rng, _pick(rng, serial))
+            yield FaultKind.SLOW, lambda rng: _slow(rng, _pick(rng, serial))
+            yield FaultKind.SHORT_WRITE, lambda rng: _short_write(rng, _pick(rng, serial), guarded)
+            yield FaultKind.RESET, lambda rng: _once(rng, FaultKind.RESET, _pick(rng, serial), "power-cycle")
+        if len(guarded) > 1:
+            yield FaultKind.WRONG_DEVICE, lambda rng: _wrong(rng, guarded, vital)
 
     def _of_motors(self) -> Iterator[tuple[FaultKind, Maker]]:
         if late := tuple(role for role in ("drive", "steering", *MORE_DRIVES, "wheels") if role in self._roles):

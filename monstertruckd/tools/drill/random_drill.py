@@ -16,6 +16,7 @@ from pydantic import TypeAdapter
 
 from monstertruck_drivers.config import kind_of
 from monstertruck_drivers.maestro.protocol import CHANNELS
+from monstertruck_drivers.pca9685.config import Pca9685EscConfig
 from monstertruck_planners.steps import TRACKING
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
@@ -71,12 +72,13 @@ def unguarded(config: SimulatedTruckConfig) -> tuple[str, ...]:
     """Motor controllers that nothing stops while they cannot be reached.
 
     The EPOS has no watchdog on RS232: without the deadman line it keeps its last speed, and of a kind that is not known
-    here the same is assumed. Steppers have a watchdog.
+    here the same is assumed. Controllers of all shafts have a watchdog; a PCA9685 has none and repeats its last pulses.
     """
     devices = config.devices.present()
     drives = {role.value: devices[role].driver.kind for role in SHAFTS if role in devices}
     wired_to = {EPOS} if config.sim.deadman_wired else set()
-    return tuple(role for role, kind in drives.items() if kind not in wired_to)
+    repeating = tuple(role for role, device in devices.items() if isinstance(device.driver, Pca9685EscConfig))
+    return tuple(role for role, kind in drives.items() if kind not in wired_to) + repeating
 
 
 @dataclass(frozen=True, slots=True)

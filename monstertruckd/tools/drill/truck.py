@@ -374,7 +374,10 @@ class DrillTruck:
         return (*down, *(() if driving else state.hindrances))
 
     async def until(self, condition: Callable[[], bool], seconds: float, order: Order | None = None) -> bool:
-        """Whether the condition becomes true in time; until then the order is repeated while the truck is disarmed."""
+        """Whether the condition becomes true in time; until then the order is repeated while the truck is disarmed.
+
+        An operator who wants to drive resets an emergency stop first: the end of a fault may look like motion.
+        """
         end = self.clock.now() + round(seconds * SECOND)
         while self.clock.now() < end and not self.rig.daemon_ended:
             if condition():
@@ -382,7 +385,7 @@ class DrillTruck:
             if order is not None and self.station is not None and self.by_hand:  # a stick at rest, until it is armed
                 self.station.silent = self.gate is None or not self.gate.mode.active
             if order is not None and self.gate is not None and not self.gate.mode.active:
-                await self.order(order)
+                await self.order(Order.RESET if self.gate.mode is GateMode.ESTOPPED else order)
             await self.clock.sleep(0.02)
         return condition()
 

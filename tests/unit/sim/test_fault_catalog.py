@@ -9,6 +9,7 @@ from monstertruck_drivers.epos.exchange import BRIEF_SILENCES
 from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_sim.faults import SHORT_WRITES, FaultCatalog, FaultKind, apply
 from monstertruckd.config.load import load_config
+from monstertruckd.tools.drill.random_drill import unguarded
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
@@ -64,6 +65,17 @@ def test_robots_of_todays_devices_have_no_faults_of_steppers(name):
     kinds = FaultCatalog(loaded(name).devices, records=False).kinds
     assert FaultKind.UNPLUG in kinds
     assert not WHEELS & set(kinds) - {FaultKind.LATE_ANSWERS}
+
+
+@pytest.mark.parametrize(("name", "role", "left"), [("f1tenth", "actuators", ()), ("donkeycar", None, ("actuators",))])
+def test_a_controller_of_all_shafts_has_the_faults_of_its_line(name, role, left):
+    """A PCA9685 is on no serial line, and nothing stops its last pulses."""
+    config = loaded(name)
+    assert unguarded(config) == left
+    catalog = FaultCatalog(config.devices, records=False, unguarded=left)
+    drawn = [catalog.draw(np.random.default_rng(seed)) for seed in range(200)]
+    assert ({FaultKind.GARBAGE, FaultKind.STALL, FaultKind.RESET} <= set(catalog.kinds)) is (role is not None)
+    assert any(one.name == "unplug: actuators" and one.must_stop for one in drawn) is (role is not None)
 
 
 def test_cross_talk_is_an_echo_from_where_nothing_is():
