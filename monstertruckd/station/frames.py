@@ -117,7 +117,10 @@ def facts(config: dict[str, Any], versions: dict[str, str]) -> str:
         tracks=config.get("tracker") is not None,
         path=PurePath(drawn["file"]).stem if (drawn := config.get("path")) else None,
         behaviours=sorted(config.get("behaviours") or {}),
-        docks=sorted(config.get("docks") or {}),
+        docks={
+            name: {"pose": [dock["x"], dock["y"], dock["yaw"]], "direction": dock["direction"]}
+            for name, dock in sorted((config.get("docks") or {}).items())
+        },
         versions=versions,
     )
 

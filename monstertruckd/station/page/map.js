@@ -88,7 +88,7 @@ export class MapView {
     link.on("tile", (message) => this.takeTile(message));
     link.on("goal", (state) => this.take("goal", state.goal));
     link.on("zones", (message) => this.takeZones(message));
-    for (const kind of ["gate", "explore", "points"]) link.on(kind, () => (this.dirty = true));
+    for (const kind of ["gate", "explore", "points", "facts"]) link.on(kind, () => (this.dirty = true));
     link.on("ground", (message) => this.takeGround(message));
     const { canvas } = this;
     canvas.addEventListener("pointerdown", (event) => this.press(event));
@@ -396,6 +396,7 @@ export class MapView {
     if (this.ground && this.layers.ground) this.drawImage(c, this.ground);
     this.drawLines(c, px);
     if (this.layers.zones) this.drawZones(c, px);
+    this.drawDocks(c, px);
     if (this.layers.trail) this.stroke(c, this.trail, this.colour.trail, 2 * px);
     if (this.path?.deformed && this.route) this.stroke(c, this.route, this.colour.route, 1.5 * px, [6 * px, 5 * px]);
     if (this.path) this.stroke(c, this.path.points, this.colour[this.path.deformed ? "deformed" : "route"], 3 * px);
@@ -438,6 +439,22 @@ export class MapView {
     c.globalAlpha = 0.2 * alpha;
     c.fill("evenodd");
     c.globalAlpha = alpha;
+  }
+
+  /** Where the robot stands when it is docked, with a bar at the end that faces the dock. */
+  drawDocks(c, px) {
+    const { length, width } = this.shape();
+    for (const [name, { pose, direction }] of Object.entries(this.link.newest.facts?.docks ?? {})) {
+      const end = (direction === "reverse" ? -1 : 1) * (length / 2 + 3 * px);
+      this.polygon(c, pose, outline(length, width));
+      c.strokeStyle = this.colour.point;
+      c.lineWidth = 1.5 * px;
+      c.setLineDash([4 * px, 3 * px]);
+      c.stroke();
+      c.setLineDash([]);
+      this.stroke(c, [compose(pose, [end, width / 2, 0]), compose(pose, [end, -width / 2, 0])], this.colour.point, 5 * px);
+      this.label(c, px, pose[0], pose[1], name);
+    }
   }
 
   drawLines(c, px) {

@@ -39,6 +39,8 @@ export class Panels {
     this.link = link;
     this.seen = new Set();
     this.pictures = new Past(1); // seconds between two pictures: ten minutes of them are some 15 MB
+    /** @type {ArrayBuffer | null} the picture that was chosen, until it is drawn */
+    this.picture = null;
     this.pointed = null;
     link.on("robot", () => this.clear());
     link.on("stop", (stop) => this.showStop(stop));
@@ -55,6 +57,7 @@ export class Panels {
   clear() {
     this.seen.clear();
     this.pictures.clear();
+    this.picture = null;
     byId("services").replaceChildren();
     byId("banners").replaceChildren();
     byId("chain").hidden = byId("stopped").hidden = true;
@@ -84,6 +87,7 @@ export class Panels {
     this.showLink();
     this.showGate(gate);
     if (!byId("pane-truck").hidden) this.showTruck();
+    this.drawPicture();
     if (!byId("pane-system").hidden) this.showSystem();
     const battery = newest.battery;
     byId("chip-battery").hidden = !battery;
@@ -197,22 +201,25 @@ export class Panels {
   }
 
   showPicture(message) {
-    const picture = new Blob([message.payload], { type: "image/jpeg" });
-    this.pictures.add(message.stamp / 1e9, picture);
-    if (this.pointed === null) this.drawPicture(picture);
+    this.pictures.add(message.stamp / 1e9, message.payload);
+    if (this.pointed === null) this.picture = message.payload;
+    this.drawPicture();
   }
 
   /** Show the picture of a time that a plot is pointed at; null = the newest. */
   showPast(at) {
     this.pointed = at;
-    const picture = at === null ? this.pictures.rows.at(-1)?.[1] : this.pictures.at(at);
-    if (picture) this.drawPicture(picture);
+    this.picture = (at === null ? this.pictures.rows.at(-1)?.[1] : this.pictures.at(at)) ?? this.picture;
+    this.drawPicture();
   }
 
-  drawPicture(picture) {
+  /** Draw the chosen picture, if it is new and somebody can see it. */
+  drawPicture() {
+    if (!this.picture || (byId("pane-truck").hidden && byId("camera-view").hidden)) return;
     const image = byId("camera");
     const before = image.src;
-    image.src = URL.createObjectURL(picture);
+    image.src = URL.createObjectURL(new Blob([this.picture], { type: "image/jpeg" }));
+    this.picture = null;
     if (!byId("camera-view").hidden) byId("camera-picture").src = image.src;
     if (before) URL.revokeObjectURL(before);
     image.alt = words("camera");

@@ -99,7 +99,7 @@ export class Work {
     byId("mission-moved").hidden = !this.elsewhere || !mission?.resumable || observer;
     text("mission-state", mission?.running ? words("task.mission.state", { name: mission.name, step: mission.node || mission.step, steps: mission.steps, doing: mission.doing })
       : mission?.number || mission?.resumable ? mission.text || reason(mission.outcome) : words("task.none"));
-    this.showDocks(facts?.docks ?? [], mission?.running || observer);
+    this.showDocks(Object.keys(facts?.docks ?? {}), mission?.running || observer);
     this.showLines(mission?.running || mission?.resumable ? mission.lines ?? [] : []);
     const names = facts?.behaviours ?? [];
     byId("task-behaviours").hidden = !names.length;

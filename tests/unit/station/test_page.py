@@ -475,6 +475,36 @@ async def a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page: 
     assert not await page.evaluate("window.sent.some((each) => each.id !== undefined)"), "armed by somebody else"
 
 
+COLOUR = """
+([x, y]) => {
+  const map = document.querySelector("#map");
+  const { left, top } = map.getBoundingClientRect();
+  const ratio = window.devicePixelRatio;
+  return [...map.getContext("2d").getImageData((x - left) * ratio, (y - top) * ratio, 1, 1).data].join();
+}
+"""
+"""Colour of the map at a place on the screen."""
+
+
+async def a_dock_is_drawn_on_the_map_and_driven_to_by_its_button(page: Page) -> None:
+    docked = {"pose": [0.5, 0.5, 0.0], "direction": "reverse"}
+    robot = FACTS | {"goals": True, "geometry": {"length": 0.4, "width": 0.3}}
+    await page.click("#tab-tasks")
+    idle = {"kind": "mission", "m": {"number": 0, "running": False, "resumable": False}}
+    await say(page, robot | {"docks": {}}, idle)
+    bar = await page.evaluate(PLACE, [0.28, 0.55])
+    bare = await page.evaluate(COLOUR, bar)
+    await say(page, robot | {"docks": {"charger": docked}})
+    await page.wait_for_function(f"([place, bare]) => ({COLOUR})(place) !== bare", arg=[bar, bare])
+    for button, step in (("Dock at charger", "dock"), ("Leave charger", "undock")):
+        await page.evaluate("void (window.sent = [])")
+        await page.click(f"#docks >> text={button}")
+        await page.wait_for_function("() => window.sent.some((each) => each.do === 'mission')")
+        (begun,) = await asked(page)
+        assert json.loads(begun["text"])["steps"] == [{"do": step, "dock": "charger"}]
+        await answer(page, begun)
+
+
 async def the_configured_path_is_started_by_its_name(page: Page) -> None:
     await say(page, FACTS)
     await expect(page.locator("#path-start"), "this robot has none").to_be_hidden()
@@ -1049,6 +1079,7 @@ async def test_the_page_drives_as_the_hand_does_and_shows_what_is_true(tmp_path:
         await a_stop_is_shown_with_its_chain_of_causes(page)
         await a_mission_of_a_robot_that_was_moved_goes_on_once_that_is_said(page)
         await a_task_arms_the_robot_and_lets_planners_drive_once_it_has_begun(page)
+        await a_dock_is_drawn_on_the_map_and_driven_to_by_its_button(page)
         await the_configured_path_is_started_by_its_name(page)
         await an_emulated_robot_fails_and_gets_obstacles_by_hand(page)
         await a_goal_says_what_the_gate_lets_it_do(page)
