@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import select
 import signal
 from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager
@@ -144,8 +145,10 @@ class VirtualRig:
         """End a worker as SIGKILL does, and wait until it is dead; nothing if it does not run."""
         pid = self.daemon.worker_pids().get(name)
         if pid is not None:
+            process = os.pidfd_open(pid)
             os.kill(pid, signal.SIGKILL)
-            os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+            select.select((process,), (), ())
+            os.close(process)
 
     def _new_daemon(self) -> Daemon:
         devices = self.config.devices.present()

@@ -1,24 +1,18 @@
-"""A worker process: the parent's blocking connection to it, and its main program.
+"""A worker process, and the fork server that starts it, from the parent's side; ``server`` is the other."""
 
-``python -m monstertruck_runtime.actors.process FD MODULE:FACTORY`` builds the worker and answers steps until the parent
-is gone, however busy it is then. Signals meant for the daemon's whole group are ignored: the parent decides when its
-workers end. Imports stay few, for every worker pays for them.
-"""
-
-import importlib
+import atexit
 import os
-import queue
-import resource
 import signal
 import socket
 import struct
 import subprocess
 import sys
 import threading
-import traceback
+from contextlib import suppress
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, Final
 
+from monstertruck_runtime.actors import server
 from monstertruck_runtime.errors import WorkerError
 
 _TIMEVAL = struct.Struct("@ll")
@@ -26,30 +20,21 @@ _TIMEVAL = struct.Struct("@ll")
 _SINGLE_THREADED = {
     f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "NUMBA", "VECLIB")
 }
+_END_TIMEOUT: Final = 5.0
+"""Time a killed process may take to end and its server to report that (s); a server that takes longer hangs."""
 
 
-class WorkerProcess:
-    """A fresh interpreter, never a fork: forked Zenoh sessions hang.
+class ForkServer:
+    """The process that forks the workers of this one; started by the first request (``server``).
 
-    Args:
-        name: for error texts.
-        target: ``module:factory``; the factory's object has ``step(inputs) -> outputs``.
-        stall_timeout: maximum pause in the middle of a message, either way, s.
+    It is a fresh interpreter, never a fork of this process: forked Zenoh sessions hang. It ends with this process.
     """
 
-    def __init__(self, name: str, target: str, stall_timeout: float = 30.0) -> None:
-        self._name = name
-        self._killed = False
-        self.used = 0.0
-        """Processor time of the latest step (s)."""
-        ours, theirs = socket.socketpair()
-        limit = _TIMEVAL.pack(*divmod(round(stall_timeout * 1e6), 10**6))
-        for direction in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
-            ours.setsockopt(socket.SOL_SOCKET, direction, limit)
-        self._connection = Connection(ours.detach())
+    def __init__(self) -> None:
+        self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603  # our own interpreter and module
-                [sys.executable, "-m", __name__, str(theirs.fileno()), target],
+                [sys.executable, "-m", server.__name__, str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=2,
@@ -60,6 +45,109 @@ class WorkerProcess:
     def pid(self) -> int:
         """Process number."""
         return self._process.pid
+
+    @property
+    def lost(self) -> bool:
+        """Whether it has ended."""
+        return self._process.poll() is not None
+
+    def fork(self, name: str, target: str, connection: socket.socket) -> socket.socket:
+        """Request a worker; returns the socket that receives its process number, then its exit code.
+
+        Args:
+            name: shown by ``ps`` and ``top``.
+            target: ``module:factory``.
+            connection: the worker's end of its connection.
+
+        Raises:
+            WorkerError: the server is gone, or does not read its requests.
+        """
+        environment = {**os.environ, **_SINGLE_THREADED}
+        packet = server.ForkRequest(name, target, sys.path, environment).encode()
+        folder = os.open(".", os.O_PATH)
+        ours, theirs = socket.socketpair()
+        try:
+            with theirs:
+                descriptors = [connection.fileno(), theirs.fileno(), folder]
+                socket.send_fds(self._requests, [packet], descriptors, socket.MSG_DONTWAIT)
+        except OSError as error:
+            ours.close()
+            self.kill()
+            raise WorkerError(f"worker {name}: the fork server (process {self.pid}) is gone or hangs") from error
+        finally:
+            os.close(folder)
+        return ours
+
+    def kill(self) -> None:
+        """Kill the server, and leave no zombie; its workers run on."""
+        self._process.kill()
+        self._process.wait()
+        self._requests.close()
+
+
+class _Current:
+    """The fork server that is in use, replaced when it has ended."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._server: ForkServer | None = None
+
+    def server(self) -> ForkServer:
+        """Return a server, a new one if the last has ended."""
+        with self._lock:
+            if self._server is not None and self._server.lost:
+                self.kill()
+            if self._server is None:
+                self._server = ForkServer()
+            return self._server
+
+    def kill(self) -> None:
+        """Kill the server at the end of this process; it would end by itself, but only after its imports."""
+        if self._server is not None:
+            self._server.kill()
+            self._server = None
+
+
+_current = _Current()
+atexit.register(_current.kill)
+
+
+class WorkerProcess:
+    """A process that takes steps, forked by the process's ``ForkServer``.
+
+    Args:
+        name: for error texts.
+        target: ``module:factory``; the factory's object has ``step(inputs) -> outputs``.
+        stall_timeout: maximum pause in the middle of a message, either way, s.
+    """
+
+    def __init__(self, name: str, target: str, stall_timeout: float = 30.0) -> None:
+        self._name = name
+        self._killed = False
+        self._pid: int | None = None
+        self._code: int | None = None
+        self._reading = threading.Lock()
+        """Held while a thread reads ``_end``."""
+        self.used = 0.0
+        """Processor time of the latest step (s)."""
+        ours, theirs = socket.socketpair()
+        limit = _TIMEVAL.pack(*divmod(round(stall_timeout * 1e6), 10**6))
+        for direction in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
+            ours.setsockopt(socket.SOL_SOCKET, direction, limit)
+        self._connection = Connection(ours.detach())
+        with theirs:
+            self._server = _current.server()
+            self._end = self._server.fork(name, target, theirs)
+
+    @property
+    def pid(self) -> int | None:
+        """Process number; None until the server has forked it."""
+        if self._pid is None and not self._killed and self._reading.acquire(blocking=False):
+            try:
+                self._pid = self._reported(0.0)
+            finally:
+                self._reading.release()
+        return self._pid
 
     def send(self, inputs: Any) -> None:
         """Submit a step.
@@ -100,64 +188,50 @@ class WorkerProcess:
         return self.receive()
 
     def kill(self) -> None:
-        """Kill the process, and leave no zombie.
+        """Kill the process, and a server that does not confirm its end; neither leaves a zombie.
 
         The connection ends with its last user: a thread may still wait for it.
         """
         self._killed = True
-        self._process.kill()
-        self._process.wait()
+        with socket.socket(fileno=os.dup(self._connection.fileno())) as connection, suppress(OSError):
+            connection.shutdown(socket.SHUT_RDWR)  # the server does not fork for a closed connection
+        with self._reading:
+            self._pid = self._pid or self._reported(0.0)
+            if self._pid is not None and self._code is None:
+                with suppress(ProcessLookupError):
+                    os.kill(self._pid, signal.SIGKILL)
+                self._code = self._reported(_END_TIMEOUT)
+                if self._code is None:
+                    self._server.kill()
+            self._end.close()
+
+    def kill_idle_server(self) -> None:
+        """Kill the server if it has not forked the process; for a start that took too long."""
+        if self.pid is None:
+            self._server.kill()
+
+    def _reported(self, timeout: float) -> int | None:
+        """Read the next number on ``_end``; None if none came for ``timeout`` seconds, or the server is gone."""
+        try:
+            self._end.settimeout(timeout)
+            data = self._end.recv(server.NUMBER.size)
+        except OSError:
+            return None
+        return server.NUMBER.unpack(data)[0] if data else None
 
     def _gone(self) -> str:
         """That the process is gone, and how it ended."""
-        text = f"worker {self._name} (process {self._process.pid}) is gone"
-        if self._killed:
-            return text
-        try:
-            code = self._process.wait(1.0)  # seconds that a process may take to end after it has closed its connection
-        except subprocess.TimeoutExpired:
+        with self._reading:
+            self._pid = self._pid or self._reported(0.0)
+            text = f"worker {self._name} (process {self._pid or 'never forked'}) is gone"
+            if self._killed:
+                return text
+            # 1.0: time a process may take to end after it has closed its connection (s)
+            self._code = self._reported(1.0) if self._code is None else self._code
+        code = self._code
+        if code is None:
             return f"{text}: it closed its connection"
         if code >= 0:
             return f"{text}: it ended with exit code {code}"
         short = ", as by a system that is short of memory" if -code == signal.SIGKILL else ""
         return f"{text}: killed by {signal.Signals(-code).name}{short}"
-
-
-def main() -> int:
-    """Serve one parent; returns the exit code."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    os.nice(5)
-    connection = Connection(int(sys.argv[1]))
-    steps: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    threading.Thread(target=_read, args=(connection, steps), daemon=True).start()
-    try:
-        module, _, factory = sys.argv[2].partition(":")
-        worker = getattr(importlib.import_module(module), factory)()
-        connection.send((True, None, 0.0))
-        while True:
-            inputs = steps.get()
-            begin = _processor_time()
-            outputs = worker.step(inputs)
-            connection.send((True, outputs, _processor_time() - begin))
-    except Exception:  # noqa: BLE001  # reported to the parent, which decides
-        connection.send((False, traceback.format_exc(), 0.0))
-        return 1
-
-
-def _processor_time() -> float:
-    """Processor time of this thread (s); the clock's module would cost every worker the import of asyncio."""
-    usage = resource.getrusage(resource.RUSAGE_THREAD)
-    return usage.ru_utime + usage.ru_stime
-
-
-def _read(connection: Connection, steps: "queue.SimpleQueue[Any]") -> None:
-    try:
-        while True:
-            steps.put(connection.recv())
-    except (EOFError, OSError):
-        os._exit(0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,29 +7,53 @@ import subprocess
 import sys
 import textwrap
 import threading
+import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from monstertruck_estimation.consistency.service import TARGET as SCAN_ODOMETRY
+from monstertruck_estimation.points.service import TARGET as READER
 from monstertruck_runtime.actors import actor
+from monstertruck_runtime.actors import process as process_module
 from monstertruck_runtime.actors.actor import WorkerActor, delivery_of
+from monstertruck_runtime.actors.process import WorkerProcess
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import WorkerError, WorkerTimeoutError
 from monstertruck_runtime.slowness import SlowComputer
 from monstertruck_runtime.threads import in_thread
+from monstertruckd.tools.install.kernels import WORKERS
 
 ROOT = Path(__file__).parents[4]
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-
-
 def counter(clock, target: str = "Counter", *, latency=0.01, deadline=5.0, **settings) -> WorkerActor:
     return WorkerActor("counter", f"tests.worker_kit:{target}", clock, latency=latency, deadline=deadline, **settings)
+
+
+async def forked(worker: WorkerActor) -> int:
+    """Process number of a worker that may still wait for the fork server."""
+    while worker.pid is None:
+        await asyncio.to_thread(time.sleep, 0.001)
+    return worker.pid
+
+
+async def ended(pid: int) -> None:
+    """Wait for the end of a process; the container's init may not reap, and a zombie has ended, too."""
+    async with asyncio.timeout(3):
+        while not gone(pid) and "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text():
+            await asyncio.sleep(0.01)
+
+
+@pytest.fixture
+def fresh_server() -> Iterator[None]:
+    """A fork server without what other tests have imported."""
+    process_module._current.kill()
+    yield
+    process_module._current.kill()
 
 
 def gone(pid: int) -> bool:
@@ -49,13 +73,88 @@ async def test_a_worker_keeps_its_state_and_gets_arrays():
     assert gone(pid)
 
 
-async def test_a_worker_is_niced_single_threaded_and_light():
+async def test_a_worker_is_niced_named_single_threaded_and_light(fresh_server: None):
     async with counter(WallClock()) as worker:
         facts = await worker.step("facts")
     assert facts["pid"] != os.getpid()
+    assert facts["name"] == "counter"
     assert facts["nice"] >= os.nice(0) + 5
     assert facts["threads"] == "1"
     assert not {"zenoh", "asyncio", "pydantic"} & set(facts["modules"])
+
+
+async def test_a_worker_finds_the_folder_and_environment_of_its_parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    async with counter(WallClock()) as worker:
+        await worker.start()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SET_SINCE", "yes")
+    async with counter(WallClock()) as worker:
+        facts = await worker.step("facts")
+    assert facts["folder"] == str(tmp_path)
+    assert facts["environment"]["SET_SINCE"] == "yes"
+
+
+async def test_the_server_builds_each_kind_of_worker_once_and_a_worker_itself(fresh_server: None):
+    for _ in range(2):
+        async with counter(WallClock()) as worker:
+            assert (await worker.step("facts"))["built"] == 2
+
+
+def test_the_server_of_all_workers_of_a_robot_keeps_one_thread():
+    """A fork of several threads may hang."""
+    for target in (*WORKERS, SCAN_ODOMETRY, READER):
+        process = WorkerProcess("any", target)
+        process.receive(60.0)
+        process.kill()
+    pid = process_module._current.server().pid
+    assert len(list(Path(f"/proc/{pid}/task").iterdir())) == 1
+
+
+async def test_a_killed_server_is_replaced_and_its_workers_run_on():
+    async with counter(WallClock()) as worker, counter(WallClock()) as other:
+        assert await worker.step(None) == 1
+        server = process_module._current.server()
+        os.kill(server.pid, signal.SIGKILL)
+        assert await worker.step(None) == 2
+        assert await other.step(None) == 1
+        assert process_module._current.server().pid != server.pid
+        pid = worker.pid
+        await worker.close()
+        assert pid is not None
+        await ended(pid)
+
+
+async def test_a_frozen_server_is_replaced_when_a_worker_does_not_start():
+    async with counter(WallClock(), start_timeout=0.3) as worker:
+        os.kill(process_module._current.server().pid, signal.SIGSTOP)
+        with pytest.raises(WorkerTimeoutError, match=r"did not start within 0.3 s"):
+            await worker.start()
+    async with counter(WallClock()) as worker:
+        assert await worker.step(None) == 1
+
+
+async def test_a_frozen_server_is_replaced_when_it_does_not_confirm_an_end(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(process_module, "_END_TIMEOUT", 0.2)
+    async with counter(WallClock()) as worker:
+        await worker.start()
+        pid, server = worker.pid, process_module._current.server()
+        assert pid is not None
+        os.kill(server.pid, signal.SIGSTOP)
+        await worker.close()
+        assert server.lost
+        await ended(pid)
+        assert await worker.step(None) == 1
+
+
+def test_a_worker_given_up_during_the_imports_of_the_server_is_not_forked(fresh_server: None):
+    given_up = WorkerProcess("given up", "tests.worker_kit:slow_to_build_once")
+    given_up.kill()
+    worker = WorkerProcess("next", "tests.worker_kit:Counter")
+    worker.receive(10.0)
+    server = process_module._current.server()
+    forks = Path(f"/proc/{server.pid}/task/{server.pid}/children").read_text().split()
+    assert forks == [str(worker.pid)]
+    worker.kill()
 
 
 async def test_concurrent_steps_are_taken_in_order():
@@ -156,33 +255,33 @@ async def test_closing_under_a_step_fails_it():
         await step
 
 
-async def test_a_worker_ends_with_its_killed_parent(tmp_path: Path):
+async def test_a_worker_and_the_server_end_with_their_killed_parent(tmp_path: Path):
     parent = tmp_path / "parent.py"
     parent.write_text(
         textwrap.dedent("""
         import asyncio
         from monstertruck_runtime.clock import WallClock
         from monstertruck_runtime.actors.actor import WorkerActor
+        from monstertruck_runtime.actors.process import _current
 
         async def main():
             worker = WorkerActor("w", "tests.worker_kit:Counter", WallClock(), latency=1, deadline=99)
             await worker.start()
-            print(worker.pid, flush=True)
+            print(worker.pid, _current.server().pid, flush=True)
             await worker.step({"sleep": 60})
 
         asyncio.run(main())
         """)
     )
-    process = subprocess.Popen([sys.executable, str(parent)], stdout=subprocess.PIPE, text=True)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen([sys.executable, str(parent)], env=environment, stdout=subprocess.PIPE, text=True)
     with process:
         assert process.stdout is not None
-        pid = int(process.stdout.readline())
+        processes = [int(word) for word in process.stdout.readline().split()]
         await asyncio.sleep(0.05)
         process.kill()
-    async with asyncio.timeout(3):
-        # the container's init may not reap: a zombie has ended, too
-        while not gone(pid) and "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text():
-            await asyncio.sleep(0.01)
+    for pid in processes:
+        await ended(pid)
 
 
 def test_a_stopped_worker_on_the_virtual_clock_is_killed_too():
@@ -297,17 +396,15 @@ def test_on_the_virtual_clock_a_worker_starts_while_the_run_goes_on(target: str,
     async def main(clock: VirtualClock) -> None:
         async with counter(clock, target, start_timeout=0.3 if target == "slow_to_build" else 30.0) as worker:
             await worker.start()
-            pid = worker.pid
             await worker.start()
-            assert worker.pid == pid is not None
             if error is None:
+                pid = await forked(worker)
                 assert await worker.step(None) == 1
                 assert worker.pid == pid
                 return
             with pytest.raises(error):
                 await worker.step(None)
             assert worker.pid is None
-            assert gone(pid)
 
     run_virtual(main)
 
