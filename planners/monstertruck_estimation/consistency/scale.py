@@ -12,19 +12,13 @@ import numpy as np
 from monstertruck_estimation.consistency.exchange import REFUTING, ScanVerdict
 from monstertruck_estimation.slam.registration import Cloud, fitting, register
 from monstertruck_estimation.slam.scans import Scan
-from monstertruck_kinematics.beams import nearest_beams
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import inverse, transform
 
 
 class Revolution(NamedTuple):
-    """A scan with its ranges."""
+    """A scan and where it was taken."""
 
-    ranges: Array
-    """Ranges, shape (n,) (m); not finite for beams without a range."""
-    start_angle: float
-    """Angle of the first beam (rad)."""
-    angle_increment: float
-    """Angle between neighbouring beams (rad)."""
     scan: Scan
     """Scan in base."""
     origin: tuple[float, float]
@@ -47,7 +41,7 @@ def scale_change(newest: Revolution, earlier: Revolution, motions: list[Array]) 
         if np.count_nonzero(~fits[-1]) < REFUTING:
             return None
     moved = max(fits, key=np.count_nonzero)
-    factor = _factor(newest, earlier)
+    factor = _factor(newest, earlier, motions)
     if factor is None:
         return None
     rescaled = _rescaled(newest.scan, newest.origin, 1.0 / factor)
@@ -61,16 +55,32 @@ def _fits(scan: Scan, cloud: Cloud, motion: Array) -> np.ndarray[tuple[int], np.
     return fitting(scan, cloud, register(scan, cloud, motion).pose)
 
 
-def _factor(newest: Revolution, earlier: Revolution) -> float | None:
-    """Compare beams of the same bearing: their number and the first one's bearing may differ between revolutions."""
-    bearings = newest.start_angle + newest.angle_increment * np.arange(len(newest.ranges))
-    beams = nearest_beams(bearings, earlier.start_angle, earlier.angle_increment)
-    met = beams < len(earlier.ranges)
-    new, old = newest.ranges[met], earlier.ranges[beams[met]]
-    both = np.isfinite(new) & np.isfinite(old) & (new > 0.0) & (old > 0.0)
-    if np.count_nonzero(both) < 30:  # minimum number of beams with a range in both revolutions
+def _factor(newest: Revolution, earlier: Revolution, motions: list[Array]) -> float | None:
+    """Compare points of the same bearing, by the motion under which they agree best on one factor."""
+    bearings, distances = _polar(newest.scan.points, newest.origin)
+    seen = [_polar(transform(inverse(motion), earlier.scan.points), newest.origin) for motion in motions]
+    found = [_ratios(bearings, distances, *earlier_ones) for earlier_ones in seen]
+    if min(map(len, found)) < 30:  # minimum number of points with one of the same bearing
         return None
-    return math.exp(float(np.median(np.log(new[both] / old[both]))))
+    spreads = [float(np.median(np.abs(ratios - np.median(ratios)))) for ratios in found]
+    return math.exp(float(np.median(found[int(np.argmin(spreads))])))
+
+
+def _polar(points: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
+    x, y = points[:, 0] - origin[0], points[:, 1] - origin[1]
+    return np.arctan2(y, x), np.hypot(x, y)
+
+
+def _ratios(bearings: Array, distances: Array, others: Array, reach: Array) -> Array:
+    """Logarithms of the ratios of distances to those of the other points nearest in bearing."""
+    order = np.argsort(others)
+    there = np.searchsorted(others[order], bearings)
+    sides = [order[(there + side) % len(order)] for side in (-1, 0)]
+    apart = [np.abs(np.remainder(others[side] - bearings + math.pi, math.tau) - math.pi) for side in sides]
+    nearest = np.where(apart[0] < apart[1], *sides)
+    close = np.minimum(*apart) < math.radians(1)  # of beams that look the same way
+    result: Array = np.log(distances[close] / reach[nearest[close]])
+    return result
 
 
 def _rescaled(scan: Scan, origin: tuple[float, float], factor: float) -> Scan:

@@ -135,8 +135,7 @@ class ScanMotionStep:
         return StepOutput(stamp, last[0], (x, y, yaw), deviations, scatter, overlap, verdict, rest, factor, name)
 
     def _scale_change(self, inputs: StepInput, whole: Scan, dt: float, motions: list[Array]) -> float | None:
-        seen, before = inputs.scan, self._revolution
-        self._revolution = Revolution(seen.ranges, seen.start_angle, seen.angle_increment, whole, seen.mount[:2])
+        before, self._revolution = self._revolution, Revolution(whole, inputs.scan.mount[:2])
         if before is None or inputs.rolled is None or not 0.0 < dt < GAP:
             return None
         return scale_change(self._revolution, before, [*motions, np.array(inputs.rolled)])
