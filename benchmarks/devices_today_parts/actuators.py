@@ -12,6 +12,9 @@ from monstertruck_drivers.epos.firmware import FreeMotor
 from monstertruck_drivers.maestro.esc_config import MaestroEscConfig
 from monstertruck_drivers.maestro.esc_driver import MaestroEscDriver
 from monstertruck_drivers.maestro.esc_emulator import MaestroEscEmulator
+from monstertruck_drivers.pca9685.config import Pca9685EscConfig
+from monstertruck_drivers.pca9685.emulator import Pca9685EscEmulator
+from monstertruck_drivers.pca9685.esc_driver import Pca9685EscDriver
 from monstertruck_drivers.vesc.config import VescConfig, VescMotorConfig
 from monstertruck_drivers.vesc.driver import VescDriver
 from monstertruck_drivers.vesc.emulator import VescEmulator
@@ -125,6 +128,8 @@ def row(
     stalls: tuple[tuple[str, str], ...] = STALLS,
     *,
     measures: bool = True,
+    watched: bool = True,
+    talks: bool = True,
 ) -> dict[str, Any]:
     """All measurements of one controller.
 
@@ -133,8 +138,10 @@ def row(
         foreign: where another implementation is compared.
         stalls: faults of the emulator, the first of which silences it: how to start and end each.
         measures: whether it measures its motors at all.
+        watched: whether it notices a dead host.
+        talks: whether a device on its port may send by itself; on an I2C bus none does.
     """
-    stands = [on_bench(make, lambda bench, i=i: stand(bench, i * 0.0037)) for i in range(TRIES)]
+    stands = [on_bench(make, lambda bench, i=i: stand(bench, i * 0.0037)) for i in range(TRIES if watched else 0)]
 
     async def trouble(bench: DriveBench) -> dict[str, bool]:
         async with running(bench.command(), bench.serve()):
@@ -147,9 +154,10 @@ def row(
         bench.emulator.inject(*stalls[0][0].split())
         return await stranger_refused(bench)
 
-    found["stranger"] = on_bench(make, refused)
+    if talks:
+        found["stranger"] = on_bench(make, refused)
     return {
-        "stand_ms": round(max(stands), 1),
+        "stand_ms": round(max(stands), 1) if stands else None,
         "clock_ms": round(on_bench(make, clock_error), 2) if measures else None,
         "trouble": score(found),
         "foreign": foreign,
@@ -231,4 +239,23 @@ def maestro_esc() -> dict[str, Any]:
     return row(make, "none: its protocol has no client in use here", stalls, measures=False)
 
 
-ROWS = {"maestro_esc": maestro_esc, "vesc": vesc, "arduino_bridge": arduino_bridge}
+def pca9685_esc() -> dict[str, Any]:
+    """A speed controller without feedback on a PCA9685, which has no watchdog, at 40 rad/s."""
+    config = Pca9685EscConfig()
+
+    def make(clock: VirtualClock) -> DriveBench:
+        def driver(port: Any, events: Any, ends: dict[str, Any]) -> Pca9685EscDriver:
+            none: Any = Mailbox(latest(), lambda _: None)
+            out: Any = Newest()
+            return Pca9685EscDriver(config, port, clock, drive=none, steering=out, battery=None, events=events, **ends)
+
+        return DriveBench(
+            clock, lambda rotors: Pca9685EscEmulator(clock, rotors[0], None, config), driver, 40.0, motors=1
+        )
+
+    stalls = (("absent on", "absent off"), ("brown_out", "oscillator 25e6"))
+    foreign = "tests/unit/drivers/pca9685/test_emulator.py"
+    return row(make, foreign, stalls, measures=False, watched=False, talks=False)
+
+
+ROWS = {"maestro_esc": maestro_esc, "pca9685_esc": pca9685_esc, "vesc": vesc, "arduino_bridge": arduino_bridge}

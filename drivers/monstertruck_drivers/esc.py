@@ -57,15 +57,24 @@ class UnmeasuredMotor:
     def _wanted(self, now: int) -> float:
         """Rate to ask for, rad/s."""
         command = self._commands.latest
-        fresh = command is not None and now - command.stamp <= self._timeout
-        if command is None or not fresh or command.action is not DriveAction.RUN or now < self._ready_at:
+        if command is None or self._mode(now) is not DriveMode.ENABLED or now < self._ready_at:
             return 0.0
         limit = self._esc.max_rate
         return min(max(command.motor_velocity, -limit), limit)
 
+    def _mode(self, now: int) -> DriveMode:
+        """Mode of the motor; a stale command to run is a stop."""
+        command = self._commands.latest
+        if command is None:
+            return DriveMode.DISABLED
+        stale = command.action is DriveAction.RUN and now - command.stamp > self._timeout
+        return DriveMode.QUICK_STOP if stale else MODES[command.action]
+
     def publish(self, stamp: int, received: int) -> None:
-        """Publish the rate that the motor may have."""
-        wanted, command = self._wanted(stamp), self._commands.latest
+        """Publish the rate that the motor may have; nothing while the speed controller has its neutral pulses."""
+        if stamp < self._ready_at:
+            return
+        wanted = self._wanted(stamp)
         dt = min(max((stamp - self._at) / SECOND, 0.0), 1.0) if self._at else 0.0
         before = self._rate
         slowest = abs(before) - self._esc.quick_deceleration * dt
@@ -80,6 +89,6 @@ class UnmeasuredMotor:
                 seq=self._out.next_seq(),
                 position=self._turned,
                 velocity=self._rate,
-                mode=DriveMode.DISABLED if command is None else MODES[command.action],
+                mode=self._mode(stamp),
             )
         )

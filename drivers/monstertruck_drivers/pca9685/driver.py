@@ -8,7 +8,7 @@ from monstertruck_drivers.pca9685.protocol import pulse
 from monstertruck_drivers.pca9685.session import Pca9685Session
 from monstertruck_drivers.transaction import Misses
 from monstertruck_runtime.clock import POLLING, SECOND, Clock, Schedule
-from monstertruck_runtime.errors import DeviceLostError
+from monstertruck_runtime.errors import DeviceFaultError, DeviceLostError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas.base import servo_fields
 from monstertruck_schemas.cmd import SteeringCommand
@@ -68,6 +68,7 @@ class Pca9685Driver:
                 address.
             WrongDeviceError: another device has its address.
             PortBusyError: another process holds the emulated bus.
+            DeviceFaultError: a channel that should be at rest reads back otherwise twice in a row; all pulses are off.
         """
         config = self._config
         async with await self._port.open() as link:
@@ -122,6 +123,9 @@ class Pca9685Driver:
         del rest
         return {}
 
+    def _restarted(self) -> None:
+        """Take note that the chip has lost its settings, and with them its pulses."""
+
     def _polled(self, stamp: int, received: int) -> None:
         """Publish what else is known after a poll."""
 
@@ -131,6 +135,17 @@ class Pca9685Driver:
         for channel, counts in targets.items():
             await session.write(pulse(channel, counts))
 
+    async def _require_rest(self, session: Pca9685Session, differ: list[int]) -> None:
+        """End all pulses if a channel that was told to rest does not: without them a speed controller drops its motor.
+
+        Raises:
+            DeviceFaultError: see ``run``.
+        """
+        rest = self._more(rest=True)
+        if unruly := [channel for channel in differ if self._sent[channel] == rest.get(channel)]:
+            await session.sleep()
+            raise DeviceFaultError(f"{session.name}: channels {unruly} do not come to rest: all pulses are off")
+
     async def _poll(self, session: Pca9685Session) -> None:
         asked, config = self._clock.now(), self._config
         present = {servo.channel: await session.counts(servo.channel) for servo in config.servos}
@@ -139,11 +154,15 @@ class Pca9685Driver:
         received = self._clock.now()
         differ = sorted(channel for channel, counts in self._sent.items() if present[channel] != counts)
         lost = bool(differ) or not set_up
+        if not set_up:
+            self._restarted()
         if lost:
             if not self._failing:
                 what = f"channels {differ} differ" if set_up else "mode or frequency lost"
                 text = f"the PCA9685 reads back otherwise ({what}): settings and pulses sent again"
                 self._events(Reason.DEVICE_FAULT, Severity.WARNING, self.name, text)
+            if self._failing:
+                await self._require_rest(session, differ)
             await session.set_up(config.prescale)
             await self._write(session, dict(self._sent) | self._more(rest=self._command is None or self._stale))
         self._failing = lost

@@ -75,5 +75,8 @@ class Pca9685EscDriver(Pca9685Driver):
         pulse_us = self._esc.neutral_us if rest else self._motor.pulse_us()
         return {self._esc.channel: self._config.counts(pulse_us)}
 
+    def _restarted(self) -> None:
+        self._motor.begin()
+
     def _polled(self, stamp: int, received: int) -> None:
         self._motor.publish(stamp, received)

@@ -91,12 +91,16 @@ class Pca9685Session:
         """
         mode, present = await self.identify()
         if present != prescaler:
-            await self.write(bytes((PwmRegister.MODE1, AWAKE | PwmMode1.SLEEP)))
+            await self.sleep()
             await self.write(bytes((PwmRegister.PRE_SCALE, prescaler)))
         await self.write(bytes((PwmRegister.MODE2, MODE2_RESET)))
         await self.write(bytes((PwmRegister.MODE1, AWAKE)))
         if present != prescaler or mode & PwmMode1.SLEEP:
             await self._clock.sleep(WAKE_UP)
+
+    async def sleep(self) -> None:
+        """Stop the oscillator, and with it all pulses; raises as ``write``."""
+        await self.write(bytes((PwmRegister.MODE1, AWAKE | PwmMode1.SLEEP)))
 
     async def is_set_up(self, prescaler: int) -> bool:
         """Whether mode and frequency are those of ``set_up``; raises as ``write``."""

@@ -8,6 +8,7 @@ from pydantic import ValidationError
 
 from monstertruck_drivers.catalog import DEVICES
 from monstertruck_drivers.epos.firmware import FreeMotor
+from monstertruck_drivers.esc import UnmeasuredMotor
 from monstertruck_drivers.maestro.config import MaestroConfig
 from monstertruck_drivers.maestro.esc_config import EscConfig, MaestroEscConfig
 from monstertruck_drivers.maestro.esc_driver import MaestroEscDriver
@@ -80,6 +81,7 @@ def test_it_drives_and_steers_once_the_speed_controller_has_had_its_neutral_puls
         async with rig.driving():
             await rig.settle(1.5)
             assert rig.turning() == 0.0
+            assert not rig.out.kept, "a motor that does not turn yet is not blocked"
             assert rig.emulator.pulse_us(CHANNEL, rig.clock.now()) == 1500.0
             await rig.settle(2.5)
             assert rig.turning() == pytest.approx(100.0, rel=1e-2)
@@ -147,6 +149,20 @@ def test_commands_that_stop_coming_make_the_pulse_neutral():
             assert rig.turning() == 0.0
 
     on_bench(test)
+
+
+def test_a_stale_command_to_run_is_a_stop_and_no_blocked_motor():
+    async def main(clock: VirtualClock) -> None:
+        commands, out = Mailbox[DriveCommand](latest(), lambda _: None), Kept()
+        motor = UnmeasuredMotor(CONFIG.esc, clock, commands, out, command_timeout=0.2)
+        head = {"stamp": clock.now(), "received": clock.now(), "seq": 0}
+        commands.put(DriveCommand(**head, action=DriveAction.RUN, speed=0.0, motor_velocity=100.0))
+        for mode, rate in ((DriveMode.ENABLED, 100.0), (DriveMode.QUICK_STOP, 0.0)):
+            motor.publish(clock.now(), clock.now())
+            assert (out.last.mode, CONFIG.esc.rate(motor.pulse_us())) == (mode, pytest.approx(rate))
+            await clock.sleep(0.3)
+
+    run_virtual(main, start=SECOND)
 
 
 def test_unplugged_it_starts_again_with_neutral_pulses():

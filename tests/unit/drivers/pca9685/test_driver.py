@@ -10,7 +10,13 @@ from monstertruck_drivers.pca9685.emulator import Pca9685Emulator
 from monstertruck_drivers.pca9685.esc_driver import Pca9685EscDriver
 from monstertruck_drivers.pca9685.protocol import PwmMode1, PwmRegister, pulse
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import ConfigError, DeviceLostError, DeviceTimeoutError, WrongDeviceError
+from monstertruck_runtime.errors import (
+    ConfigError,
+    DeviceFaultError,
+    DeviceLostError,
+    DeviceTimeoutError,
+    WrongDeviceError,
+)
 from monstertruck_schemas.cmd import DriveAction
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import DriveMode
@@ -241,6 +247,25 @@ def test_a_dead_host_is_noticed_by_nothing_on_the_chip():
             with pytest.raises(DeviceTimeoutError):
                 await rig.session()
             await dying
+
+    on_bench(test, ESC)
+
+
+@pytest.mark.parametrize("fault", [("scaled", "1.1"), ("noisy", "40")])
+def test_without_pulses_a_motor_stops_that_does_not_obey_neutral(fault: tuple[str, str]):
+    async def test(rig):
+        async def disobey():
+            rig.action, rig.rate = DriveAction.RUN, 100.0
+            await rig.settle(4.0)
+            rig.emulator.signals.inject(f"target_{ESC.esc.channel}", *fault)
+            rig.action = DriveAction.QUICK_STOP
+            await rig.settle(0.3)
+            assert rig.pulse(ESC.esc.channel) is None
+
+        async with background(disobey()) as disobeying:
+            with pytest.raises(DeviceFaultError, match=r"channels \[\d\] do not come to rest: all pulses are off"):
+                await rig.session()
+            await disobeying
 
     on_bench(test, ESC)
 
