@@ -133,7 +133,9 @@ class TruckPlant(Plant):
         lateral = 0.0
         if self._tyres is None:
             vx, _, wz = self._twist
-            lateral = (vx * wz + PLANT_GRAVITY * sin(self._attitude[1])) * copysign(1.0, wheels[0])
+            pressed = vx * wz + PLANT_GRAVITY * sin(self._attitude[1])
+            grip = PLANT_GRAVITY  # greatest lateral acceleration of tyres with a friction coefficient of 1
+            lateral = min(max(pressed, -grip), grip) * copysign(1.0, wheels[0])
         front_slip = config.front_slip_angle * lateral - config.slip_angle_noise * front_noise
         rear_slip = config.rear_slip_angle * lateral - config.slip_angle_noise * rear_noise
         half = len(steering.angles) // 2
