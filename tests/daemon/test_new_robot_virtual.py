@@ -36,7 +36,23 @@ async def explore(rig: VirtualRig) -> None:
     await rig.clock.sleep(14.0)
 
 
-@pytest.mark.parametrize(("name", "options"), [("ant", ANT), pytest.param("beetle", BEETLE, marks=pytest.mark.long)])
+EVERY_WAY = (
+    "--drive vesc --drive-ratio 12 --wheelbase 0.24 --track 0.2 --wheel-radius 0.05 --length 0.36 --width 0.3 "
+    "--mass 4 --speed 0.5 --lidar ld19"
+)
+"""Three bodies that move sideways and turn on the spot."""
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("ant", ANT),
+        pytest.param("beetle", BEETLE, marks=pytest.mark.long),
+        pytest.param("crab", f"--body mecanum {EVERY_WAY}", marks=pytest.mark.long),
+        pytest.param("fly", f"--body omni {EVERY_WAY}", marks=pytest.mark.long),
+        pytest.param("spider", f"--body independent --steering maestro {EVERY_WAY}", marks=pytest.mark.long),
+    ],
+)
 def test_the_twin_maps_a_room(tmp_path: Path, name: str, options: str):
     made = CliRunner().invoke(app, ["new-robot", name, "--folder", str(tmp_path), *options.split()])
     assert made.exit_code == 0, made.output

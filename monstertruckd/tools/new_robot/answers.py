@@ -10,7 +10,20 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Name, Positive, Schema, field_docs, first_mistake
 from monstertruck_schemas.body import Metres
 
-Body = Literal["differential", "skid_steer", "ackermann", "bicycle", "tricycle", "truck"]
+Body = Literal[
+    "differential",
+    "skid_steer",
+    "ackermann",
+    "bicycle",
+    "tricycle",
+    "truck",
+    "mecanum",
+    "omni",
+    "synchro",
+    "independent",
+]
+UNSTEERED: Final = ("differential", "skid_steer", "mecanum", "omni")
+"""Bodies without steering servos."""
 Drive = Literal["vesc", "arduino_bridge", "steppers", "epos", "maestro_esc", "pca9685_esc"]
 LIDARS: Final = tuple(kind.name for kind in DEVICES.of_role("lidar"))
 NONE: Final = "none"
@@ -22,12 +35,12 @@ class Answers(Schema):
     name: Name
     """Name of the robot"""
     body: Body
-    """How it moves"""
+    """How it moves; independent: a motor and a servo for every wheel"""
     wheelbase: Metres
     """Distance between front and rear axle (m); of a body that steers nothing, the length of the bicycle that requests
     speak of"""
     track: Metres
-    """Distance between left and right wheels (m)"""
+    """Distance between left and right wheels (m); of three omni wheels, of the two behind"""
     wheel_radius: Metres
     """Wheel radius (m)"""
     length: Metres
@@ -126,7 +139,7 @@ def asked(name: str, answers: dict[str, Any]) -> bool:
         case "cells":
             return bool(answers.get("battery", NONE) != NONE)
         case "steering":
-            return answers.get("body") not in ("differential", "skid_steer")
+            return answers.get("body") not in UNSTEERED
         case _:
             return True
 

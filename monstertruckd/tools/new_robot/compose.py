@@ -34,7 +34,7 @@ def robot(answers: Answers, tree: TreeSnapshot, navigation: str) -> Section:
     """
     chassis = _chassis(answers)
     found: Section = {"include": navigation} if answers.lidar != NONE else {}
-    found |= {"version": FILE_VERSION, "robot": answers.name, "body": {"kind": answers.body}}
+    found |= {"version": FILE_VERSION, "robot": answers.name, "body": _body(answers)}
     found |= {"geometry": _geometry(answers), "devices": _with_ports(_devices(answers, chassis), tree)}
     if answers.battery == "iio":
         found["monitors"] = {"battery": {"kind": "iio"} | _pack(answers.cells)}
@@ -70,8 +70,19 @@ def twin(own: str, simulation: str) -> Section:
 
 def _chassis(answers: Answers) -> Chassis:
     train = DriveTrain(answers.drive_ratio, answers.wheel_radius)
-    built: Chassis = BODIES[answers.body].build(Dimensions(train, answers.wheelbase, answers.track))
+    body = {name: value for name, value in _body(answers).items() if name != "kind"}
+    built: Chassis = BODIES[answers.body].build(Dimensions(train, answers.wheelbase, answers.track), **body)
     return built
+
+
+def _body(answers: Answers) -> Section:
+    match answers.body:
+        case "omni":
+            return {"kind": "omni", "circle": _rounded(answers.track / math.sqrt(3))}
+        case "independent":
+            return {"kind": "independent", "steering": "wheels"}
+        case _:
+            return {"kind": answers.body}
 
 
 def _geometry(answers: Answers) -> Section:
@@ -146,8 +157,13 @@ def _axles(answers: Answers, chassis: Chassis) -> Section:
         return {}
     if answers.body == "truck":
         return {"front": {"channel": 1}, "rear": {"channel": 0}}
-    pulses = {"centre_us": 1500.0, "scale_us_per_deg": 10.0, "min_us": 1100.0, "max_us": 1900.0, "max_angle_deg": 35.0}
-    return {"front": {"channel": 1} | pulses}
+    names = ("scale_us_per_deg", "min_us", "max_us", "max_angle_deg")
+    turns_far = answers.body in ("synchro", "independent")  # to both sides, so that wheels point anywhere
+    pulses = dict(zip(names, (5.0, 1000.0, 2000.0, 100.0) if turns_far else (10.0, 1100.0, 1900.0, 35.0), strict=True))
+    wheels = ("front", "front_right", "rear", "rear_right") if answers.body == "independent" else ("front",)
+    at_once: Section = {"speed": 0} if turns_far and answers.steering == "maestro" else {}
+    servo = {"centre_us": 1500.0} | pulses | at_once
+    return {wheel: {"channel": channel} | servo for channel, wheel in enumerate(wheels, 1)}
 
 
 def _in_time(driver: Section, answers: Answers) -> Section:
@@ -236,7 +252,7 @@ def _put(section: Section, key: list[str], value: Any) -> None:
 def _tracker(answers: Answers, chassis: Chassis) -> Section:
     return {
         "kind": "lqr",
-        "steering": "counter" if chassis.freedom == "both" else "front",
+        "steering": {"both": "counter", "front": "front", "parallel": "crab"}[chassis.freedom],
         "speed": answers.speed,
         "reverse_speed": _rounded(0.4 * answers.speed),
         "acceleration": _rounded(0.6 * answers.braking),
@@ -262,6 +278,8 @@ def _navigation(answers: Answers, chassis: Chassis, tracker: Section) -> Section
         "slam": {"save": f"runs/{answers.name}", "grid": {"passed": None}},
         "explorer": {"reach": min(reach, 12.0), "view": round(view, 3)},
     }
+    if chassis.freedom == "parallel":  # no route turns with such a body
+        found |= {"planner": None, "explorer": None}
     return found | ({} if answers.camera != NONE else {"points": None})
 
 

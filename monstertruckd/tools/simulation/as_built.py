@@ -10,7 +10,7 @@ from monstertruck_drivers.shafts import motor_limits
 from monstertruck_drivers.vesc.config import VescServoConfig
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import Mount
-from monstertruck_sim.world.config import MotorConfig, WorldConfig
+from monstertruck_sim.world.config import MotorConfig, ServoModelConfig, WorldConfig
 from monstertruckd.config.device_safety import packs
 from monstertruckd.config.truck import TruckConfig
 
@@ -53,12 +53,16 @@ def _servos(config: TruckConfig) -> dict[str, Any]:
         return {}
     driver = config.devices.present()[steering[0]].driver
     unit = getattr(driver, "unit", driver)
-    axles = {name: servo for name in ("front", "rear") if isinstance(servo := getattr(unit, name, None), ServoPulses)}
-    servos = {
+    names = ("front", "front_right", "rear", "rear_right")
+    axles = {name: servo for name in names if isinstance(servo := getattr(unit, name, None), ServoPulses)}
+    stop: float = ServoModelConfig.model_fields["left_stop_deg"].default
+    servos: dict[str, dict[str, Any]] = {
         f"{name}_servo": {
             "channel": vars(servo)["channel"],
             "centre_us": servo.centre_us,
             "us_per_degree": servo.direction * servo.scale_us_per_deg,
+            "left_stop_deg": max(servo.max_angle_deg, stop),
+            "right_stop_deg": max(servo.max_angle_deg, stop),
         }
         for name, servo in axles.items()
     }
