@@ -136,7 +136,7 @@ class Pca9685Driver:
             await session.write(pulse(channel, counts))
 
     async def _require_rest(self, session: Pca9685Session, differ: list[int]) -> None:
-        """End all pulses if a channel that was told to rest does not: without them a speed controller drops its motor.
+        """End all pulses if a channel does not come to rest: without them a speed controller lets its motor coast.
 
         Raises:
             DeviceFaultError: see ``run``.
