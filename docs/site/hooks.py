@@ -7,7 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from mkdocs.structure.files import File, Files, InclusionLevel
-from pages import benchmarks, commands, configuration, devices, figures, never_tried, reasons, source, symptoms, topics
+from pages import (
+    api,
+    benchmarks,
+    commands,
+    configuration,
+    devices,
+    figures,
+    never_tried,
+    reasons,
+    source,
+    symptoms,
+    topics,
+)
 from pages.markdown import Page, join
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,6 +51,7 @@ def on_config(config: Any) -> Any:
         *commands.pages(texts),
         *topics.pages(),
         *configuration.pages(),
+        *api.pages(),
         *figures.pages(),
         benchmarks.page(),
         never_tried.page(texts),
