@@ -36,21 +36,13 @@ from monstertruckd.tools.calibrate import (
     stabiliser,
     weave,
 )
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.board_mount import LidarPlace
 from monstertruckd.tools.calibrate.board_views import BoardGuide, BoardView
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steering import BAND, SPAN
-from monstertruckd.tools.calibrate.steering_model import (
-    CURVE,
-    HEADING,
-    LINKAGE,
-    SLIP,
-    Maps,
-    SteeringModel,
-    SteeringRun,
-    half_widths,
-)
+from monstertruckd.tools.calibrate.steering_model import Maps, SteeringModel, SteeringRun, half_widths
 from tests.calibration_kit import Verdict
 
 CHASSIS: Final = build_chassis(TruckBody(), Dimensions(DriveTrain(644.0, 0.075), 0.32, 0.26))
@@ -89,14 +81,14 @@ def drive_fit(rng: np.random.Generator) -> list[Verdict]:
     """Taped runs."""
     wizard = drive.DriveWizard()
     turns = rng.uniform(1000.0, 1600.0)
-    tape = 1 + drive.TAPE_SCALE * rng.normal() / NORMAL
+    tape = 1 + ASSUMED.tape_scale * rng.normal() / NORMAL
     values = []
     for _ in range(wizard.runs):
         shown = wizard.metres * tape + math.sqrt(2) * wizard.tape_error * rng.normal()
         values.append(turns * wizard.metres / shown)
     found = drive.turns_per_metre(values, wizard.tape_error, wizard.metres, 0.0)
     # On another floor.
-    ratio, true = drive.on_any_floor(found), turns * (1 + drive.SLIP * rng.normal() / NORMAL)
+    ratio, true = drive.on_any_floor(found), turns * (1 + ASSUMED.floor_slip * rng.normal() / NORMAL)
     return [
         Verdict("drive.turns_per_metre", found.value, found.low, found.high, turns),
         Verdict("drive.drive_ratio", ratio.value / turns, ratio.low / turns, ratio.high / turns, true / turns),
@@ -172,8 +164,8 @@ def steered_leg(
     pulses = tuple(np.full(16, float(MAPS.pulses(axle, np.array(servos[axle])))) for axle in (0, 1))
     (ideal,), (aside,) = model.predict([SteeringRun(motor, (pulses[0], pulses[1]), 0.0, 0.0)], true)
     part = min(abs(math.remainder(float(ideal), math.tau)), 1.0)
-    sigma = math.hypot(HEADING, CURVE * part, LINKAGE * float(ideal))
-    turn = float(ideal) + math.hypot(sigma, SLIP * math.sqrt(abs(way))) * rng.normal()
+    sigma = math.hypot(ASSUMED.turn_heading, ASSUMED.turn_compass * part, ASSUMED.turn_linkage * float(ideal))
+    turn = float(ideal) + math.hypot(sigma, ASSUMED.turn_slip * math.sqrt(abs(way))) * rng.normal()
     string = front == rear == 0.0 and way > 0.0
     offset = float(aside) + 0.0076 * rng.normal() if string else None
     return SteeringRun(motor, (pulses[0], pulses[1]), turn, sigma, offset, 0.0076)
@@ -183,7 +175,7 @@ def _weaves(rng: np.random.Generator) -> list[Verdict]:
     """Delay of the steering from three weaves ahead and back."""
     delay, lag = rng.uniform(0.02, 0.15), rng.uniform(0.0, 0.06)
     dead = max(delay - lag, 0.0)
-    late = weave.HALF_FRAME * rng.uniform(-1, 1)  # how long commands wait for a pulse since this start
+    late = ASSUMED.servo_wait * rng.uniform(-1, 1)  # how long commands wait for a pulse since this start
     at = np.arange(0.0, 12.0, 0.04)
     changes = np.cumsum(weave.WEAVE * 4)
     sides = np.array([1.0 if k % 2 else -1.0 for k in range(len(changes))])
@@ -201,7 +193,7 @@ def _weaves(rng: np.random.Generator) -> list[Verdict]:
         return np.concatenate([one.residuals(delay, squared) for one in seen])
 
     found: dict[str, Estimate] = {
-        e.name: e for e in weave.estimates(ResponseFit.of(residuals, weave.HALF_FRAME, weave.ROUNDED))
+        e.name: e for e in weave.estimates(ResponseFit.of(residuals, ASSUMED.servo_wait, ASSUMED.weave_linearity))
     }
     e = found["delay"]
     return [Verdict("steering.delay", e.value, e.low, e.high, dead + lag)]
@@ -213,7 +205,7 @@ def odometry_fit(rng: np.random.Generator) -> list[Verdict]:
     model = odometry.SquareModel(SteeringModel(CHASSIS), MAPS, AHEAD)
     true = np.array((rng.uniform(0.95, 1.05), rng.uniform(0.95, 1.05), rng.uniform(-0.04, 0.04)))
     # What the interval's bounds cover besides: floor, linkage and wheels that are steered while the truck stands.
-    besides = odometry.FLOOR_DIFFERENCE, math.hypot(odometry.LINKAGE, odometry.ON_THE_SPOT), 0.0
+    besides = ASSUMED.floor_slip, math.hypot(ASSUMED.square_linkage, ASSUMED.square_on_the_spot), 0.0
     actual = true * (1 + np.array(besides) * rng.normal(size=3) / NORMAL)
     squares = square_legs(model, actual, rng)
     fit = model.fit(squares, 0.002, 0.0035)
@@ -237,7 +229,7 @@ def square_legs(model: odometry.SquareModel, actual: np.ndarray, rng: np.random.
         end = model.end(odometry.Square(runs, 0.0, (0.0, 0.0)), actual)
         side = actual[0] * 1.5 * math.sin(runs[0].turn / 2) / (runs[0].turn / 2)
         side += math.hypot(0.002 * math.sqrt(2), 0.003) * rng.normal()
-        place = math.hypot(odometry.PLACE, 0.007)
+        place = math.hypot(ASSUMED.square_place, 0.007)
         squares.append(odometry.Square(runs, side, (end[0] + place * rng.normal(), end[1] + place * rng.normal())))
     return squares
 
@@ -253,7 +245,7 @@ def _leg(
     ideal = SteeringRun(motor, (pulses[0], pulses[1]), 0.0, 0.0)
     turn = float(model.turns([ideal], actual)[0])
     sigma = math.hypot(0.002, 0.006 * min(abs(turn), 1.0), 0.005 * turn)
-    turn += math.hypot(sigma, SLIP * math.sqrt(way)) * rng.normal()
+    turn += math.hypot(sigma, ASSUMED.turn_slip * math.sqrt(way)) * rng.normal()
     return SteeringRun(motor, (pulses[0], pulses[1]), turn, sigma)
 
 
@@ -262,13 +254,15 @@ def lidar_fit(rng: np.random.Generator) -> list[Verdict]:
     x, y, yaw = rng.uniform((0.10, -0.03, -0.05), (0.18, 0.03, 0.05))
     error = math.radians(0.15)
     true = np.array((x, y, yaw, 1 + 0.01 * rng.normal(), error * rng.normal()))
-    centre = lidar.CENTRE * rng.normal()
+    centre = ASSUMED.turning_centre * rng.normal()
     legs = []
     for side in (1, -1):
         for way, turn in ((1.0, 0.0), (-1.0, 0.0), *((0.665, side * 1.52),) * 4):
             turn = turn + 0.01 * rng.normal()
             sigma = 0.006
-            actual = true + np.array((centre, 0.0, 0.0, lidar.LEG_DRIFT * rng.normal(), lidar.CRAB * rng.normal()))
+            actual = true + np.array(
+                (centre, 0.0, 0.0, ASSUMED.leg_distance * rng.normal(), ASSUMED.leg_direction * rng.normal())
+            )
             seen = lidar.seen_motion(actual, np.array((way,)), np.array((turn,)), np.zeros(1))[0]
             seen[:2] += sigma * rng.normal(size=2)
             legs.append(lidar.LidarLeg(way, (float(seen[0]), float(seen[1]), float(seen[2])), sigma))
@@ -328,8 +322,11 @@ def slip_fit(rng: np.random.Generator) -> list[Verdict]:
         for sign in (1, -1, 1, -1):
             vx, vy, wz = robot.forward((sign * left, sign * right))
             x, y, yaw = integrate((0.0, 0.0, 0.0), vx, vy, wz, 1.0)
-            way = slip.SLIDING * 0.021 * max(left, right)
-            place, aim = math.hypot(slip.POSITION_FLOOR, way), math.hypot(slip.AIM, slip.SLIDING * abs(yaw))
+            way = ASSUMED.sliding * 0.021 * max(left, right)
+            place, aim = (
+                math.hypot(ASSUMED.rest_position, way),
+                math.hypot(ASSUMED.rest_heading, ASSUMED.sliding * abs(yaw)),
+            )
             motion = x + place * rng.normal(), y + place * rng.normal(), yaw + aim * rng.normal()
             arcs.append(slip.SkidArc(sign * left, sign * right, motion, (0.0003, 0.0005)))
     return judged(slip.result_of(arcs, 0.021, 0.0525), truth)
@@ -364,21 +361,23 @@ def sonar_legs(
     Odometry turns too little by another share on every arc, drifts between, and errs in the way.
     """
     legs: list[sonar.SonarLeg] = []
-    aside, turned, further = 0.0, 0.0, 1.0 + sonar.BELIEVED[1] * rng.normal()
+    aside, turned, further = 0.0, 0.0, 1.0 + ASSUMED.sonar_scale[1] * rng.normal()
     step = 0.2 * sonar.SonarWizard().speed / ARC
     for side in (1, -1):
         for way in (1, -1):
             angles = np.arange(0.0, turn, step)[::way] * side
             radius = side * ARC
             poses = np.column_stack((radius * np.sin(angles), radius * (1 - np.cos(angles)), angles))
-            nearer, drift, more = (np.array(sonar.ARC_DRIFT) * rng.normal(size=3)).tolist()
+            nearer, drift, more = (np.array(ASSUMED.sonar_arc) * rng.normal(size=3)).tolist()
             nearer, drift = (nearer, drift) if legs else (0.0, 0.0)
             actual = _drifted(poses, aside + nearer, turned + drift, more, further)
             aside, turned = (actual[-1] - poses[-1])[1:].tolist()
             ranges = {}
             for name, place in places.items():
                 due, past = sonar.wall_range(actual, place, wall, half)
-                heard = due / factor + np.hypot(sonar.NOISE[0], sonar.NOISE[1] * due) * rng.normal(size=due.size)
+                heard = due / factor + np.hypot(ASSUMED.sonar_noise[0], ASSUMED.sonar_noise[1] * due) * rng.normal(
+                    size=due.size
+                )
                 ranges[name] = np.where((past <= 0.45) & (due <= 3.0), heard, np.inf)
             legs.append(sonar.SonarLeg(dict.fromkeys(places, poses), ranges))
     return legs
@@ -402,7 +401,7 @@ def stabiliser_fit(rng: np.random.Generator) -> list[Verdict]:
     stands = mounted(settings, zeros, directions, rng)
     height, walls = 0.25, (2.0, 2.5)
     true = true_joints(settings, stands[0][1], zeros, directions)
-    sigma = math.hypot(0.002 * math.sqrt(2), lidar.FLAT * 0.002) / math.sqrt(2)
+    sigma = math.hypot(0.002 * math.sqrt(2), ASSUMED.tape_floor * 0.002) / math.sqrt(2)
     centre, ahead, left = (
         height,
         height - walls[0] * math.sin(stands[0][0].pitch + true.pitch),
@@ -451,7 +450,7 @@ def camera_fit(rng: np.random.Generator) -> list[Verdict]:
     believed = np.array((0.18, 0.0, 0.25, 0.0, 0.0, 0.0))
     true = believed + rng.uniform(-1, 1, 6) * (0.03, 0.03, 0.03, 0.06, 0.06, 0.06)
     lidar = LidarPlace.of(Mount(x=0.14, z=0.25, yaw=0.02))
-    size, far = 1 + board_mount.PRINT * rng.normal(), board_mount.RANGE * rng.normal()
+    size, far = 1 + ASSUMED.board_size * rng.normal(), ASSUMED.board_range * rng.normal()
     guide = BoardGuide(
         reader, lens, lambda v: board_mount.line_on_board(v, reader, lens, true, lidar, known=True) is not None, 60.0
     )
@@ -518,7 +517,7 @@ def held_boards(
         on = (origin + (axes[:, 2] @ (place - origin) / away)[:, None] * beams - place) @ axes
         met = (away > 0) & (on[:, 0] > 0) & (on[:, 0] < wide) & (on[:, 1] > 0) & (on[:, 1] < high)
         # The board is no plane: its middle is off, and it is warped.
-        off = board_mount.FLAT * rng.normal() + board_mount.WARPED * rng.normal() * (on[:, 0] - wide / 2)
+        off = ASSUMED.board_flatness * rng.normal() + ASSUMED.board_warp * rng.normal() * (on[:, 0] - wide / 2)
         noise = 0.005 / math.sqrt(5) * rng.standard_normal(angles.size)
         ranges = np.where(met, (axes[:, 2] @ (place - origin) + off) / away + far + noise, 3.0)
         sighting = BoardSighting(pixels[ids], ids, 0.5)

@@ -24,18 +24,11 @@ from monstertruck_kinematics.fitting import FitResult, least_squares
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.board import BoardConfig
 from monstertruck_schemas.body import Mount
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.board_views import BoardView
 
 NAMES: Final = ("x", "y", "z", "yaw", "pitch", "roll")
 """Parameters of a mount."""
-FLAT: Final = 0.001
-"""Standard deviation of a board's middle off its plane, m."""
-WARPED: Final = 0.003
-"""Standard deviation of the direction of a line on it, rad."""
-RANGE: Final = 0.004
-"""Standard deviation of the lidar's range excess on such a surface, m."""
-PRINT: Final = 0.003
-"""Relative error of the board's size: a ruler, and paper."""
 LEAST_VIEWS: Final = 6
 REACH: Final = np.array((0.5, 0.5, 0.5, 0.8, 0.8, 0.8))
 """Maximum error of the configured mount, m and rad."""
@@ -109,7 +102,12 @@ def line_on_board(
     by_plane = plane_sigmas(view, reader, lens, pose, in_camera(ends, mount, lidar))
     lidar_sigmas = noise / math.sqrt(run.size), noise / math.sqrt(float(along @ along))
     return BoardLine(
-        pose, ends, (math.hypot(lidar_sigmas[0], by_plane[0], FLAT), math.hypot(lidar_sigmas[1], by_plane[1], WARPED))
+        pose,
+        ends,
+        (
+            math.hypot(lidar_sigmas[0], by_plane[0], ASSUMED.board_flatness),
+            math.hypot(lidar_sigmas[1], by_plane[1], ASSUMED.board_warp),
+        ),
     )
 
 
@@ -203,7 +201,7 @@ def fit(lines: Sequence[BoardLine], mount: Array, lidar: LidarPlace, size_error:
     reach = np.array((*REACH, 0.5, 0.05))
 
     def residual(parameters: Array) -> Array:
-        believed = ((parameters[6] - 1.0) / size_error, parameters[7] / RANGE)
+        believed = ((parameters[6] - 1.0) / size_error, parameters[7] / ASSUMED.board_range)
         return np.concatenate((residuals(parameters, lines, lidar).ravel(), believed))
 
     return least_squares(residual, start, start - reach, start + reach)
@@ -239,7 +237,7 @@ def fit_mount(
         loose = fit(lines, loose.parameters[:6], lidar, unknown)
         found = loose.parameters[:6]
     _check_size(loose, reader.board)
-    return fit(lines, found, lidar, math.hypot(PRINT, focal_error)), lines
+    return fit(lines, found, lidar, math.hypot(ASSUMED.board_size, focal_error)), lines
 
 
 def _agreeing(lines: list[BoardLine], found: FitResult, lidar: LidarPlace) -> list[BoardLine]:

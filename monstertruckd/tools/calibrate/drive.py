@@ -18,6 +18,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.calibration import Estimate, Result, WizardName
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps, unexplained
 from monstertruckd.tools.calibrate.statistics import Interval, estimated, mean_interval
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
@@ -28,10 +29,6 @@ INVERTED: Final = "devices.drive.driver.inverted"
 RATE: Final = "devices.drive.driver.rate"
 ROOM: Final = "a straight of 3 m (half a metre of it behind the robot), 1 m wide, level"
 
-TAPE_SCALE: Final = 0.0005
-"""Relative error of a class II tape, including its sag."""
-SLIP: Final = 0.003
-"""Share that rolling slip may differ by on another floor."""
 BENT: Final = 0.35
 """Turn in one run, rad, beyond which a straight tape measures nothing useful."""
 ASIDE: Final = math.tan(BENT / 2)
@@ -126,9 +123,11 @@ class DriveWizard:
         ratio = turns.times(2 * math.pi * radius)
         floor = (
             f"on this floor; 95 % of the runs' spread and of {1000 * self.tape_error:g} mm in each reading, "
-            f"{TAPE_SCALE:.2%} of the tape" + (f", {bend:.2%} of the bends" if bend else "")
+            f"{ASSUMED.tape_scale:.2%} of the tape" + (f", {bend:.2%} of the bends" if bend else "")
         )
-        wheels = f"motor turns per turn of wheels of {radius:g} m {floor}, {SLIP:.1%} of slip on another one"
+        wheels = (
+            f"motor turns per turn of wheels of {radius:g} m {floor}, {ASSUMED.floor_slip:.1%} of slip on another one"
+        )
         count = len(runs)
         estimates = [
             _sign(inverted),
@@ -163,12 +162,12 @@ def turns_per_metre(values: Sequence[float], tape_error: float, metres: float, b
     """
     middle = float(np.median(values))
     found = mean_interval(values, middle * math.sqrt(2) * tape_error / metres)
-    return found.joined(middle * TAPE_SCALE).widened(middle * bend)
+    return found.joined(middle * ASSUMED.tape_scale).widened(middle * bend)
 
 
 def on_any_floor(found: Interval) -> Interval:
     """Value found on one floor, for use on others."""
-    return found.joined(found.value * SLIP)
+    return found.joined(found.value * ASSUMED.floor_slip)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import Attitude, Imu
 from monstertruckd.config.calibration import Result, WizardName
 from monstertruckd.config.wizards import IMU
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, known_errors
-from monstertruckd.tools.calibrate.steering_model import HEADING
 from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
@@ -62,7 +62,7 @@ class Turn:
             raise InputError(f"the unit was silent for {silent:.1f} s while the robot turned: measure again")
         integral = float(np.trapezoid(rates[between], stamps[between]))
         seconds = float(np.ptp(stamps[between]))
-        return cls(integral, seconds, turned, math.hypot(noise, HEADING, 0.01 * min(over, 1.0)))
+        return cls(integral, seconds, turned, math.hypot(noise, ASSUMED.turn_heading, 0.01 * min(over, 1.0)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import VALID_BEAM, LaserScan
 from monstertruckd.config.calibration import Estimate, Result, WizardName
 from monstertruckd.config.wizards import LIDAR
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.beams import stacked_ranges
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import AXLES, EYE
@@ -48,16 +49,8 @@ LEAST_OVERLAP: Final = 0.5
 """Minimum overlap of two registered scans."""
 LEAST_SCANS: Final = 3
 """Minimum scans at each rest."""
-CRAB: Final = 0.005
-"""Standard deviation of the direction of travel on one leg, by tyres, rad."""
-LEG_DRIFT: Final = 0.006
-"""Standard deviation of the distance of one leg, by slip, as a share."""
-CENTRE: Final = 0.002
-"""m: how far the turning centre of all arcs may be ahead or behind by tyres that slip outward."""
 TILT: Final = math.radians(0.2)
 """Standard deviation of the compass's tilt, rad."""
-FLAT: Final = 0.5
-"""Share of the tape's standard deviation that a floor is uneven by."""
 MOST_TILT: Final = math.sin(math.radians(20.0))
 """Rise of the beam per metre, at most: more is a wrong number."""
 HEIGHTS: Final = (
@@ -186,7 +179,7 @@ class LidarWizard:
         heights = [(await context.ask(step)) / 100 for step in HEIGHTS]
         pitch, roll = beam_tilt(heights, (ahead, left))
         body = tuple(float(np.mean([getattr(a, name) for a in tilt])) for name in ("pitch", "roll"))
-        error = math.hypot(self.tape_error * math.sqrt(2), FLAT * self.tape_error)
+        error = math.hypot(self.tape_error * math.sqrt(2), ASSUMED.tape_floor * self.tape_error)
         found = (
             ("pitch", pitch - body[0] - joints[0], ahead, "nose down positive"),
             ("roll", roll - body[1] - joints[1], left, "right side down positive"),
@@ -262,8 +255,9 @@ def result_of(
         raise InputError("the mount is not determined by the legs: more than half a metre off, or the scans do not fit")
     x, y, yaw = (Interval(float(v), float(h)) for v, h in zip(fit.parameters[:3], halves[:3], strict=True))
     noise = "95 % of scans and slip"
+    x = x.joined(NORMAL * ASSUMED.turning_centre)
     estimates = [
-        estimated("x", x.joined(NORMAL * CENTRE), "m", len(legs), f"before the body's middle; {noise}", f"{LIDAR}.x"),
+        estimated("x", x, "m", len(legs), f"before the body's middle; {noise}", f"{LIDAR}.x"),
         estimated("y", y, "m", len(legs), f"left of it; {noise}", f"{LIDAR}.y"),
         estimated(
             "yaw", yaw, "rad", len(legs),
@@ -290,7 +284,12 @@ def fit_mount(legs: Sequence[LidarLeg], mount: tuple[float, float, float], crab:
     """Fit the lidar's translations by least squares; parameters x, y (m), yaw (rad), scale, crab (rad)."""
     distances, seen = np.array([leg.distance for leg in legs]), np.array([leg.seen for leg in legs])
     travels = np.array([leg.travel for leg in legs])
-    sigmas = np.array([math.hypot(leg.sigma, LEG_DRIFT * leg.distance, CRAB * leg.distance) for leg in legs])
+    sigmas = np.array(
+        [
+            math.hypot(leg.sigma, ASSUMED.leg_distance * leg.distance, ASSUMED.leg_direction * leg.distance)
+            for leg in legs
+        ]
+    )
     start = np.array((*mount, 1.0, 0.0))
     reach = np.array((0.5, 0.5, math.pi, 0.3, 0.3))
 
@@ -323,7 +322,12 @@ def _arc(distance: float, crab: float, turn: float) -> Array:
 
 
 def _unexplained(fit: FitResult, legs: Sequence[LidarLeg]) -> float:
-    sigmas = np.array([math.hypot(leg.sigma, LEG_DRIFT * leg.distance, CRAB * leg.distance) for leg in legs])
+    sigmas = np.array(
+        [
+            math.hypot(leg.sigma, ASSUMED.leg_distance * leg.distance, ASSUMED.leg_direction * leg.distance)
+            for leg in legs
+        ]
+    )
     off = fit.residuals[: 2 * len(legs)].reshape(-1, 2) * sigmas[:, None]
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 

@@ -21,8 +21,9 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import Estimate, Result, WizardName
 from monstertruckd.config.wizards import STEERING
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.statistics import Interval, estimated, known_errors
-from monstertruckd.tools.calibrate.steering_model import AXLES, EYE, SLIP, Maps, SteeringModel, SteeringRun
+from monstertruckd.tools.calibrate.steering_model import AXLES, EYE, Maps, SteeringModel, SteeringRun
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
@@ -31,15 +32,6 @@ CORNER: Final = 0.08
 """Speed in the corners, m/s: fast ones are wider, as tyres slip outward."""
 ANGLE: Final = 0.35
 """Angle of both axles in the corners, in opposite directions, rad."""
-PLACE: Final = 0.03
-"""Standard deviation of the final position by slip over 10 m, m."""
-FLOOR_DIFFERENCE: Final = 0.003
-"""Relative change of the distance on another floor, half a 95 % interval."""
-LINKAGE: Final = 0.004
-"""Relative error of a linkage's polynomials in a turn, half a 95 % interval."""
-ON_THE_SPOT: Final = 0.004
-"""Relative turn of the body by steering at standstill at the ends of a corner, half a 95 % interval: 0.005 rad among
-rigid bodies."""
 BELIEVED: Final = (0.05, 0.05, math.radians(6.0))
 """Standard deviations before anything is measured: share of distance and of wheelbase, servo angle, rad."""
 
@@ -126,8 +118,8 @@ class OdometryWizard:
         fit = model.fit(squares, self.tape_error, self.string_error)
         legs = sum(len(square.legs) for square in squares)
         distance, base, offset = intervals(fit, legs + 3 * len(squares))
-        distance = distance.joined(FLOOR_DIFFERENCE)
-        base = base.joined(LINKAGE).joined(ON_THE_SPOT)
+        distance = distance.joined(ASSUMED.floor_slip)
+        base = base.joined(ASSUMED.square_linkage).joined(ASSUMED.square_on_the_spot)
         ratio = geometry.drive_ratio / distance.value
         steering = context.known.get("steering")
         estimates = [
@@ -138,7 +130,7 @@ class OdometryWizard:
                 high=geometry.drive_ratio / distance.low,
                 samples=len(squares),
                 meaning=f"motor turns per turn of wheels of {geometry.wheel_radius:g} m; 95 % of tape and slip, and "
-                f"{FLOOR_DIFFERENCE:.1%} of other floors",
+                f"{ASSUMED.floor_slip:.1%} of other floors",
                 key="geometry.drive_ratio",
             ),
             estimated(
@@ -150,8 +142,8 @@ class OdometryWizard:
                 base.times(geometry.wheelbase),
                 "m",
                 legs,
-                f"that the turns show; 95 % of the legs' noise, {LINKAGE:.1%} of the linkage, and {ON_THE_SPOT:.1%} of "
-                "wheels that are steered while it stands",
+                f"that the turns show; 95 % of the legs' noise, {ASSUMED.square_linkage:.1%} of the linkage, "
+                f"and {ASSUMED.square_on_the_spot:.1%} of wheels that are steered while it stands",
                 "geometry.wheelbase",
             ),
             estimated(
@@ -252,13 +244,15 @@ class SquareModel:
         """Solve by least squares; residuals in standard deviations, the priors last."""
         legs = [leg for square in squares for leg in square.legs]
         turned = np.array([leg.turn for leg in legs])
-        sigmas = np.array([math.hypot(leg.sigma, SLIP * math.sqrt(self._model.distance(leg))) for leg in legs])
+        sigmas = np.array(
+            [math.hypot(leg.sigma, ASSUMED.turn_slip * math.sqrt(self._model.distance(leg))) for leg in legs]
+        )
         sides = np.array([square.side for square in squares])
         rolled = np.array([self._model.distance(square.legs[0]) for square in squares])
         chords = np.array([sinc(square.legs[0].turn / 2) for square in squares])
         tapes = np.hypot(tape * math.sqrt(2), 0.002 * sides)
         ends = np.array([square.off for square in squares])
-        place = np.hypot(PLACE, string * 2.0)
+        place = np.hypot(ASSUMED.square_place, string * 2.0)
         believed = np.array(BELIEVED)
         start = np.array((1.0, 1.0, 0.0))
 

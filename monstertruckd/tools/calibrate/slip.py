@@ -23,6 +23,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.topics import Topic
 from monstertruckd.config.calibration import Estimate, Result, WizardName
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.statistics import known_errors
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
@@ -32,12 +33,6 @@ OBSERVERS: Final[dict[Observer, Topic[Any]]] = {"stand": topics.STAND_POSE, "pos
 ROOM: Final = "ten lengths of the robot around it"
 RADII: Final = (4.0, 2.0, 0.0)
 """Radii of the arcs, in tracks; 0 = straight."""
-SLIDING: Final = 0.004
-"""Relative error of a skidding body's model: of the distance, along and across, and of the turn."""
-POSITION_FLOOR: Final = 0.0005
-"""Minimum standard deviation of a position at rest (m)."""
-AIM: Final = 0.001
-"""Minimum standard deviation of a heading at rest (rad)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,8 +129,8 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
     model = skid_model("icr and slip", radius, half_track, bounded=False, with_icr_x=True)
     seen = np.array([arc.motion for arc in arcs]).T
     distances = np.array([radius * max(abs(arc.left), abs(arc.right)) for arc in arcs])
-    place = np.hypot([max(arc.sigma[0], POSITION_FLOOR) for arc in arcs], SLIDING * distances)
-    heading = np.hypot([max(arc.sigma[1], AIM) for arc in arcs], SLIDING * np.abs(turns))
+    place = np.hypot([max(arc.sigma[0], ASSUMED.rest_position) for arc in arcs], ASSUMED.sliding * distances)
+    heading = np.hypot([max(arc.sigma[1], ASSUMED.rest_heading) for arc in arcs], ASSUMED.sliding * np.abs(turns))
     left, right = np.array([(arc.left, arc.right) for arc in arcs]).T
     _check_sides(left, right, seen)
 

@@ -25,6 +25,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import Result, WizardName
 from monstertruckd.config.wizards import SONAR, TURN_IN_A_METRE
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.statistics import Interval, estimated, known_errors, mean_angle
 from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
@@ -33,14 +34,6 @@ ROOM: Final = (
     "a flat wall 5 m long and as high as the sonars see, 1.7 m to the robot's left; nothing else within 2 m before, "
     "behind and to the right of the robot"
 )
-NOISE: Final = (0.005, 0.01)
-"""Standard deviation of a range: m, and share of it, added in quadrature."""
-ARC_DRIFT: Final = (0.003, 0.003, 0.01)
-"""Standard deviation of the odometry's error on an arc: distance from the wall (m) and heading (rad) since the previous
-arc, and relative excess of the turn, due to gyroscopes and slipping wheels."""
-BELIEVED: Final = 0.01, 0.003
-"""Standard deviations before anything is measured, as shares: of the speed of sound (6 degrees Celsius), and of the
-distance by odometry: on another floor or under another load the wheels roll a little further or less far."""
 FIRST_RANGE_ERROR: Final = 0.2
 """Maximum error of a range from the wall before the fit, m."""
 BEYOND: Final = 0.3
@@ -266,7 +259,7 @@ class SonarModel:
     def __init__(self, legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape_error: float) -> None:
         self.order = tuple(settings.sonars)
         legs = [leg for leg in legs if leg.poses]
-        self.first = COMMON + len(ARC_DRIFT) * len(legs) - 2
+        self.first = COMMON + len(ASSUMED.sonar_arc) * len(legs) - 2
         rows = np.concatenate(
             [
                 np.column_stack((np.full((len(at), 2), (i, k)), leg.ranges[name], at, swings(at)))
@@ -330,7 +323,7 @@ class SonarModel:
 
     def _drift(self, parameters: Array) -> Array:
         """Shift (m), turn (rad) and relative excess of the turn of every arc, (n, 3)."""
-        return np.concatenate((np.zeros(2), parameters[COMMON : self.first])).reshape(-1, len(ARC_DRIFT))
+        return np.concatenate((np.zeros(2), parameters[COMMON : self.first])).reshape(-1, len(ASSUMED.sonar_arc))
 
     def _drifted(self, drift: Array) -> Array:
         """Drift as in ``ARC_DRIFT``: changes in nearer and turned since the last arc ended, and the share; (n, 3)."""
@@ -347,8 +340,11 @@ class SonarModel:
     def _residual(self, parameters: Array) -> Array:
         kept = self.kept
         off = (kept.ranges - self._predicted(parameters, kept)[0]) / _sigma(kept.ranges)
-        drift = self._drifted(self._drift(parameters)) / ARC_DRIFT
-        taped, believed = (parameters[0] - self._wall) / self._tape_error, (parameters[3:COMMON] - 1.0) / BELIEVED
+        drift = self._drifted(self._drift(parameters)) / ASSUMED.sonar_arc
+        taped, believed = (
+            (parameters[0] - self._wall) / self._tape_error,
+            (parameters[3:COMMON] - 1.0) / ASSUMED.sonar_scale,
+        )
         return np.concatenate((off, drift.ravel(), believed, [taped]))
 
     def _chosen(self, parameters: Array, bounds: Array | float, beyond: float) -> "_Echoes":
@@ -408,7 +404,7 @@ def _bearings(legs: Sequence[SonarLeg], name: str, wall: float) -> tuple[Array, 
 
 
 def _sigma(ranges: Array) -> Array:
-    return np.asarray(np.hypot(NOISE[0], NOISE[1] * ranges))
+    return np.asarray(np.hypot(ASSUMED.sonar_noise[0], ASSUMED.sonar_noise[1] * ranges))
 
 
 def _turned(record: MoveRecord) -> float:

@@ -25,8 +25,9 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import Attitude, LaserScan, StabiliserFeedback
 from monstertruckd.config.calibration import Estimate, Result, WizardName
 from monstertruckd.config.wizards import STABILISER
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.beams import bearings_of, stacked_ranges
-from monstertruckd.tools.calibrate.lidar import FLAT, HEIGHTS, beam_distance, beam_tilt
+from monstertruckd.tools.calibrate.lidar import HEIGHTS, beam_distance, beam_tilt
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
 from monstertruckd.tools.calibrate.steps import Collect, Confirm
 from monstertruckd.tools.calibrate.wizard import WizardContext
@@ -160,7 +161,7 @@ def result_of(
         InputError: heights that no lidar has; the blocks are missing, a joint does not follow, or the scans fit neither
             direction.
     """
-    error = math.hypot(tape_error * math.sqrt(2), FLAT * tape_error)
+    error = math.hypot(tape_error * math.sqrt(2), ASSUMED.tape_floor * tape_error)
     lies = RollPitch(*beam_tilt((heights.centre, heights.ahead, heights.left), walls))
     really = RollPitch(lies.pitch - flat.body.pitch, lies.roll - flat.body.roll)
     joints = (settings.pitch, settings.roll)

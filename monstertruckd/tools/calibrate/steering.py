@@ -18,8 +18,9 @@ from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import Estimate, Result, WizardName
 from monstertruckd.config.wizards import STEERING
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated
-from monstertruckd.tools.calibrate.steering_model import AXLES, SLIP, Maps, SteeringModel, SteeringRun, half_widths
+from monstertruckd.tools.calibrate.steering_model import AXLES, Maps, SteeringModel, SteeringRun, half_widths
 from monstertruckd.tools.calibrate.steps import Confirm, MoveStep, Number
 from monstertruckd.tools.calibrate.weave import estimates, response, weaves
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
@@ -285,7 +286,9 @@ class AxleTravel:
         stopped = sign * (meant - reached) > SHORT
         servo = reached if stopped else meant
         angle = model.axle_angle(axle, servo, maps)
-        noise = max(math.hypot(leg.sigma, SLIP * math.sqrt(model.distance(leg))) / abs(leg.turn) for leg in legs)
+        noise = max(
+            math.hypot(leg.sigma, ASSUMED.turn_slip * math.sqrt(model.distance(leg))) / abs(leg.turn) for leg in legs
+        )
         # 0.02: relative error of the scale from short arcs
         half = abs(angle) * (NORMAL * noise / math.sqrt(len(legs)) + 0.02)
         return cls(axle, sign, servo, angle, stopped, half, tuple(legs))

@@ -22,20 +22,13 @@ from monstertruck_kinematics.truck import LinkedAxles, TurnDeficit
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.body import TruckBody
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.statistics import NORMAL, student
 from monstertruckd.tools.calibrate.steps import MoveRecord
 
 Axle = Literal["front", "rear"]
 AXLES: Final[tuple[Axle, Axle]] = ("front", "rear")
 
-HEADING: Final = 0.002
-"""Standard deviation of a turn between two rests, rad: rounding and noise of averaged headings."""
-CURVE: Final = 0.006
-"""Standard deviation of a turn by the compass's own slow error over the heading, rad; none for a full turn."""
-SLIP: Final = 0.004
-"""Standard deviation of a turn per root metre by tyres that never roll quite along their plane, rad."""
-LINKAGE: Final = 0.005
-"""Relative error of the linkage's polynomials in a turn."""
 EYE: Final = math.radians(3.0)
 """Servo angle, rad, within which straight wheels look straight: without a string the only word on a common error."""
 
@@ -116,7 +109,9 @@ class SteeringRun:
         motor, *servos = track.steps()
         turn, noise = track.turn()
         part = abs(math.remainder(turn, 2 * math.pi))
-        sigma = math.hypot(HEADING, noise, CURVE * min(part, 1.0), LINKAGE * turn)
+        sigma = math.hypot(
+            ASSUMED.turn_heading, noise, ASSUMED.turn_compass * min(part, 1.0), ASSUMED.turn_linkage * turn
+        )
         pulses = maps.pulses(0, servos[0]), maps.pulses(1, servos[1])
         return cls(motor, pulses, turn, sigma, offset, offset_sigma)
 
@@ -174,7 +169,7 @@ class SteeringModel:
             gain: share within which the scales are known beforehand.
         """
         guess = start.parameters
-        sigmas = np.array([math.hypot(leg.sigma, SLIP * math.sqrt(self.distance(leg))) for leg in legs])
+        sigmas = np.array([math.hypot(leg.sigma, ASSUMED.turn_slip * math.sqrt(self.distance(leg))) for leg in legs])
         turns = np.array([leg.turn for leg in legs])
         strings = [(k, leg.offset, leg.offset_sigma) for k, leg in enumerate(legs) if leg.offset is not None]
 

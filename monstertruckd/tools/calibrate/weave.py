@@ -24,6 +24,7 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.sensor import Attitude
 from monstertruckd.config.calibration import Estimate
 from monstertruckd.config.wizards import STEERING
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps, unexplained
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 
@@ -33,13 +34,8 @@ where changes follow each other evenly."""
 SPEED: Final = 0.15
 ANGLE: Final = 0.12
 """Small, so that the curvature is about linear in it."""
-ROUNDED: Final = 1.5e-4
-"""Square of the lag, s^2, that a curvature looks like which is 2 % from linear in the angles."""
 BASE: Final = 0.3
 """Seconds between two headings that are compared, about as long as the steering keeps to one side."""
-HALF_FRAME: Final = 0.010
-"""Half the period of the servo pulses, s. How long a command waits for the next pulse is constant while the daemon
-runs, and another time after each start: nothing between 0 and a period can be excluded."""
 
 
 def weaves(rounds: int) -> list[MoveStep]:
@@ -139,7 +135,7 @@ def response(records: Iterable[MoveRecord], chassis: TruckChassis, iron: IronCon
     def residuals(delay: float, squared: float) -> Array:
         return np.concatenate([weave.residuals(delay, squared) for weave in seen])
 
-    return ResponseFit.of(residuals, HALF_FRAME, ROUNDED)
+    return ResponseFit.of(residuals, ASSUMED.servo_wait, ASSUMED.weave_linearity)
 
 
 def estimates(found: ResponseFit) -> list[Estimate]:
@@ -150,6 +146,7 @@ def estimates(found: ResponseFit) -> list[Estimate]:
         "dead time and lag together",
     )
     covers = (
-        f"95 % of the compass's noise, a linkage 2 % from linear, and {2000 * HALF_FRAME:g} ms of waiting for a pulse"
+        f"95 % of the compass's noise, a linkage 2 % from linear, "
+        f"and {2000 * ASSUMED.servo_wait:g} ms of waiting for a pulse"
     )
     return found.estimates(meanings, covers, key=STEERING)

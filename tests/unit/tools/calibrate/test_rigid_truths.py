@@ -9,6 +9,7 @@ import pytest
 from monstertruckd.config.calibration import Estimate, Result
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.calibrate import odometry
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from tests.calibration_kit import curvature_errors, hidden, truths, verdicts
 from tests.calibration_rigid import HandDriven, rigid_truths
@@ -73,4 +74,4 @@ def test_wheels_that_are_steered_while_the_truck_stands_turn_it(tmp_path, side):
     before = hands.wait(1.5)[-1].yaw
     hands.steer((0.0, 0.0))
     turned = side * (hands.wait(1.0)[-1].yaw - before)
-    assert 0.002 < turned < odometry.ON_THE_SPOT * pi / 2
+    assert 0.002 < turned < ASSUMED.square_on_the_spot * pi / 2

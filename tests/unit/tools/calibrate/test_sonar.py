@@ -14,7 +14,7 @@ from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.sensor import SonarEcho, SonarRanges
 from monstertruck_schemas.state import Odometry
 from monstertruckd.config.calibration import may_set
-from monstertruckd.tools.calibrate import sonar
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.sonar import SonarLeg, SonarPose, result_of
 from monstertruckd.tools.calibrate.steps import MoveRecord
 from tests.calibration_light import sonar_legs
@@ -113,7 +113,8 @@ def test_ranges_that_come_out_short_mean_a_faster_sound():
 
 
 def test_a_heading_that_drifts_on_its_arcs_moves_no_sonar(monkeypatch):
-    monkeypatch.setattr(sonar, "ARC_DRIFT", (0.0, 0.0, 0.03))
+    drifting_heading = ASSUMED.model_copy(update={"sonar_arc": (0.0, 0.0, 0.03)})
+    monkeypatch.setattr("tests.calibration_light.ASSUMED", drifting_heading)
     drifting = sonar_legs(PLACES, (WALL, 0.02), 0.43, 1.0, np.random.default_rng(3))
     monkeypatch.undo()
     result = result_of(drifting, SETTINGS, WALL, 0.002)
@@ -126,7 +127,8 @@ def test_a_heading_that_drifts_on_its_arcs_moves_no_sonar(monkeypatch):
 
 def test_the_interval_of_the_sound_holds_wheels_that_roll_less_far_than_odometry_says(monkeypatch):
     """Loaded tyres: on circles of 0.8 m 0.5 % less look like ranges that come out too short."""
-    monkeypatch.setattr(sonar, "BELIEVED", (0.01, 0.0))
+    certain_wheels = ASSUMED.model_copy(update={"sonar_scale": (0.01, 0.0)})
+    monkeypatch.setattr("tests.calibration_light.ASSUMED", certain_wheels)
     circles = sonar_legs(PLACES, (WALL, 0.02), 0.43, 1.0, np.random.default_rng(3))
     monkeypatch.undo()
     longer = [replace(leg, poses={n: p * (1.005, 1.005, 1.0) for n, p in leg.poses.items()}) for leg in circles]

@@ -17,8 +17,9 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.body import TruckBody
 from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.sensor import STANDARD_GRAVITY, Attitude, DriveFeedback, DriveMode, Vector3
+from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
-from monstertruckd.tools.calibrate.weave import ANGLE, HALF_FRAME, SPEED, WEAVE, estimates, response, weaves
+from monstertruckd.tools.calibrate.weave import ANGLE, SPEED, WEAVE, estimates, response, weaves
 
 CHASSIS = build_chassis(TruckBody(), Dimensions(DriveTrain(644.0, 0.075), 0.32, 0.26))
 STEP = 0.001
@@ -77,7 +78,7 @@ def test_dead_time_and_lag_lie_in_narrow_intervals(dead_time, lag):
     records = [record(dead_time, lag, sign, seed=k) for k in (1, 2, 3) for sign in (1, -1)]
     found = response(records, CHASSIS, IRON)
     assert found.delay.value == pytest.approx(dead_time + lag, abs=0.002)
-    assert found.delay.half < HALF_FRAME + 0.002
+    assert found.delay.half < ASSUMED.servo_wait + 0.002
     by_name = {estimate.name: estimate for estimate in estimates(found)}
     assert by_name["dead_time"].low <= dead_time <= by_name["dead_time"].high
     assert by_name["lag"].low <= lag <= by_name["lag"].high
