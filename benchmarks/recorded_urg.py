@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from monstertruck_drivers.hokuyo_urg.recording import FIRST_STEP, RecordedRanges
+from monstertruck_drivers.hokuyo_urg.recording import STEPS, RecordedRanges
 from monstertruck_runtime.clock import WallClock, run_wall
 from monstertruck_schemas.sensor import VALID_BEAM
 from monstertruckd.tools.demo.runs import connect, free_endpoint, write_overlay
@@ -104,7 +104,7 @@ def compare(
     raw = recording.ranges[: len(ranges)]
     valid = raw >= 20
     good = np.where(valid, ranges == raw / 1000.0, np.isinf(ranges)) & (codes == np.where(valid, VALID_BEAM, raw))
-    true = began + recording.times[: len(stamps)] + FIRST_STEP * STEP_NS
+    true = began + recording.times[: len(stamps)] + STEPS.start * STEP_NS
     error = np.abs(stamps - true) / 1e6
     return Result(
         sent=len(recording),

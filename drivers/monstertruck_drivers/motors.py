@@ -10,7 +10,7 @@ from typing import Generic, Protocol, TypedDict, TypeVar
 
 from monstertruck_drivers.link import Link, Port
 from monstertruck_drivers.transaction import Misses
-from monstertruck_runtime.clock import POLLING, SECOND, Clock, Schedule
+from monstertruck_runtime.clock import SECOND, Clock, Lead, Schedule
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas.cmd import DriveAction, DriveCommand
 from monstertruck_schemas.sensor import DriveFeedback, DriveMode
@@ -117,7 +117,7 @@ class MotorBoard(ABC, Generic[Settings, Session]):
                     await self._make_safe(session)
 
     async def _serve(self, session: Session, ready: Ready) -> None:
-        schedule = Schedule(self._clock, self._config.rate, POLLING)
+        schedule = Schedule(self._clock, self._config.rate, Lead.POLLING)
         misses, reported = Misses(), False
         due = 0
         while True:

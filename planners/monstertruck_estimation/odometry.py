@@ -21,7 +21,7 @@ from monstertruck_estimation.wheel_motion import WheelIncrement, WheelMotion
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, Twist2, integrate, integration_jacobians
-from monstertruck_runtime.clock import ESTIMATES, SECOND, Clock, Schedule
+from monstertruck_runtime.clock import SECOND, Clock, Lead, Schedule
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.ports import BusPort, EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas import topics
@@ -409,7 +409,7 @@ class OdometryService:
     async def run(self, ready: Ready) -> None:
         """Publish until cancelled; the first pose follows the first drive reading."""
         ready()
-        schedule = Schedule(self._clock, self._rate, ESTIMATES)
+        schedule = Schedule(self._clock, self._rate, Lead.ESTIMATES)
         while True:
             await schedule.next()
             self.take()

@@ -19,6 +19,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine
+from enum import IntEnum
 from types import FrameType
 from typing import Any, Final, NamedTuple, TypeVar, TypeVarTuple
 
@@ -462,18 +463,17 @@ def _ignore_second_interrupt() -> None:
     signal.signal(signal.SIGINT, interrupt)
 
 
-BEFORE_GATE: Final = 4 * MILLISECOND
-"""Lead of other schedules over the gate's ticks: the gate's input is fresh then, and the loop free."""
+class Lead(IntEnum):
+    """Times by which schedules are ahead of the gate's ticks (ns); negative: behind."""
 
-ESTIMATES: Final = BEFORE_GATE + MILLISECOND
-"""Lead of services whose estimates the others use, ns."""
-
-POLLING: Final = ESTIMATES + 3 * MILLISECOND
-"""Lead of services that query a device, ns: unless its line is slow, the answer is there when the estimates are
-made."""
-
-IN_THREADS: Final = -2 * MILLISECOND
-"""Lead of services that work in threads, ns: behind the tick, which a thread that holds the interpreter would delay."""
+    BEFORE_GATE = 4 * MILLISECOND
+    """Most schedules: the gate's input is fresh then, and the loop free."""
+    ESTIMATES = 5 * MILLISECOND
+    """Services whose estimates the others use."""
+    POLLING = 8 * MILLISECOND
+    """Services that query a device: unless its line is slow, the answer is there when the estimates are made."""
+    IN_THREADS = -2 * MILLISECOND
+    """Services that work in threads: behind the tick, which a thread that holds the interpreter would delay."""
 
 
 class Schedule:
@@ -488,7 +488,7 @@ class Schedule:
         ahead: of the multiples of the period, ns; negative: behind them.
     """
 
-    def __init__(self, clock: Clock, rate: float, ahead: int = BEFORE_GATE) -> None:
+    def __init__(self, clock: Clock, rate: float, ahead: int = Lead.BEFORE_GATE) -> None:
         self._clock = clock
         self._period = round(SECOND / rate)
         self._ahead = ahead

@@ -4,15 +4,7 @@ from collections import defaultdict
 
 import pytest
 
-from monstertruck_runtime.clock import (
-    BEFORE_GATE,
-    ESTIMATES,
-    IN_THREADS,
-    MILLISECOND,
-    POLLING,
-    VirtualClock,
-    run_virtual,
-)
+from monstertruck_runtime.clock import MILLISECOND, Lead, VirtualClock, run_virtual
 from monstertruck_schemas import topics
 from monstertruckd.bus.outgoing import BEHIND
 from monstertruckd.config.load import load_config
@@ -23,12 +15,12 @@ from tests.daemon.goal_kit import CONFIGS
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(60)]
 
 PLACES = {
-    topics.ODOMETRY: (50, ESTIMATES),
-    topics.TRACKER: (20, BEFORE_GATE),
-    topics.TRANSFORMS: (10, BEFORE_GATE),
+    topics.ODOMETRY: (50, Lead.ESTIMATES),
+    topics.TRACKER: (20, Lead.BEFORE_GATE),
+    topics.TRANSFORMS: (10, Lead.BEFORE_GATE),
     topics.CMD_STEERING: (50, 0),
-    topics.LINK: (2, IN_THREADS),
-    topics.HOST: (1, IN_THREADS),
+    topics.LINK: (2, Lead.IN_THREADS),
+    topics.HOST: (1, Lead.IN_THREADS),
 }
 """Rate, and ns before the multiples of its period."""
 
@@ -58,7 +50,7 @@ def test_devices_are_asked_before_the_estimates_are_made():
     found = seen(ASKED, lambda message, _: message.received)
     for topic, (rate, takes) in ASKED.items():
         period = 1000 * MILLISECOND // rate
-        took = sorted((instant + POLLING) % period for instant in found[topic])
+        took = sorted((instant + Lead.POLLING) % period for instant in found[topic])
         assert len(took) == pytest.approx(2 * rate, abs=1), topic.name
         assert (takes - 1) * MILLISECOND <= took[len(took) // 2] <= takes * MILLISECOND, topic.name
         assert took[0] >= took[len(took) // 2] - MILLISECOND // 10, topic.name

@@ -8,7 +8,7 @@ from monstertruck_drivers.ax12.config import Ax12Config, JointConfig
 from monstertruck_drivers.ax12.protocol import Alarm, Present, alarm_names, word
 from monstertruck_drivers.ax12.session import RETRIES, Ax12Session
 from monstertruck_drivers.link import Port
-from monstertruck_runtime.clock import POLLING, SECOND, Clock, Schedule
+from monstertruck_runtime.clock import SECOND, Clock, Lead, Schedule
 from monstertruck_runtime.errors import DeviceMismatchError, DeviceTimeoutError, ProtocolError, WrongDeviceError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription, Value
 from monstertruck_schemas.event import Severity
@@ -369,7 +369,7 @@ class Ax12Driver:
             joint.report_absent(why)
 
     async def _serve(self, session: Ax12Session) -> None:
-        schedule = Schedule(self._clock, self._config.rate, POLLING)
+        schedule = Schedule(self._clock, self._config.rate, Lead.POLLING)
         while True:
             await self._follow(session, schedule.step())
             asked = self._clock.now()

@@ -7,7 +7,7 @@ from monstertruck_drivers.battery.config import IioConfig
 from monstertruck_drivers.battery.monitor import BatteryMonitor
 from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.transaction import Misses
-from monstertruck_runtime.clock import IN_THREADS, Clock, Schedule
+from monstertruck_runtime.clock import Clock, Lead, Schedule
 from monstertruck_runtime.errors import DeviceError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas.sensor import Battery, DriveFeedback
@@ -56,7 +56,7 @@ class IioBatteryDriver:
         channel = await self._offload(self._find)
         await self._offload(channel.read)
         ready()
-        schedule = Schedule(self._clock, self._config.rate, IN_THREADS)
+        schedule = Schedule(self._clock, self._config.rate, Lead.IN_THREADS)
         misses = Misses()
         while True:
             await schedule.next()

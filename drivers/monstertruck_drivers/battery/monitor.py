@@ -20,13 +20,12 @@ MEDIAN_WINDOW: Final = 5
 GAP: Final = SECOND
 """Maximum time without a sample (ns); then all durations restart."""
 
-CELL_VOLTS: Final = (
+CELL_VOLTS: Final = np.array((
     3.27, 3.61, 3.69, 3.71, 3.73, 3.75, 3.77, 3.79, 3.80, 3.82, 3.84,
     3.85, 3.87, 3.91, 3.95, 3.98, 4.02, 4.08, 4.11, 4.15, 4.20,
-)  # fmt: skip
+))  # fmt: skip
 """Resting voltage of a lithium-polymer cell at 0, 5 .. 100 % (table in common circulation, of no one maker)."""
 
-_CELL_VOLTS: Final = np.array(CELL_VOLTS)
 _CHARGES: Final = np.linspace(0.0, 1.0, len(CELL_VOLTS))
 
 
@@ -36,7 +35,7 @@ def charge_of(cell_volts: float) -> float:
     Between 20 and 60 % a cell changes by 8 to 35 mV per 5 %, less than a 10-bit converter resolves behind a
     divider for six cells: no better than 0.1 either way.
     """
-    return float(np.interp(cell_volts, _CELL_VOLTS, _CHARGES))
+    return float(np.interp(cell_volts, CELL_VOLTS, _CHARGES))
 
 
 class BatteryVerdict(NamedTuple):

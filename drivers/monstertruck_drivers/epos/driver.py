@@ -19,7 +19,7 @@ from monstertruck_drivers.epos.objects import ObjectEntry
 from monstertruck_drivers.epos.protocol import FAULTED, OFF, POWERED, Control, State, next_control, state_of
 from monstertruck_drivers.link import Port
 from monstertruck_drivers.transaction import Misses
-from monstertruck_runtime.clock import POLLING, SECOND, Clock, Schedule
+from monstertruck_runtime.clock import SECOND, Clock, Lead, Schedule
 from monstertruck_runtime.errors import (
     DeviceError,
     DeviceFaultError,
@@ -338,7 +338,7 @@ class _DriveSession:
 
     async def serve(self, ready: Ready) -> None:
         """Cycle after cycle until cancelled; a failed exchange is followed by the most urgent one."""
-        schedule = Schedule(self._clock, self._config.rate, POLLING)
+        schedule = Schedule(self._clock, self._config.rate, Lead.POLLING)
         misses, reported_ready = Misses(BRIEF_SILENCES + 2), False  # the last one follows a long silence
         while True:
             with misses:

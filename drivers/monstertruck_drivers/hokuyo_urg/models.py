@@ -3,6 +3,7 @@
 from typing import Final, NamedTuple
 
 from monstertruck_drivers.emulation import RangeSheet
+from monstertruck_drivers.hokuyo_urg.protocol import UNRETURNED
 
 
 class ScannerModel(NamedTuple):
@@ -45,8 +46,6 @@ URG_04LX: Final = ScannerModel(
     *(1024, 44, 725, 768, 384, 20, 5600, 600, 0, 18, 6),
     RangeSheet(0.02, 4.0, 0.01, 0.01),
 )
-UNRETURNED: Final = 65533
-"""Value of a UST's beam that nothing returned."""
 
 
 def _lx(

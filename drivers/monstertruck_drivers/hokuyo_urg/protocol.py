@@ -30,6 +30,8 @@ LINE_PAYLOAD: Final = 64
 """Maximum number of payload characters in a data line."""
 TAG_LIMIT: Final = 16
 """Maximum length of the echoed string after ``;``."""
+UNRETURNED: Final = 65533
+"""Value of a UST's beam that nothing returned."""
 MAX_REPLY: Final = 8192
 """Bytes kept while waiting for the end of a reply; the longest real one (1081 ranges with intensities) has 6700."""
 

@@ -13,8 +13,8 @@ from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.outside import lines_of, reading
 
 COLUMNS: Final = 707
-FIRST_STEP: Final = 43
-LAST_STEP: Final = 725
+STEPS: Final = range(43, 726)
+"""Steps of the recorded scanner."""
 
 
 class RecordedRanges:
@@ -67,7 +67,7 @@ class RecordedRanges:
         best = min(near, key=lambda i: abs(int(self.times[i]) - (time_ns - self._begin)))
         steps = 769
         values = np.zeros(steps, np.int32)
-        values[FIRST_STEP : LAST_STEP + 1] = self.ranges[best]
+        values[STEPS.start : STEPS.stop] = self.ranges[best]
         return values
 
 
@@ -111,7 +111,7 @@ class RecordedHokuyoEmulator(HokuyoEmulator):
         self._wanted = asyncio.Event()
         self._first = 0
         self._index = -1
-        options |= {"min_step": FIRST_STEP, "max_step": LAST_STEP}
+        options |= {"min_step": STEPS[0], "max_step": STEPS[-1]}
         super().__init__(clock, recording, seed=seed, state=state, **options)
         if state == "streaming":
             self._wanted.set()

@@ -7,7 +7,7 @@ from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.host_health.config import HostHealthConfig
 from monstertruck_drivers.host_health.readings import Reading, busy_share, read_host
 from monstertruck_drivers.thresholds import Threshold, ThresholdAlarm
-from monstertruck_runtime.clock import IN_THREADS, Clock, Schedule
+from monstertruck_runtime.clock import Clock, Lead, Schedule
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import HostHealth
@@ -62,7 +62,7 @@ class HostHealthDriver:
             DeviceError: /proc cannot be read, or the disk cannot be asked.
             ProtocolError: /proc is not as documented.
         """
-        schedule = Schedule(self._clock, self._config.rate, IN_THREADS)
+        schedule = Schedule(self._clock, self._config.rate, Lead.IN_THREADS)
         while True:
             await schedule.next()
             stamp = self._clock.now()

@@ -7,7 +7,7 @@ from typing import Any, Final
 from monstertruck_drivers.computer import Computer
 from monstertruck_drivers.link_quality.config import LinkQualityConfig
 from monstertruck_drivers.link_quality.interfaces import Sample, choose, read_interfaces
-from monstertruck_runtime.clock import IN_THREADS, SECOND, Clock, Schedule
+from monstertruck_runtime.clock import SECOND, Clock, Lead, Schedule
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.health import LinkHealth, LinkLevel, LinkMedium
@@ -114,7 +114,7 @@ class LinkQualityDriver:
 
     async def run(self, ready: Ready) -> None:
         """Sample until cancelled; no kernel output, and no missing output, ends the session."""
-        schedule = Schedule(self._clock, self._config.rate, IN_THREADS)
+        schedule = Schedule(self._clock, self._config.rate, Lead.IN_THREADS)
         while True:
             await schedule.next()
             stamp = self._clock.now()

@@ -8,7 +8,7 @@ from monstertruck_drivers.maestro.config import BatteryInputConfig, MaestroConfi
 from monstertruck_drivers.maestro.protocol import ADC_MAX, Encoder, error_names
 from monstertruck_drivers.maestro.session import MaestroSession
 from monstertruck_drivers.transaction import Misses
-from monstertruck_runtime.clock import POLLING, SECOND, Clock, Schedule
+from monstertruck_runtime.clock import SECOND, Clock, Lead, Schedule
 from monstertruck_runtime.errors import DeviceLostError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas.base import servo_fields
@@ -102,7 +102,7 @@ class MaestroDriver:
                     session.send(*self._line(session, high=False), *self._more(session, rest=True))
 
     async def _serve(self, session: MaestroSession) -> None:
-        schedule = Schedule(self._clock, self._config.poll_rate, POLLING)
+        schedule = Schedule(self._clock, self._config.poll_rate, Lead.POLLING)
         every = max(1, round(self._config.poll_rate / self._config.battery_rate))
         cycle = 0
         while True:

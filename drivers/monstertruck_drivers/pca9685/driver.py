@@ -7,7 +7,7 @@ from monstertruck_drivers.pca9685.config import Pca9685Config
 from monstertruck_drivers.pca9685.protocol import pulse
 from monstertruck_drivers.pca9685.session import Pca9685Session
 from monstertruck_drivers.transaction import Misses
-from monstertruck_runtime.clock import POLLING, SECOND, Clock, Schedule
+from monstertruck_runtime.clock import SECOND, Clock, Lead, Schedule
 from monstertruck_runtime.errors import DeviceFaultError, DeviceLostError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas.base import servo_fields
@@ -89,7 +89,7 @@ class Pca9685Driver:
                         session.send(pulse(channel, counts))
 
     async def _serve(self, session: Pca9685Session) -> None:
-        schedule = Schedule(self._clock, self._config.poll_rate, POLLING)
+        schedule = Schedule(self._clock, self._config.poll_rate, Lead.POLLING)
         while True:
             until = schedule.step()
             while (command := await self._commands.next_within((until - self._clock.now()) / SECOND)) is not None:

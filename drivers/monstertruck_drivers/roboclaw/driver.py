@@ -5,7 +5,7 @@ from monstertruck_drivers.roboclaw.config import RoboclawConfig
 from monstertruck_drivers.roboclaw.protocol import step
 from monstertruck_drivers.roboclaw.session import RoboclawSession
 from monstertruck_drivers.transaction import Misses
-from monstertruck_runtime.clock import POLLING, SECOND, Clock, Schedule
+from monstertruck_runtime.clock import SECOND, Clock, Lead, Schedule
 from monstertruck_runtime.errors import DeviceRestartedError
 from monstertruck_runtime.ports import EventSink, Publisher, Ready
 from monstertruck_schemas.event import Severity
@@ -57,7 +57,7 @@ class RoboclawDriver:
         async with await self._port.open() as link:
             session = RoboclawSession(link, self._clock, config.address, config.answer_timeout)
             self._events(Reason.DEVICE_READY, Severity.INFO, self.name, await session.identify())
-            schedule = Schedule(self._clock, config.rate, POLLING)
+            schedule = Schedule(self._clock, config.rate, Lead.POLLING)
             last: tuple[tuple[int, int], int] | None = None
             misses = Misses()
             while True:

@@ -2,13 +2,10 @@
 
 from math import exp
 
+from monstertruck_drivers.battery.monitor import CELL_VOLTS
 from monstertruck_sim.world.config import BatteryModelConfig
 
-_CELL_VOLTS = (
-    3.27, 3.61, 3.69, 3.71, 3.73, 3.75, 3.77, 3.79, 3.80, 3.82, 3.84,
-    3.85, 3.87, 3.91, 3.95, 3.98, 4.02, 4.08, 4.11, 4.15, 4.20,
-)  # fmt: skip
-"""At charges in steps of 5 %."""
+_CELL_VOLTS = CELL_VOLTS.tolist()
 
 
 def rest_voltage(charge: float, cells: int) -> float:

@@ -16,7 +16,7 @@ from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_estimation.wheel_motion import WheelMotion
 from monstertruck_kinematics.chassis import Chassis, TricycleChassis
 from monstertruck_runtime.actors.actor import Actor
-from monstertruck_runtime.clock import ESTIMATES, SECOND, Clock, Schedule
+from monstertruck_runtime.clock import SECOND, Clock, Lead, Schedule
 from monstertruck_runtime.errors import WorkerError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
@@ -141,7 +141,7 @@ class ConsistencyService:
                     group.create_task(self._follow_scans(self._scans, self._inputs.scan), name="scan odometry")
                 ready()
                 rate = 25.0  # readings of the sensors per second
-                schedule = Schedule(self._clock, rate, ESTIMATES)
+                schedule = Schedule(self._clock, rate, Lead.ESTIMATES)
                 while True:
                     await schedule.next()
                     self.take()

@@ -5,34 +5,39 @@ likelihood grid, 2 to 3 ns; other work is converted to it.
 """
 
 from collections.abc import Generator
-from typing import Final, Generic, TypeVar
+from enum import Enum
+from typing import Generic, TypeVar
 
 T = TypeVar("T")
 Pieces = Generator[float, None, T]
 """Search in pieces that returns its result at the end."""
 
-BUDGET: Final = 9e6
-"""Maximum work on searches per scan, 20 to 25 ms."""
-ELEMENT: Final = 100.0
-"""Work of merging one element into a submap."""
-DRAWN: Final = 1000.0
-"""Work of drawing an element into a likelihood grid."""
-CELL: Final = 0.2
-"""Work per cell of one level of a likelihood grid."""
-EDGE: Final = 400.0
-"""Work per edge of the pose graph for bounding its drift."""
-EDGE_OPTIMISED: Final = 4000.0
-"""Work per edge for optimising the pose graph."""
-VERIFIED: Final = 3e6
-"""Work of verifying a match."""
-CROSSED: Final = 2e5
-"""Work of comparing a keyframe with those of another submap."""
+
+class Work(float, Enum):
+    """Work of one piece."""
+
+    SCAN = 9e6
+    """Maximum work on searches per scan, 20 to 25 ms."""
+    ELEMENT = 100.0
+    """Merging one element into a submap."""
+    DRAWN = 1000.0
+    """Drawing an element into a likelihood grid."""
+    CELL = 0.2
+    """One cell of one level of a likelihood grid."""
+    EDGE = 400.0
+    """One edge of the pose graph, for bounding its drift."""
+    EDGE_OPTIMISED = 4000.0
+    """One edge, for optimising the pose graph."""
+    VERIFIED = 3e6
+    """Verifying a match."""
+    CROSSED = 2e5
+    """Comparing a keyframe with those of another submap."""
 
 
 class ScanBudget:
     """Work left for one scan. The first piece is always allowed, so that every search ends."""
 
-    def __init__(self, units: float = BUDGET) -> None:
+    def __init__(self, units: float = Work.SCAN) -> None:
         self._left = units
         self._begun = False
 

@@ -19,17 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_estimation.slam.budget import (
-    CROSSED,
-    EDGE,
-    EDGE_OPTIMISED,
-    ELEMENT,
-    VERIFIED,
-    Pieces,
-    PiecewiseSearch,
-    ScanBudget,
-    finished,
-)
+from monstertruck_estimation.slam.budget import Pieces, PiecewiseSearch, ScanBudget, Work, finished
 from monstertruck_estimation.slam.correlation import Submap, correlate, look_ups, merged
 from monstertruck_estimation.slam.graph import optimise, residuals, robust_weights
 from monstertruck_estimation.slam.keyframes import KeyframeMap
@@ -116,7 +106,7 @@ class LoopCloser:
 
     def _close(self, keyframes: KeyframeMap, at: int) -> Pieces[bool]:
         """Search for loops from keyframe ``at``; True if a closure has moved the poses."""
-        yield 2 * EDGE * len(keyframes.edges)
+        yield 2 * Work.EDGE * len(keyframes.edges)
         own, query = surroundings(keyframes, at)
         self._fingerprints[at] = describe(query.points)
         covariances, far = keyframes.drift(at)
@@ -131,7 +121,7 @@ class LoopCloser:
             if hit is None:
                 continue
             sure = window[0] <= SMALL_WINDOW[0] and window[1] <= SMALL_WINDOW[1]
-            yield EDGE_OPTIMISED * len(keyframes.edges)
+            yield Work.EDGE_OPTIMISED * len(keyframes.edges)
             if self._accepted(keyframes, hit, sure=sure):
                 return True
         return False
@@ -142,7 +132,7 @@ class LoopCloser:
         Like a match of a wide search it needs the support of others, and of all keyframes of one submap that come near
         the other's. True if the submaps were joined, False if the match waits for others, None if there is none.
         """
-        yield 2 * EDGE * len(keyframes.edges)
+        yield 2 * Work.EDGE * len(keyframes.edges)
         own_part = int(keyframes.part[at])
         numbers = np.flatnonzero(keyframes.part == part)
         candidate = int(numbers[np.argmin(_distance(keyframes, at)[numbers])])
@@ -151,7 +141,7 @@ class LoopCloser:
         hit = yield from self._search(keyframes, query, own, at, candidate, MARGIN, least=join_overlap)
         if hit is None:
             return None
-        yield EDGE_OPTIMISED * len(keyframes.edges)
+        yield Work.EDGE_OPTIMISED * len(keyframes.edges)
         poses, count = keyframes.poses, len(keyframes.edges)
         join_baseline = 2.0  # least length of the trajectory between the matches that join two submaps, m
         if not self._accepted(keyframes, hit, sure=False, baseline=join_baseline):
@@ -262,7 +252,7 @@ class LoopCloser:
             return None
         place_keys = 60  # keyframes of the place that is searched, at most
         numbers = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), place_keys)).astype(np.intp)]
-        yield 2 * EDGE * len(keyframes.edges) + ELEMENT * sum(len(keyframes.frames[k].scan) for k in numbers)
+        yield 2 * Work.EDGE * len(keyframes.edges) + Work.ELEMENT * sum(len(keyframes.frames[k].scan) for k in numbers)
         submap = keyframes.submap(numbers)
         levels = 7  # levels of the correlation pyramid
         yield submap.grid_cost(levels)
@@ -279,7 +269,7 @@ class LoopCloser:
         max_rival = 0.9  # a match is ambiguous if another place scores more than this share of it
         if peak is None or peak.rival > max_rival * peak.score:
             return None
-        yield VERIFIED
+        yield Work.VERIFIED
         fit = register(query, submap.cloud, peak.pose)
         ratio, _ = degeneracy(fit.information)
         moved = between(peak.pose, fit.pose)
@@ -423,7 +413,7 @@ def crossings(keyframes: KeyframeMap, own: NDArray[np.intp], others: NDArray[np.
     met = np.flatnonzero(far.min(axis=1, initial=np.inf) < crossed_reach)[-crossed_keys:]
     counts = np.zeros((len(met), 2))
     for row, k in enumerate(met.tolist()):
-        yield CROSSED
+        yield Work.CROSSED
         near = others[far[k] < crossed_reach]
         crossed_near = 12  # keyframes of the other submap that each is compared with, evenly chosen, at most
         near = near[np.linspace(0, len(near) - 1, min(len(near), crossed_near)).astype(np.intp)]

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from monstertruck_estimation.slam.budget import CELL, DRAWN, Pieces, finished
+from monstertruck_estimation.slam.budget import Pieces, Work, finished
 from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
@@ -425,7 +425,7 @@ class Submap:
         if levels in self._grids:
             return 0.0
         edges = (self.cloud.points.max(axis=0) - self.cloud.points.min(axis=0)) / RESOLUTION + (2 << (levels - 1))
-        return DRAWN * len(self.cloud.points) + CELL * levels * float(edges.prod())
+        return Work.DRAWN * len(self.cloud.points) + Work.CELL * levels * float(edges.prod())
 
     def grid(self, levels: int) -> LikelihoodGrid:
         """Likelihood pyramid of at least this many levels."""

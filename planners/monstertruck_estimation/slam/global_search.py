@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.slam.budget import BUDGET, VERIFIED, Pieces, PiecewiseSearch, ScanBudget
+from monstertruck_estimation.slam.budget import Pieces, PiecewiseSearch, ScanBudget, Work
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import RivalSearch, Submap, correlation, merged
 from monstertruck_estimation.slam.map_evidence import Evidence, EvidenceGrid
@@ -158,7 +158,7 @@ class GlobalLocaliser:
             self._due, self._running = False, PiecewiseSearch(self._search())
         # Share of ``BUDGET`` that one scan spends on the search, 14 to 18 ms: the local map searches for loops as well.
         share = 0.7
-        if not self._running.run(ScanBudget(share * BUDGET)):
+        if not self._running.run(ScanBudget(share * Work.SCAN)):
             return None
         result, self._running = self._running.result, None
         self._fruitless = result is None
@@ -201,7 +201,7 @@ class GlobalLocaliser:
         peak = yield from correlation(grid, points, self._middle, window, anywhere, min_score, rivals, work)
         if peak is None:
             return None
-        yield VERIFIED
+        yield Work.VERIFIED
         ambiguous = peak.rival > ambiguous_ratio * peak.score
         unique = max(peak.rival, peak.unseen) < unique_ratio * peak.score
         fit = register(query, self._submap.cloud, peak.pose)

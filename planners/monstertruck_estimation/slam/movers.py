@@ -99,10 +99,9 @@ def moved(view: View, before: View, motion: Array) -> Marks:
 
     ``motion``, shape (3,), is the motion of base between both, m and rad.
     """
-    sights, sectors = _sights(before.limits, transform(motion, view.points))
-    left = _sights(view.limits, transform(inverse(motion), before.points))[0] == THROUGH
-    marks: Marks = sights == THROUGH
-    hidden = sights == HIDDEN
+    marks: Marks
+    marks, hidden, sectors = _sights(before.limits, transform(motion, view.points))
+    left = _sights(view.limits, transform(inverse(motion), before.points))[0]
     marks[hidden] = left[before.owners[sectors[hidden]]]
     return marks
 
@@ -125,12 +124,6 @@ def narrow(points: Array, marks: Marks) -> Marks:
     result = np.zeros_like(marks)
     result[numbers[(widths <= 0.8)[things]]] = True
     return result
-
-
-UNKNOWN: Final = 0
-HIDDEN: Final = 1
-SEEN: Final = 2
-THROUGH: Final = 3
 
 
 @njit(cache=True)
@@ -159,15 +152,16 @@ def _nearest(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
 
 @njit(cache=True)
 def _sights(limits, points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    """How the view of ``limits`` has each of ``points``, shape (n,), and the sector it lies in."""
+    """Whether the view of ``limits`` looks through each of ``points``, shape (n,), or hides it, and its sector."""
     # Difference of range within which two points are one, m and per metre: noise, and the error of odometry.
     margin, slack = 0.1, 0.03
-    sights, sectors = np.full(points.shape[0], UNKNOWN), np.zeros(points.shape[0], np.int64)
+    through, hidden = np.zeros(points.shape[0], np.bool_), np.zeros(points.shape[0], np.bool_)
+    sectors = np.zeros(points.shape[0], np.int64)
     for i in range(points.shape[0]):
         sectors[i] = k = _sector(points[i, 0], points[i, 1])
         if limits[k] <= 0:
             continue
         r = math.hypot(points[i, 0], points[i, 1])
         gap = margin + slack * r
-        sights[i] = HIDDEN if r >= limits[k] + gap else THROUGH if r < limits[k] - gap else SEEN
-    return sights, sectors
+        hidden[i], through[i] = r >= limits[k] + gap, r < limits[k] - gap
+    return through, hidden, sectors

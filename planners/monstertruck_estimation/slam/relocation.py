@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from monstertruck_estimation.slam.budget import ELEMENT, Pieces, PiecewiseSearch, ScanBudget, finished
+from monstertruck_estimation.slam.budget import Pieces, PiecewiseSearch, ScanBudget, Work, finished
 from monstertruck_estimation.slam.closure import CONTRADICTION, VIEW, LoopCloser, contradiction, opposed, surroundings
 from monstertruck_estimation.slam.correlation import Peak, Submap, correlate, look_ups
 from monstertruck_estimation.slam.keyframes import Join, KeyframeMap
@@ -332,7 +332,7 @@ class Relocation:
         if known is None or known[0] != len(numbers):
             part_keys = 300  # maximum number of keyframes of the map, or of a submap, in a search
             kept = numbers[np.linspace(0, len(numbers) - 1, min(len(numbers), part_keys)).astype(np.intp)]
-            yield ELEMENT * sum(len(keyframes.frames[k].scan) for k in kept)
+            yield Work.ELEMENT * sum(len(keyframes.frames[k].scan) for k in kept)
             known = self._submaps[part] = len(numbers), keyframes.poses[part], keyframes.submap(kept)
         return known[1:]
 

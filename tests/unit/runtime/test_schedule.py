@@ -3,16 +3,7 @@ from itertools import pairwise
 
 import pytest
 
-from monstertruck_runtime.clock import (
-    BEFORE_GATE,
-    ESTIMATES,
-    IN_THREADS,
-    MILLISECOND,
-    SECOND,
-    Schedule,
-    run_virtual,
-    run_wall,
-)
+from monstertruck_runtime.clock import MILLISECOND, SECOND, Lead, Schedule, run_virtual, run_wall
 
 TENTH = SECOND // 10
 
@@ -65,7 +56,7 @@ def test_services_that_began_at_different_times_wake_together_ahead_of_the_gate(
             await clock.sleep(0.0037)
         return [[due / MILLISECOND for due in await task] for task in begun]
 
-    ahead = BEFORE_GATE / MILLISECOND
+    ahead = Lead.BEFORE_GATE / MILLISECOND
     assert run_virtual(main, start=SECOND + 123_456) == [
         [20 - ahead, 40 - ahead],
         [20 - ahead, 40 - ahead],
@@ -76,7 +67,7 @@ def test_services_that_began_at_different_times_wake_together_ahead_of_the_gate(
 
 def test_estimates_come_before_who_uses_them_and_threads_behind_the_gate():
     async def main(clock):
-        schedules = [Schedule(clock, 50, ahead) for ahead in (ESTIMATES, BEFORE_GATE, 0, IN_THREADS)]
+        schedules = [Schedule(clock, 50, ahead) for ahead in (Lead.ESTIMATES, Lead.BEFORE_GATE, 0, Lead.IN_THREADS)]
         for schedule in schedules:
             await schedule.next()
         return [await schedule.next() for schedule in schedules]

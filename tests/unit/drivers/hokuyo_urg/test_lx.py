@@ -19,8 +19,8 @@ from monstertruck_drivers.hokuyo_urg.config import HokuyoConfig, HokuyoLxConfig
 from monstertruck_drivers.hokuyo_urg.driver import HokuyoDriver
 from monstertruck_drivers.hokuyo_urg.emulator import HokuyoEmulator
 from monstertruck_drivers.hokuyo_urg.lx_emulator import LxEmulator
-from monstertruck_drivers.hokuyo_urg.models import LX, UNRETURNED
-from monstertruck_drivers.hokuyo_urg.protocol import split_lx_ranges
+from monstertruck_drivers.hokuyo_urg.models import LX
+from monstertruck_drivers.hokuyo_urg.protocol import UNRETURNED, split_lx_ranges
 from monstertruck_drivers.tcp import CONNECT_TIMEOUT, TcpPort, parse_address
 from monstertruck_runtime.clock import SECOND, VirtualClock, WallClock, run_virtual
 from monstertruck_runtime.errors import BusyError, DeviceError, DeviceLostError, DeviceTimeoutError, WrongDeviceError

@@ -1,6 +1,6 @@
 """What one scan may spend on long searches."""
 
-from monstertruck_estimation.slam.budget import BUDGET, PiecewiseSearch, ScanBudget, finished
+from monstertruck_estimation.slam.budget import PiecewiseSearch, ScanBudget, Work, finished
 from monstertruck_estimation.slam.closure import MOST_WAITING, LoopCloser
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from tests.unit.estimation.slam.test_closure import far_round
@@ -52,7 +52,7 @@ def test_loops_are_searched_for_within_the_budget_of_each_scan_and_repeatably():
             closer.step(keyframes, budget)
             spent.append(budget.pieces)
         assert closer.searches
-        assert all(sum(one) <= BUDGET or sum(piece > 0 for piece in one) == 1 for one in spent)
+        assert all(sum(one) <= Work.SCAN or sum(piece > 0 for piece in one) == 1 for one in spent)
         ends.append((spent, keyframes.poses.tobytes()))
     assert ends[0] == ends[1]
 
