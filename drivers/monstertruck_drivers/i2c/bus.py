@@ -7,13 +7,6 @@ import ctypes
 import fcntl
 from typing import Final
 
-MAJOR: Final = 89
-"""Device number of the kernel's I2C buses."""
-I2C_TIMEOUT: Final = 0x0702
-I2C_RDWR: Final = 0x0707
-READ: Final = 0x0001
-ADAPTER_TIMEOUT: Final = 5
-"""Time limit of the adapter for one transfer (10 ms)."""
 
 
 class I2cMessage(ctypes.Structure):
@@ -39,7 +32,7 @@ def limit_waits(bus: int) -> None:
     Raises:
         OSError: not an I2C bus.
     """
-    fcntl.ioctl(bus, I2C_TIMEOUT, ADAPTER_TIMEOUT)
+    fcntl.ioctl(bus, 0x0702, 5)  # I2C_TIMEOUT of one transfer, in 10 ms
 
 
 def transfer(bus: int, address: int, data: bytes, count: int = 0) -> bytes:
@@ -55,10 +48,10 @@ def transfer(bus: int, address: int, data: bytes, count: int = 0) -> bytes:
         OSError: ENXIO or EREMOTEIO if the device does not acknowledge, ETIMEDOUT if the bus is held.
     """
     written, read = ctypes.create_string_buffer(data, len(data)), ctypes.create_string_buffer(count)
-    parts = [(0, written)] * bool(data) + [(READ, read)] * bool(count)
+    parts = [(0, written)] * bool(data) + [(0x0001, read)] * bool(count)  # I2C_M_RD
     pointer = ctypes.POINTER(ctypes.c_char)
     messages = (I2cMessage * len(parts))(
         *(I2cMessage(address, flags, len(buffer), ctypes.cast(buffer, pointer)) for flags, buffer in parts)
     )
-    fcntl.ioctl(bus, I2C_RDWR, I2cMessages(messages, len(parts)))
+    fcntl.ioctl(bus, 0x0707, I2cMessages(messages, len(parts)))  # I2C_RDWR
     return read.raw

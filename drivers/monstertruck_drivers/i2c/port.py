@@ -37,7 +37,7 @@ class I2cPort:
         """
         try:
             node = self._path.stat()
-            if os.major(node.st_rdev) != bus.MAJOR or not stat.S_ISCHR(node.st_mode):
+            if os.major(node.st_rdev) != 89 or not stat.S_ISCHR(node.st_mode):  # I2C_MAJOR of the kernel
                 return await SerialPort(self._path).open()
             return serve(self.name, os.open(self._path, os.O_RDWR | os.O_CLOEXEC))
         except OSError as error:

@@ -47,15 +47,6 @@ _ROWS: Final = (
 
 CIRCLES: Final = tuple(PublishedCircle(circle, *row) for circle, row in zip(PUBLISHED_CIRCLES, _ROWS, strict=True))
 
-SPREAD: Final = 0.1569
-"""Spread of the tracks of 12 passes, as a share of the segment."""
-BEND: Final = 0.0002
-"""Within one pass, share of the segment."""
-LINE_DEVIATION: Final = 0.06
-"""Relative deviation of the line's speed from 3.24 cm/s."""
-SEGMENT: Final = 0.682
-"""m."""
-PASSES: Final = 12
 SLIPS: Final = (
     "The conclusion prints the drifts of the centres ten times larger (0.91 cm/s for 0.091).",
     "Figure 7 is captioned 2:1 and shows 3:1.",

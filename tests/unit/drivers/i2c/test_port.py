@@ -18,6 +18,8 @@ from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import DeviceLostError, DeviceTimeoutError
 from tests.unit.drivers.kit import background
 
+ADAPTER_TIMEOUT, READ, I2C_TIMEOUT, MAJOR = 5, 0x0001, 0x0702, 89
+
 
 class Kernel:
     """Stands in for ``fcntl.ioctl``: a device at 0x40 that answers 1, 2, 3 ..."""
@@ -27,13 +29,13 @@ class Kernel:
         self.error = 0
 
     def ioctl(self, file, request, argument):
-        if request == bus.I2C_TIMEOUT:
+        if request == I2C_TIMEOUT:
             self.calls.append(("timeout", argument))
             return
         if self.error:
             raise OSError(self.error, os.strerror(self.error))
         for message in argument.messages[: argument.count]:
-            if message.flags & bus.READ:
+            if message.flags & READ:
                 ctypes.memmove(message.buffer, bytes(range(1, message.length + 1)), message.length)
                 self.calls.append(("read", message.address, message.length))
             else:
@@ -63,7 +65,7 @@ def on_node(monkeypatch, test):
     """Run ``test`` with a link to the kernel's bus, whose node is a pipe."""
 
     async def main():
-        node = SimpleNamespace(st_rdev=os.makedev(bus.MAJOR, 1), st_mode=0o020660)
+        node = SimpleNamespace(st_rdev=os.makedev(MAJOR, 1), st_mode=0o020660)
         monkeypatch.setattr(Path, "stat", lambda _: node)
         there, here = os.pipe()
         monkeypatch.setattr(port.os, "open", lambda *_: there)
@@ -99,7 +101,7 @@ def test_transfers_run_in_a_thread_and_the_node_is_closed_after_the_link(kernel,
         host.send(0x40, b"\x06\x01")
         assert await host.transfer(0x40, b"\x00", 1) == b"\x01"
         assert ("write", 0x40, b"\x06\x01") in kernel.calls
-        assert kernel.calls[0] == ("timeout", bus.ADAPTER_TIMEOUT)
+        assert kernel.calls[0] == ("timeout", ADAPTER_TIMEOUT)
 
     on_node(patched, test)
 
