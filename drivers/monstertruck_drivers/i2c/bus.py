@@ -5,8 +5,6 @@ Source: kernel documentation, i2c/dev-interface: ``I2C_RDWR`` joins messages by 
 
 import ctypes
 import fcntl
-from typing import Final
-
 
 
 class I2cMessage(ctypes.Structure):

@@ -7,12 +7,12 @@ import numpy as np
 
 from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import EmulatorSetup, ViewSource
+from monstertruck_drivers.fault_table import FaultTable, FaultyDevice
 from monstertruck_drivers.mjpeg.config import MjpegConfig
 from monstertruck_drivers.mjpeg.protocol import HEAD_END
 from monstertruck_drivers.signals import SignalKind, Signals
 from monstertruck_drivers.webcam.emulator import jpeg
 from monstertruck_runtime.clock import Clock, Schedule
-from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.threads import Offload, in_thread
 
 BOUNDARY: Final = b"picture"
@@ -20,7 +20,7 @@ CHUNK: Final = 4095
 """Bytes written at a time: as many as the reader of a pty gets in one go."""
 
 
-class MjpegEmulator:
+class MjpegEmulator(FaultyDevice):
     """Camera of a program or of a server; a server serves its latest client.
 
     Faults (``inject``): ``corrupt N`` (a header is overwritten), ``truncate N`` (the second half is missing),
@@ -43,8 +43,14 @@ class MjpegEmulator:
         self._view = view
         self._config = settings or MjpegConfig()
         self._offload = offload
-        self._to_damage = {"corrupt": 0, "truncate": 0, "oversize": 0}
-        self._switches = {"stuck": False, "text": False, "chunked": False}
+        self.faults = FaultTable(
+            self.name,
+            {
+                "corrupt|truncate|oversize N": 0,
+                "stuck|text|chunked on|off": False,
+                "status CODE|off": self._answer_status,
+            },
+        )
         self._status = 200
         self._number = 0
 
@@ -67,48 +73,29 @@ class MjpegEmulator:
                         serving.cancel()
                     serving = group.create_task(self._answer(end, first))
 
-    def inject(self, fault: str, *values: str) -> None:
-        """Start or end a fault, see the class.
-
-        Raises:
-            InputError: unknown fault or bad value.
-        """
-        try:
-            match fault, values:
-                case (("corrupt" | "truncate" | "oversize"), (count,)):
-                    self._to_damage[fault] = int(count)
-                case (("stuck" | "text" | "chunked"), (("on" | "off") as state,)):
-                    self._switches[fault] = state == "on"
-                case "status", (code,):
-                    self._status = 200 if code == "off" else int(code)
-                case _:
-                    raise ValueError("unknown")
-        except ValueError as error:
-            raise InputError(
-                f"{self.name}: fault {' '.join((fault, *values))!r} not understood; known: corrupt|truncate|oversize "
-                "N, stuck|text|chunked on|off, status CODE|off"
-            ) from error
+    def _answer_status(self, code: str) -> None:
+        self._status = 200 if code == "off" else int(code)
 
     async def _answer(self, end: DeviceEnd, first: bytes) -> None:
-        if self._switches["stuck"]:
+        if self.faults["stuck"]:
             return
         path = str(self._config.http).encode()
         status = self._status if first.split(b" ")[1:2] == [path] else 404
         single = self._config.poll is not None
         kind = b"image/jpeg" if single else b"multipart/x-mixed-replace; boundary=" + BOUNDARY
-        if self._switches["text"]:
+        if self.faults["text"]:
             kind = b"text/html"
-        coding = b"Transfer-Encoding: chunked\r\n" if self._switches["chunked"] else b""
+        coding = b"Transfer-Encoding: chunked\r\n" if self.faults["chunked"] else b""
         picture = await self._picture(self._clock.now()) if single else b""
         if single and not coding:
             coding = b"Content-Length: %d\r\n" % len(picture)
         reason = b"OK" if status == 200 else b"Refused"
         end.write(b"HTTP/1.1 %d %s\r\n%sContent-Type: %s\r\n\r\n" % (status, reason, coding, kind))
-        if status != 200 or self._switches["text"]:
+        if status != 200 or self.faults["text"]:
             return
         if single:
             await self._send(end, picture)
-            if self._switches["chunked"]:
+            if self.faults["chunked"]:
                 end.write(b"0\r\n\r\n")
         else:
             await self._stream(end)
@@ -117,7 +104,7 @@ class MjpegEmulator:
         schedule = Schedule(self._clock, self._config.rate)
         while True:
             stamp = await schedule.next()
-            if not self._switches["stuck"]:
+            if not self.faults["stuck"]:
                 await self._send(end, await self._picture(stamp))
 
     async def _picture(self, stamp: int) -> bytes:
@@ -125,11 +112,11 @@ class MjpegEmulator:
         self._number += 1
         draw = self.signals.report("image", self._view.exposure(stamp, size))
         data = await self._offload(lambda: jpeg(draw(), number))
-        if self._uses_up("corrupt"):
+        if self.faults.strikes("corrupt"):
             data = data[:2] + bytes(4) + data[6:]
-        if self._uses_up("truncate"):
+        if self.faults.strikes("truncate"):
             data = data[: len(data) // 2]
-        if self._uses_up("oversize"):
+        if self.faults.strikes("oversize"):
             data = data[:-2] + bytes(self._config.most)
         return data
 
@@ -139,15 +126,10 @@ class MjpegEmulator:
             data = head + data + b"\r\n"
         for at in range(0, len(data), CHUNK):
             part = data[at : at + CHUNK]
-            if self._switches["chunked"]:
+            if self.faults["chunked"]:
                 part = b"%x\r\n%s\r\n" % (len(part), part)
             await self._clock.sleep(0.0002)  # s
             end.write(part)
-
-    def _uses_up(self, fault: str) -> bool:
-        left = self._to_damage[fault]
-        self._to_damage[fault] = max(0, left - 1)
-        return left > 0
 
 
 def emulated(setup: EmulatorSetup) -> MjpegEmulator:

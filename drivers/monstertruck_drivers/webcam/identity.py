@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from monstertruck_drivers.webcam import v4l2
+from monstertruck_drivers.webcam import protocol as v4l2
 from monstertruck_drivers.webcam.config import WebcamConfig
-from monstertruck_drivers.webcam.v4l2_source import asked, enumerate_formats, enumerate_modes
+from monstertruck_drivers.webcam.v4l2_source import Kernel, asked, enumerate_formats, enumerate_modes
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.errors import DeviceError
 from monstertruck_runtime.threads import Offload, in_thread
@@ -14,7 +14,7 @@ async def identify(
     pattern: str,
     clock: Clock,
     settings: WebcamConfig,
-    kernel: v4l2.Kernel | None = None,
+    kernel: Kernel | None = None,
     offload: Offload = in_thread,
 ) -> dict[str, Any]:
     """Ask every node that fits ``pattern``; nothing is streamed.
@@ -23,11 +23,11 @@ async def identify(
         JSON-able: ``nodes``: path, driver, card, bus, whether it captures, pixel formats, and the sizes and rates of
         motion JPEG; or why it cannot be asked.
     """
-    system = kernel or v4l2.Kernel()
+    system = kernel or Kernel()
     return await offload(lambda: {"nodes": [_describe(path, system) for path in system.nodes(pattern)]})
 
 
-def _describe(path: str, kernel: v4l2.Kernel) -> dict[str, Any]:
+def _describe(path: str, kernel: Kernel) -> dict[str, Any]:
     try:
         with asked(path, kernel) as (fd, node):
             formats = enumerate_formats(fd, kernel) if node.captures else []

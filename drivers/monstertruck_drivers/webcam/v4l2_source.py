@@ -3,21 +3,48 @@
 import asyncio
 import contextlib
 import errno
+import fcntl
+import os
 import struct
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from mmap import mmap
+from mmap import MAP_SHARED, PROT_READ, mmap
+from pathlib import Path
 from typing import Any, Final, Self
 
-from monstertruck_drivers.webcam import v4l2
+from monstertruck_drivers.webcam import protocol as v4l2
 from monstertruck_drivers.webcam.source import SET_FORMAT, CameraFrame, Mode, device_error
 from monstertruck_runtime.errors import DeviceError, DeviceLostError, DeviceMismatchError
 from monstertruck_runtime.threads import Offload, in_daemon_thread
 
 CAMERA_STOP_LIMIT: Final = 2.0
 """Longest wait for the camera to stop at the end of a session (s)."""
+
+
+class Kernel:
+    """The system calls a camera is used through; every one of them may block."""
+
+    def nodes(self, pattern: str) -> list[str]:
+        """Existing device nodes that fit a glob pattern, video2 before video10."""
+        return sorted(map(str, Path("/").glob(pattern.lstrip("/"))), key=lambda path: (len(path), path))
+
+    def open(self, path: str) -> int:
+        """Open without blocking later reads; raises ``OSError``."""
+        return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+
+    def close(self, fd: int) -> None:
+        """Close."""
+        os.close(fd)
+
+    def ioctl(self, fd: int, request: int, argument: bytearray) -> None:
+        """Carry out a request; ``argument`` is changed in place. Raises ``OSError``."""
+        fcntl.ioctl(fd, request, argument, True)
+
+    def map(self, fd: int, length: int, offset: int) -> mmap:
+        """Map a buffer, to read it; raises ``OSError``."""
+        return mmap(fd, length, MAP_SHARED, PROT_READ, offset=offset)
 
 
 class V4l2Source:
@@ -32,10 +59,10 @@ class V4l2Source:
     """
 
     def __init__(
-        self, pattern: str = "/dev/video*", kernel: v4l2.Kernel | None = None, offload: Offload = in_daemon_thread
+        self, pattern: str = "/dev/video*", kernel: Kernel | None = None, offload: Offload = in_daemon_thread
     ) -> None:
         self.name = pattern
-        self._kernel = kernel or v4l2.Kernel()
+        self._kernel = kernel or Kernel()
         self._offload = offload
 
     async def open(self, mode: Mode, buffers: int) -> "V4l2Stream":
@@ -51,7 +78,7 @@ class V4l2Source:
 class Camera:
     """An open node; its methods block."""
 
-    def __init__(self, path: str, kernel: v4l2.Kernel, fd: int) -> None:
+    def __init__(self, path: str, kernel: Kernel, fd: int) -> None:
         self.path = path
         self.fd = fd
         self.mode = Mode(0, 0, 0.0)
@@ -59,7 +86,7 @@ class Camera:
         self._memory: list[mmap] = []
 
     @classmethod
-    def start(cls, pattern: str, kernel: v4l2.Kernel, mode: Mode, buffers: int) -> "Camera":
+    def start(cls, pattern: str, kernel: Kernel, mode: Mode, buffers: int) -> "Camera":
         """Open the node that captures motion JPEG and let it stream."""
         path = find_node(pattern, kernel)
         with _doing(path, "open it"):
@@ -140,7 +167,7 @@ class _Starting:
         buffers: how many.
     """
 
-    def __init__(self, pattern: str, kernel: v4l2.Kernel, mode: Mode, buffers: int) -> None:
+    def __init__(self, pattern: str, kernel: Kernel, mode: Mode, buffers: int) -> None:
         self._start = partial(Camera.start, pattern, kernel, mode, buffers)
         self._lock = threading.Lock()
         self._is_given_up = False
@@ -212,7 +239,7 @@ class V4l2Stream:
             self._news.set()
 
 
-def find_node(pattern: str, kernel: v4l2.Kernel) -> str:
+def find_node(pattern: str, kernel: Kernel) -> str:
     """The first node of ``pattern`` that captures motion JPEG.
 
     Raises:
@@ -233,7 +260,7 @@ def find_node(pattern: str, kernel: v4l2.Kernel) -> str:
     raise failed or DeviceMismatchError(f"{', '.join(paths)}: no node captures motion JPEG")
 
 
-def pixel_formats(path: str, kernel: v4l2.Kernel) -> list[int]:
+def pixel_formats(path: str, kernel: Kernel) -> list[int]:
     """Pixel formats a node can capture; none if it does not capture.
 
     Raises:
@@ -244,7 +271,7 @@ def pixel_formats(path: str, kernel: v4l2.Kernel) -> list[int]:
 
 
 @contextmanager
-def asked(path: str, kernel: v4l2.Kernel) -> Iterator[tuple[int, v4l2.Capability]]:
+def asked(path: str, kernel: Kernel) -> Iterator[tuple[int, v4l2.Capability]]:
     """Open a node and query its capabilities; close it at the end of the context."""
     with _doing(path, "ask it what it is"):
         fd = kernel.open(path)
@@ -256,13 +283,13 @@ def asked(path: str, kernel: v4l2.Kernel) -> Iterator[tuple[int, v4l2.Capability
             kernel.close(fd)
 
 
-def enumerate_formats(fd: int, kernel: v4l2.Kernel) -> list[int]:
+def enumerate_formats(fd: int, kernel: Kernel) -> list[int]:
     """Pixel formats an open node can capture."""
     rows = _enumerate(fd, kernel, v4l2.ENUM_FMT, v4l2.FORMAT_DESCRIPTION, v4l2.CAPTURE)
     return [int(row[4]) for row in rows]
 
 
-def enumerate_modes(fd: int, kernel: v4l2.Kernel) -> list[Mode]:
+def enumerate_modes(fd: int, kernel: Kernel) -> list[Mode]:
     """Discrete sizes and rates of motion JPEG; stepwise ones are left out."""
     modes = []
     for _, _, size_kind, width, height, *_ in _enumerate(fd, kernel, v4l2.ENUM_FRAMESIZES, v4l2.FRAME_SIZE, v4l2.MJPG):
@@ -277,7 +304,7 @@ def enumerate_modes(fd: int, kernel: v4l2.Kernel) -> list[Mode]:
     return modes
 
 
-def _enumerate(fd: int, kernel: v4l2.Kernel, request: int, layout: struct.Struct, *key: int) -> list[tuple[Any, ...]]:
+def _enumerate(fd: int, kernel: Kernel, request: int, layout: struct.Struct, *key: int) -> list[tuple[Any, ...]]:
     """Rows of an enumeration: index and key go in first, the whole structure comes back."""
     head = struct.Struct(f"@{1 + len(key)}I")
     rows: list[tuple[Any, ...]] = []

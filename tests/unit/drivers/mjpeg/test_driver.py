@@ -166,7 +166,7 @@ def test_a_size_that_differs_is_reported_once():
 def test_unknown_faults_and_settings_that_do_not_fit():
     async def test(rig):
         for words in (("corrupt", "many"), ("stuck", "maybe"), ("nonsense",)):
-            with pytest.raises(InputError, match=r"not understood; known: corrupt\|truncate\|oversize N"):
+            with pytest.raises(InputError, match=r"known: corrupt\|truncate\|oversize N"):
                 rig.emulator.inject(*words)
         rig.emulator.power_cycle()
 

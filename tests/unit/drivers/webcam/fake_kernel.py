@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
 
-from monstertruck_drivers.webcam import v4l2
+from monstertruck_drivers.webcam import protocol as v4l2
 from monstertruck_drivers.webcam.source import Mode
 
 YUYV = int.from_bytes(b"YUYV", "little")
@@ -73,7 +73,7 @@ class Memory:
 
 
 class FakeKernel:
-    """``v4l2.Kernel`` over scripted nodes."""
+    """``Kernel`` over scripted nodes."""
 
     def __init__(self, **nodes: Node) -> None:
         self.by_path = {f"/dev/{name}": node for name, node in nodes.items()}

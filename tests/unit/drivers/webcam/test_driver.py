@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.cable import EmulatedPort, MemoryPort, PtyPort
-from monstertruck_drivers.webcam import v4l2
+from monstertruck_drivers.webcam import protocol as v4l2
 from monstertruck_drivers.webcam.config import WebcamConfig
 from monstertruck_drivers.webcam.driver import WebcamDriver
 from monstertruck_drivers.webcam.emulator import WebcamEmulator

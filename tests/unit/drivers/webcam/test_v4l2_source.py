@@ -6,7 +6,8 @@ import threading
 
 import pytest
 
-from monstertruck_drivers.webcam import v4l2, v4l2_source
+from monstertruck_drivers.webcam import protocol as v4l2
+from monstertruck_drivers.webcam import v4l2_source
 from monstertruck_drivers.webcam.config import WebcamConfig
 from monstertruck_drivers.webcam.identity import identify
 from monstertruck_drivers.webcam.rendered_source import PathSource

@@ -1,15 +1,11 @@
-"""Video4Linux2 in as much as a capturing motion-JPEG camera needs: structures, requests, and the kernel behind them.
+"""Video4Linux2 in as much as a capturing motion-JPEG camera needs: structures and requests.
 
 Structures are laid out by ``struct`` in the machine's own sizes and alignment, as the kernel's header has them.
 Source: kernel documentation, userspace-api/media/v4l, and include/uapi/linux/videodev2.h.
 """
 
-import fcntl
-import mmap
-import os
 import struct
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 from monstertruck_drivers.webcam.source import Mode
@@ -61,30 +57,6 @@ STREAMOFF: Final = _request(_WRITE, 19, NUMBER.size)
 S_PARM: Final = _request(_READ | _WRITE, 22, STREAM_PARAMETERS.size)
 ENUM_FRAMESIZES: Final = _request(_READ | _WRITE, 74, FRAME_SIZE.size)
 ENUM_FRAMEINTERVALS: Final = _request(_READ | _WRITE, 75, FRAME_INTERVAL.size)
-
-
-class Kernel:
-    """The system calls a camera is used through; every one of them may block."""
-
-    def nodes(self, pattern: str) -> list[str]:
-        """Existing device nodes that fit a glob pattern, video2 before video10."""
-        return sorted(map(str, Path("/").glob(pattern.lstrip("/"))), key=lambda path: (len(path), path))
-
-    def open(self, path: str) -> int:
-        """Open without blocking later reads; raises ``OSError``."""
-        return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
-
-    def close(self, fd: int) -> None:
-        """Close."""
-        os.close(fd)
-
-    def ioctl(self, fd: int, request: int, argument: bytearray) -> None:
-        """Carry out a request; ``argument`` is changed in place. Raises ``OSError``."""
-        fcntl.ioctl(fd, request, argument, True)
-
-    def map(self, fd: int, length: int, offset: int) -> mmap.mmap:
-        """Map a buffer, to read it; raises ``OSError``."""
-        return mmap.mmap(fd, length, mmap.MAP_SHARED, mmap.PROT_READ, offset=offset)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,9 @@ import struct
 
 import pytest
 
-from monstertruck_drivers.webcam import v4l2
+from monstertruck_drivers.webcam import protocol as v4l2
 from monstertruck_drivers.webcam.source import Mode
+from monstertruck_drivers.webcam.v4l2_source import Kernel
 
 LP64 = struct.calcsize("@P") == 8
 
@@ -84,7 +85,7 @@ def test_names_of_pixel_formats():
 
 def test_the_real_kernel(tmp_path):
     """What of it can be tried without a camera: a regular file is mapped, and refuses requests."""
-    kernel = v4l2.Kernel()
+    kernel = Kernel()
     for name in ("video10", "video2"):
         (tmp_path / name).write_bytes(b"0123456789")
     nodes = kernel.nodes(str(tmp_path / "video*"))
