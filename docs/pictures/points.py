@@ -9,7 +9,7 @@ from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
 from monstertruck_sim.world.config import CameraConfig, PersonConfig, Spot, TagConfig, WorldConfig
 from monstertruck_sim.world.world import World
-from monstertruck_sim.world3d.ceiling import CeilingView
+from monstertruck_sim.world3d.onlookers import CeilingView
 from monstertruckd.tools.simulation.config import load_simulated
 
 FOLDER = Path(__file__).parent

@@ -6,14 +6,10 @@ coast without pulses, and gives no feedback of the motor.
 
 import math
 from collections.abc import Callable
-from typing import Final
 
 from monstertruck_drivers.emulation import MotorPlant
 from monstertruck_drivers.servos import EscPulses
 from monstertruck_runtime.clock import SECOND, Clock
-
-NEAR: Final = 10.0
-"""Tolerance around the neutral pulse (us)."""
 
 
 class EscEmulator:
@@ -45,13 +41,16 @@ class EscEmulator:
                 self._plant.command(now, None, 1.0)
                 continue
             self._arm(pulse, now)
-            rate = self._esc.rate(pulse) if self._armed and abs(pulse - self._esc.neutral_us) > NEAR else 0.0
+            rate = self._esc.rate(pulse) if self._armed and not self._is_neutral(pulse) else 0.0
             slowing = self._esc.deceleration if rate else self._esc.quick_deceleration
             rpm = math.tau / 60
             self._plant.command(now, rate / rpm, slowing / rpm)
 
+    def _is_neutral(self, pulse: float) -> bool:
+        return abs(pulse - self._esc.neutral_us) <= 10.0  # us
+
     def _arm(self, pulse: float, now: int) -> None:
-        if abs(pulse - self._esc.neutral_us) > NEAR:
+        if not self._is_neutral(pulse):
             self._neutral_since = None
         elif self._neutral_since is None:
             self._neutral_since = now

@@ -5,7 +5,7 @@ An emergency stop is refused only where as many of the same owner, or of all tog
 
 import threading
 from collections import Counter
-from typing import Final
+from typing import Final, NamedTuple
 
 from monstertruck_runtime.clock import Clock
 from monstertruck_schemas.req import Order
@@ -17,18 +17,31 @@ ESTOP: Final = Order.ESTOP.value
 ORDERS: Final = frozenset(order.value for order in Order)
 """Calls that must get through when others fill the places."""
 
-MAX_CALLS: Final = 16
-"""Calls served at once; twice as many with orders, emergency stops not counted."""
-MAX_WAITING: Final = 64
-"""Calls that wait to be served; twice as many with orders."""
-ROOM: Final = 4 * MAX_WAITING
-"""Calls that wait with emergency stops."""
-MAX_ESTOPS: Final = 8
-"""Emergency stops of one owner that wait or are carried out."""
-ALL_ESTOPS: Final = 64
-"""Limit of all owners together: without certificates names can be invented."""
-CALL_RATE: Final = 100.0
-"""Calls a second of one owner that are not orders."""
+
+class Allowance(NamedTuple):
+    """What calls of one kind may take."""
+
+    rate: float
+    """Calls a second of one owner."""
+    served: int
+    """Calls under way, emergency stops not counted, from which on no further one is served."""
+    waiting: int
+    """Waiting calls from which on no further one is taken."""
+
+
+CALLS: Final = Allowance(100.0, 16, 64)
+ORDER_CALLS: Final = Allowance(ORDER_RATE, 2 * CALLS.served, 2 * CALLS.waiting)
+
+
+class EstopLimit(NamedTuple):
+    """Emergency stops that wait or are carried out."""
+
+    owner: int
+    together: int
+    """Limit of all owners: without certificates names can be invented."""
+
+
+ESTOPS: Final = EstopLimit(8, 64)
 TOO_MANY: Final = "too many calls at once"
 
 
@@ -40,8 +53,8 @@ class CallLimits:
     """
 
     def __init__(self, clock: Clock) -> None:
-        self._calls = OwnerRates(CALL_RATE, clock)
-        self._orders = OwnerRates(ORDER_RATE, clock)
+        self._calls = OwnerRates(CALLS.rate, clock)
+        self._orders = OwnerRates(ORDER_CALLS.rate, clock)
         self._lock = threading.Lock()
         self._estops: Counter[str] = Counter()
 
@@ -57,17 +70,17 @@ class CallLimits:
         if name == ESTOP:
             with self._lock:
                 owner = owner_of(source)
-                if self._estops[owner] >= MAX_ESTOPS:
-                    return f"{MAX_ESTOPS} emergency stops of {owner} are being carried out"
-                if self._estops.total() >= ALL_ESTOPS:
-                    return f"{ALL_ESTOPS} emergency stops are being carried out"
+                if self._estops[owner] >= ESTOPS.owner:
+                    return f"{ESTOPS.owner} emergency stops of {owner} are being carried out"
+                if self._estops.total() >= ESTOPS.together:
+                    return f"{ESTOPS.together} emergency stops are being carried out"
                 self._estops[owner] += 1
             return ""
-        order = name in ORDERS
-        rates, rate, what = (self._orders, ORDER_RATE, "orders") if order else (self._calls, CALL_RATE, "calls")
+        rates, what = (self._orders, "orders") if name in ORDERS else (self._calls, "calls")
+        allowance = _allowance(name)
         if not rates.spend(source):
-            return f"more than {rate:g} {what} a second"
-        return TOO_MANY if waiting >= (2 * MAX_WAITING if order else MAX_WAITING) else ""
+            return f"more than {allowance.rate:g} {what} a second"
+        return TOO_MANY if waiting >= allowance.waiting else ""
 
     def ended(self, name: str, source: str | None) -> None:
         """A call that was taken has been carried out, or is discarded."""
@@ -81,4 +94,8 @@ class CallLimits:
 
 def may_be_served(name: str, under_way: int) -> bool:
     """Whether a call has a place while ``under_way`` others, emergency stops not counted, are served."""
-    return name == ESTOP or under_way < (2 * MAX_CALLS if name in ORDERS else MAX_CALLS)
+    return name == ESTOP or under_way < _allowance(name).served
+
+
+def _allowance(name: str) -> Allowance:
+    return ORDER_CALLS if name in ORDERS else CALLS

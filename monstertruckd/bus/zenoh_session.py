@@ -44,7 +44,7 @@ from monstertruck_schemas.topics import (
     sender_in,
 )
 from monstertruckd.bus.access import ANONYMOUS, OBSERVING, Sender, in_groups
-from monstertruckd.bus.call_limits import ESTOP, ORDERS, ROOM, TOO_MANY, CallLimits, may_be_served
+from monstertruckd.bus.call_limits import CALLS, ESTOP, ORDERS, TOO_MANY, CallLimits, may_be_served
 from monstertruckd.bus.intake import Intake, Refusals, StandIntake
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.port_holder import holder_of
@@ -150,7 +150,7 @@ class ZenohBridge:
                             closing(
                                 ThreadHop(
                                     lambda call: guard(partial(self._serve, *call, replies, limits, calls, active)),
-                                    ROOM,
+                                    4 * CALLS.waiting,  # emergency stops included
                                     self._bus.add_drops,
                                     discard=lambda call: self._discard(*call, replies, limits),
                                 )

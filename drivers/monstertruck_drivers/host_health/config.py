@@ -12,8 +12,6 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Seconds = Annotated[float, Field(ge=0, le=3600)]
 Bytes = Annotated[int, Field(ge=0)]
 
-GIGABYTE = 1_000_000_000
-
 
 class HostHealthConfig(Schema):
     """When the computer is in need; every ``..._clear`` is where that ends again."""
@@ -36,9 +34,9 @@ class HostHealthConfig(Schema):
     memory: Share = 0.1
     """Available share of the memory"""
     memory_clear: Share = 0.15
-    disk: Bytes = GIGABYTE
+    disk: Bytes = 1_000_000_000
     """Free bytes of the file system that holds ``disk_path``"""
-    disk_clear: Bytes = 3 * GIGABYTE // 2
+    disk_clear: Bytes = 1_500_000_000
     disk_path: Path = Path("runs")
     """Folder of the logs; it need not exist yet"""
 

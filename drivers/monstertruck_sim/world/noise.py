@@ -7,8 +7,8 @@ LIDAR, CURRENT, COMPASS, COMPASS_FIXED, SLIP, ANALOG, SONAR, IMU, IMU_FIXED, SKI
 )
 """Streams of a robot."""
 
-GROUND_STREAM = 101
-"""Stream of its ground."""
+PEOPLE, GROUND_STREAM = range(100, 102)
+"""Streams of a world."""
 
 _BLOCK = 512
 

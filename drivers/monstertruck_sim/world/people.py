@@ -8,7 +8,7 @@ import numpy as np
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_sim.world.config import PersonConfig
-from monstertruck_sim.world.noise import generator
+from monstertruck_sim.world.noise import PEOPLE, generator
 from monstertruck_sim.world.obstacles import Disc
 
 STEP_S = 0.02
@@ -53,7 +53,7 @@ class Person:
         self.speed = 0.0
         """Speed (m/s)."""
         self._config, self._free, self._bounds = config, free, bounds
-        self._rng = generator(seed, 100, index)  # the stream of people
+        self._rng = generator(seed, PEOPLE, index)
         self._given: list[Place] = [(point.x, point.y) for point in config.waypoints]
         self._next = 0
         self._require_free()

@@ -1,8 +1,8 @@
-"""``goto``, ``track`` and ``path``: send the robot to a pose or along a path, and follow it there; ``convert-path``."""
+"""``goto``, ``track``, ``path``, ``dock``, ``undock``: send the robot somewhere, and follow it; ``convert-path``."""
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
@@ -18,13 +18,14 @@ from monstertruckd.tools.cli.options import (
     parse_pose,
     require_finite,
 )
-from monstertruckd.tools.cli.output import JsonOption, print_end, print_json, remark
+from monstertruckd.tools.cli.output import JsonOption, print_end, print_json, print_words, remark
 
 if TYPE_CHECKING:
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
     from monstertruck_runtime.drives import Arrival
     from monstertruck_schemas.plan import Path as PathMessage
+    from monstertruckd.tools.cli.runs import RunEnd
 
 ROUTE_TIMEOUT: Final = 6.0
 """Seconds to wait for a first route."""
@@ -186,3 +187,47 @@ def convert_path(
     path = load_path(file, closed=closed, columns=names_of(columns))
     replace_file(output, path_text(path, form, speed=speed, width=width).encode())
     typer.echo(f"{output}: {len(path.poses) // 3} poses")
+
+
+DockArgument = Annotated[
+    str | None, typer.Argument(help="Name of the dock; not needed if the robot has one only.", show_default=False)
+]
+
+
+def dock(
+    name: DockArgument = None,
+    arm: ArmOption = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+    json_output: JsonOption = False,
+) -> None:
+    """Drive to a dock and charge. Ctrl-C stops the robot."""
+    _dock_or_undock("dock", name, robot, endpoint, arm=arm, json_output=json_output)
+
+
+def undock(
+    name: DockArgument = None,
+    arm: ArmOption = False,
+    robot: RobotOption = "truck",
+    endpoint: EndpointOption = DEFAULT_ENDPOINT,
+    json_output: JsonOption = False,
+) -> None:
+    """Leave a dock, back to its staging pose. Ctrl-C stops the robot."""
+    _dock_or_undock("undock", name, robot, endpoint, arm=arm, json_output=json_output)
+
+
+def _dock_or_undock(
+    do: Literal["dock", "undock"], name: str | None, robot: str, endpoint: str, *, arm: bool, json_output: bool
+) -> None:
+    from monstertruck_schemas.mission import DockStep, Mission, UndockStep
+    from monstertruckd.tools.cli.runs import run_mission
+
+    step = DockStep(do="dock", dock=name) if do == "dock" else UndockStep(do="undock", dock=name)
+    mission = Mission(version=2, name=do, steps=(step,))
+
+    async def main(client: "TruckClient", _: "Clock") -> "RunEnd":
+        await require_section(client, "docks", "has no docks")
+        return await run_mission(client, mission, arm=arm, report=None if json_output else print_words)
+
+    end = with_robot(main, robot, endpoint)
+    print_end(end.reason, end.text, end.as_json(), json_output=json_output)

@@ -10,7 +10,6 @@ from monstertruckd.tools.cli import (
     demo,
     description,
     devices,
-    dock,
     doctor,
     drill,
     explore,
@@ -21,8 +20,7 @@ from monstertruckd.tools.cli import (
     maps,
     mission,
     move,
-    new_driver,
-    new_robot,
+    new,
     orders,
     plan,
     points,
@@ -70,8 +68,8 @@ app.command("try")(demo.try_out)
 app.command("simulate")(demo.simulate)
 app.command("drill")(drill.drill)
 app.command("run")(robot.run)
-app.command("new-driver")(new_driver.new_driver)
-app.command("new-robot", cls=new_robot.AnswersCommand)(new_robot.new_robot)
+app.command("new-driver")(new.new_driver)
+app.command("new-robot", cls=new.AnswersCommand)(new.new_robot)
 app.command("check-config", hidden=True)(config.show)  # its name before there were others
 app.command("description")(description.description)
 app.command("topics")(robot.topics)
@@ -106,8 +104,8 @@ app.command("ros2")(ros2.ros2)
 app.command("doctor")(doctor.doctor)
 app.command("install-service")(service.install_service)
 app.command("uninstall-service")(service.uninstall_service)
-app.command("dock")(dock.dock)
-app.command("undock")(dock.undock)
+app.command("dock")(goto.dock)
+app.command("undock")(goto.undock)
 app.add_typer(behave.app, name="behave")
 app.add_typer(mission.app, name="mission")
 app.add_typer(config.app, name="config")

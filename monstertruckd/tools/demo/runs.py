@@ -120,7 +120,7 @@ async def _filmed(rig: VirtualRig, clock: VirtualClock, file: Path | None) -> As
     if file is None:
         yield
         return
-    from monstertruck_sim.world3d.film import Film  # noqa: PLC0415  # the library of an extra
+    from monstertruck_sim.world3d.onlookers import Film  # noqa: PLC0415  # the library of an extra
 
     with Film(rig.world, clock, file) as film:
         task = asyncio.create_task(film.run(), name="film")

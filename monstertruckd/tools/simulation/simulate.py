@@ -293,7 +293,7 @@ async def _see(clock: Clock, config: SimulatedTruckConfig, world: World) -> None
 
 async def _watch(clock: Clock, world: World, camera: CeilingCamera, board: HeldBoard | None, seed: int) -> None:
     """Serve a camera of the stand."""
-    from monstertruck_sim.world3d.ceiling import CeilingView  # noqa: PLC0415  # the library of an extra
+    from monstertruck_sim.world3d.onlookers import CeilingView  # noqa: PLC0415  # the library of an extra
 
     camera.port.parent.mkdir(parents=True, exist_ok=True)
     port = PtyPort(camera.port)

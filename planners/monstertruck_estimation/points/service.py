@@ -17,8 +17,7 @@ import numpy as np
 
 from monstertruck_estimation.points import files
 from monstertruck_estimation.points.config import PointsConfig
-from monstertruck_estimation.points.exchange import ReadAnswer, ReadTask
-from monstertruck_estimation.points.poses import tag_pose
+from monstertruck_estimation.points.exchange import ReadAnswer, ReadTask, tag_pose
 from monstertruck_estimation.points.tracking import Bases, PointMap, PoseAsker, nearest
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, between, compose

@@ -40,7 +40,7 @@ from monstertruck_schemas.topics import (
     estop_key,
 )
 from monstertruckd.bus.access import ANONYMOUS, Sender
-from monstertruckd.bus.call_limits import CALL_RATE, MAX_WAITING
+from monstertruckd.bus.call_limits import CALLS
 from monstertruckd.bus.intake import Intake
 from monstertruckd.bus.local import Bus
 from monstertruckd.bus.rpc import Rpc
@@ -321,12 +321,12 @@ async def test_a_flood_of_calls_is_refused_by_its_rate_and_keeps_off_neither_oth
                 replies = [reply for answer in asked for reply in answer]
                 return ["ok" if reply.ok else json.loads(reply.err.payload.to_bytes())["text"] for reply in replies]
 
-            flood = asyncio.create_task(asyncio.to_thread(texts, "topics/eve", round(4 * CALL_RATE)))
+            flood = asyncio.create_task(asyncio.to_thread(texts, "topics/eve", round(4 * CALLS.rate)))
             order = await asyncio.to_thread(texts, "estop/eve")
             answers = await flood
             other = await asyncio.to_thread(texts, "topics/ann")
     assert (order, other) == (["ok"], ["ok"])
-    assert answers.count("more than 100 calls a second") > 2 * CALL_RATE
+    assert answers.count("more than 100 calls a second") > 2 * CALLS.rate
 
 
 async def test_orders_have_room_where_too_many_calls_wait_and_the_others_are_refused():
@@ -334,13 +334,13 @@ async def test_orders_have_room_where_too_many_calls_wait_and_the_others_are_ref
         robot.rpc.register("estop", AsyncMock(return_value={}))
         with raw_session(robot.endpoint) as station:
             (_,) = await asyncio.to_thread(lambda: list(station.get("mt/truck/rpc/topics/ann")))
-            keys = [*["topics/eve"] * round(CALL_RATE), "estop/ann"]
+            keys = [*["topics/eve"] * round(CALLS.rate), "estop/ann"]
             asked = [station.get(f"mt/truck/rpc/{key}", payload=b"{}", timeout=10.0) for key in keys]
             time.sleep(0.3)  # the loop takes none of them meanwhile
             answers = await asyncio.to_thread(lambda: [list(answer) for answer in asked])
     *others, order = ([bool(reply.ok) for reply in answer] for answer in answers)
     assert order == [True]
-    assert others.count([False]) >= CALL_RATE - MAX_WAITING
+    assert others.count([False]) >= CALLS.rate - CALLS.waiting
     assert others.count([]) == 0, "all are answered"
 
 

@@ -20,7 +20,6 @@ from monstertruck_kinematics.se2 import Pose2, between, compose, interpolate
 from monstertruck_planners.behave.api import BehaviourBody, BehaviourStep, Inputs, RequestedMotion
 from monstertruck_planners.behave.dock.config import DockingConfig, UndockConfig, chosen
 from monstertruck_planners.behave.dock.estimate import TagEstimate, docked_pose, driven, facing, seen
-from monstertruck_planners.behave.dock.steer import LENGTH, curvature, pace, predicted
 from monstertruck_planners.behave.move import require_possible
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.plan import DockTarget
@@ -33,6 +32,8 @@ Phase = Literal[
     "perceive", "look", "view", "back_off", "turn_out", "turn_in", "approach", "settle", "charge", "retreat"
 ]
 
+STEERING_LENGTH: Final = 0.1
+"""Distance in which an error across the axis falls to 1/e, twice over (m): critically damped."""
 VIEW: Final = 0.15
 """Distance before the docked pose from which a robot that docks in reverse looks at the tag (m)."""
 
@@ -230,7 +231,7 @@ class Dock:
         left, across, turn = -float(at[0]), float(at[1]), float(at[2])
         if left <= 0.002:  # distance in which the robot stops from the lowest speed, m
             return self._next(state, "settle", t)
-        if left < LENGTH and abs(predicted(across, turn, left)) > self._config.tolerance:
+        if left < STEERING_LENGTH and abs(predicted(across, turn, left)) > self._config.tolerance:
             text = f"{across * 1000:+.0f} mm and {math.degrees(turn):+.1f} degrees off the axis of {self._name}"
             return self._failed(state, t, Reason.DOCK_MISSED, text)
         if not self._reverse and t - state.seen > 1.0:  # the tag is hidden: stand, s
@@ -356,3 +357,30 @@ class Undock:
 
 def _pose(odometry: Odometry) -> Array:
     return np.array((odometry.pose.x, odometry.pose.y, odometry.pose.yaw))
+
+
+def curvature(across: float, turn: float, way: float, limit: float) -> float:
+    """Return the curvature (1/m) per distance travelled that leads a robot onto an axis.
+
+    Args:
+        across: distance to the left of the axis (m).
+        turn: heading relative to the axis (rad).
+        way: +1 for a robot that drives ahead along the axis, -1 for one that reverses along it.
+        limit: maximum curvature (1/m).
+    """
+    # 0.2: maximum angle to the axis, rad: the camera keeps the tag in view
+    towards = min(max(-way * across / (2.0 * STEERING_LENGTH), -0.2), 0.2)
+    return min(max(2.0 * (towards - turn) / STEERING_LENGTH, -limit), limit)
+
+
+def pace(left: float, speed: float) -> float:
+    """Return the speed (m/s) with ``left`` metres to a stop; it falls in proportion to the distance.
+
+    0.6 1/s: a robot that responds within 0.3 s does not overshoot. 0.012 m/s: slower set-points do not turn a motor.
+    """
+    return min(speed, max(0.6 * left, 0.012))
+
+
+def predicted(across: float, turn: float, left: float) -> float:
+    """Return the distance across the axis (m) that is left after ``left`` metres along it, for a small heading."""
+    return (across + (turn + across / STEERING_LENGTH) * left) * math.exp(-left / STEERING_LENGTH)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from monstertruck_drivers.webcam.emulator import jpeg
-from monstertruck_estimation.points.exchange import ReadTask
-from monstertruck_estimation.points.poses import tag_pose
+from monstertruck_estimation.points.exchange import ReadTask, tag_pose
 from monstertruck_estimation.points.reader import ReadingStep
 from monstertruck_kinematics.se2 import between
 from monstertruck_schemas.body import LensConfig, Mount

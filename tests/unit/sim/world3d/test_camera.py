@@ -16,7 +16,7 @@ from monstertruck_schemas.base import Pose2D
 from monstertruck_sim.config import CeilingCamera
 from monstertruck_sim.world.config import CameraConfig, HeldBoard, PersonConfig, RoofTag, Spot, TagConfig, WorldConfig
 from monstertruck_sim.world.world import World
-from monstertruck_sim.world3d.ceiling import CeilingView
+from monstertruck_sim.world3d.onlookers import CeilingView
 
 SIZE = (320, 240)
 FOCAL = 160 / math.tan(math.radians(31.5))

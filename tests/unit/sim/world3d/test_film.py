@@ -11,8 +11,8 @@ from monstertruck_runtime.errors import InputError, NoAnswerError, NotInstalledE
 from monstertruck_schemas.base import Pose2D
 from monstertruck_sim.world.config import WorldConfig
 from monstertruck_sim.world.world import World, make_scene
-from monstertruck_sim.world3d.film import FRAME_RATE, Film
 from monstertruck_sim.world3d.model import Group
+from monstertruck_sim.world3d.onlookers import FRAME_RATE, Film
 from monstertruck_sim.world3d.picture import WorldRenderer, looking_at
 
 FILM_SIZE = (480, 320)

@@ -10,7 +10,7 @@ from monstertruck_drivers.usb.tree import Node, TreeSnapshot, UsbDevice
 from monstertruck_runtime.errors import InputError
 from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
-from monstertruckd.tools.cli import new_robot as command
+from monstertruckd.tools.cli import new as command
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.new_robot.answers import Answers
 from monstertruckd.tools.new_robot.write import next_commands, write_robot

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from monstertruck_planners.behave.dock.config import DockConfig, DockingConfig, chosen
-from monstertruck_planners.behave.dock.docking import Dock
+from monstertruck_planners.behave.dock.docking import STEERING_LENGTH, Dock, curvature, predicted
 from monstertruck_planners.behave.dock.estimate import staging_pose
-from monstertruck_planners.behave.dock.steer import LENGTH, curvature, predicted
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.behave.dock.kit import Robot
 
@@ -163,4 +162,4 @@ def test_the_steering_leads_onto_the_axis_either_way_as_predicted(way: int):
         turn += curvature(across, turn, way, 10.0) * step
         across += way * math.sin(turn) * step
     assert across == pytest.approx(foreseen, abs=0.003)
-    assert abs(across) < 0.03 * (1 + 0.3 / LENGTH) * math.exp(-0.3 / LENGTH) + 0.006
+    assert abs(across) < 0.03 * (1 + 0.3 / STEERING_LENGTH) * math.exp(-0.3 / STEERING_LENGTH) + 0.006

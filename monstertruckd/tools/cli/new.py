@@ -1,4 +1,4 @@
-"""``monstertruckd new-robot``: a robot's configuration and its simulated twin, from questions or options."""
+"""``new-robot``: a robot's configuration and its simulated twin, from answers; ``new-driver``: a driver's package."""
 
 import sys
 from pathlib import Path
@@ -8,6 +8,7 @@ import typer
 
 from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.output import NumberCommand, on_terminal, remark
+from monstertruckd.tools.new_driver.write import DriverKind, write_driver
 
 if TYPE_CHECKING:
     import inspect
@@ -114,3 +115,23 @@ def _with_options() -> Any:
     answers.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     answers.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return answers
+
+
+def new_driver(
+    kind: Annotated[
+        DriverKind, typer.Argument(help="lidar: streams; sensor: answers; motors: drives shafts.", show_default=False)
+    ],
+    name: Annotated[str, typer.Argument(help="Name of the device kind, such as acme_l5.", show_default=False)],
+    folder: Annotated[Path, typer.Option("--folder", help="Where its folder is made.")] = Path(),
+) -> None:
+    """Write the package of a new driver: protocol, driver, emulator, identity, tests. Its tests pass as written.
+
+    Replace the protocol by the device's own, then emulator and tests. Existing files are never overwritten.
+    """
+    made = write_driver(kind, name, folder)
+    remark(f"written: {made}; next:")
+    print(
+        f"cd {made}\npython -m pytest\npython -m hatchling build -t wheel -d dist\n"
+        f"python -m zipfile -e dist/{name}_driver-0.1-py3-none-any.whl plugins\n"
+        "PYTHONPATH=plugins monstertruckd plugins"
+    )
