@@ -5,7 +5,7 @@ from math import exp
 from monstertruck_drivers.battery.monitor import CELL_VOLTS
 from monstertruck_sim.world.config import BatteryModelConfig
 
-_CELL_VOLTS = CELL_VOLTS.tolist()
+_CELL_VOLTS: list[float] = CELL_VOLTS.tolist()
 
 
 def rest_voltage(charge: float, cells: int) -> float:
