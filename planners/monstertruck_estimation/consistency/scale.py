@@ -13,7 +13,7 @@ from monstertruck_estimation.consistency.exchange import REFUTING, ScanVerdict
 from monstertruck_estimation.slam.registration import Cloud, fitting, register
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import inverse, transform
+from monstertruck_kinematics.se2 import compose, inverse, transform
 
 
 class Revolution(NamedTuple):
@@ -25,8 +25,42 @@ class Revolution(NamedTuple):
     """Position of the sensor in base (m)."""
 
 
+class ScaleWatch:
+    """Compares each revolution with the one before.
+
+    After a change in the middle of a revolution neither motion nor a factor explains it: the next one is compared with
+    that before it.
+    """
+
+    def __init__(self) -> None:
+        self._reference: Revolution | None = None
+        self._over: list[Array] = []
+        """Motions from the reference to a revolution that nothing explained; empty without one."""
+
+    def begin(self, newest: Revolution | None) -> None:
+        """Start anew at a revolution, or without one."""
+        self._reference, self._over = newest, []
+
+    def change(self, newest: Revolution, motions: list[Array]) -> float | None:
+        """Return the factor by which all ranges have changed, or None.
+
+        Args:
+            newest: latest revolution.
+            motions: see ``scale_change``, from the revolution before; always as many.
+        """
+        factor, skipped = None, bool(self._over)
+        over = [compose(*pair) for pair in zip(self._over, motions, strict=True)] if skipped else motions
+        if self._reference is not None:
+            factor = scale_change(newest, self._reference, over)
+        if factor is None and self._reference is not None and not skipped:
+            self._over = motions
+        else:
+            self.begin(newest)
+        return None if factor == 1.0 else factor
+
+
 def scale_change(newest: Revolution, earlier: Revolution, motions: list[Array]) -> float | None:
-    """Return the factor from the earlier ranges to the latest ones, or None if motion explains the latest scan.
+    """Return the factor from the earlier ranges to the latest ones: 1 if motion explains them, None if nothing does.
 
     Args:
         newest: latest revolution.
@@ -39,15 +73,18 @@ def scale_change(newest: Revolution, earlier: Revolution, motions: list[Array]) 
     for motion in motions:
         fits.append(_fits(newest.scan, cloud, motion))
         if np.count_nonzero(~fits[-1]) < REFUTING:
-            return None
+            return 1.0
     moved = max(fits, key=np.count_nonzero)
     factor = _factor(newest, earlier, motions)
     if factor is None:
         return None
     rescaled = _rescaled(newest.scan, newest.origin, 1.0 / factor)
     scaled = max((_fits(rescaled, cloud, motion) for motion in motions), key=np.count_nonzero)
-    # Nothing else changes with the scale: every point that does not fit the rescaled revolution is evidence of motion.
-    alone, misfits = int(np.count_nonzero(scaled & ~moved)), int(np.count_nonzero(~scaled))
+    # Nothing else changes with the scale: every point that does not fit the rescaled revolution is evidence of motion,
+    # unless the earlier revolution did not reach so far.
+    reach = _polar(earlier.scan.points, earlier.origin)[1].max()
+    judged = _polar(rescaled.points, newest.origin)[1] <= reach
+    alone, misfits = (int(np.count_nonzero(points & judged)) for points in (scaled & ~moved, ~scaled))
     return factor if ScanVerdict(claimed=misfits, own=alone, misfits=misfits).refuted else None
 
 

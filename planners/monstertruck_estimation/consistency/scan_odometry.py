@@ -17,7 +17,7 @@ import numpy as np
 from monstertruck_estimation.consistency.delay import scan_delay
 from monstertruck_estimation.consistency.exchange import Claim, RestEvidence, ScanVerdict, StepInput, StepOutput
 from monstertruck_estimation.consistency.rest_proof import rest_evidence
-from monstertruck_estimation.consistency.scale import Revolution, scale_change
+from monstertruck_estimation.consistency.scale import Revolution, ScaleWatch
 from monstertruck_estimation.consistency.tracks import KEPT
 from monstertruck_estimation.slam.registration import Cloud, Fit, fitting, measure, register
 from monstertruck_estimation.slam.scans import Scan, prepare_input, scans_in_a_room
@@ -74,8 +74,7 @@ class ScanMotionStep:
         self._changes: deque[tuple[float, float]] = deque(maxlen=scattered)
         """Changes from one motion to the next (m^2, rad^2)."""
         self._last: tuple[int, Cloud] | None = None
-        self._revolution: Revolution | None = None
-        """Latest revolution, the reference of the next one's scale."""
+        self._scale = ScaleWatch()
         self._reference: tuple[Cloud, Array] | None = None
         """Reference scan of the registration, and its pose."""
         self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=128)  # number of scans kept for claims
@@ -104,7 +103,8 @@ class ScanMotionStep:
         most_points = 300
         scan = whole.downsampled(thinned, most_points)
         if len(whole) < 30:  # minimum number of points of a scan that measures the motion
-            self._last = self._revolution = None
+            self._last = None
+            self._scale.begin(None)
             return StepOutput(stamp, None, front=name)
         found = None
         if last is not None and 0.0 < dt < GAP:
@@ -135,10 +135,11 @@ class ScanMotionStep:
         return StepOutput(stamp, last[0], (x, y, yaw), deviations, scatter, overlap, verdict, rest, factor, name)
 
     def _scale_change(self, inputs: StepInput, whole: Scan, dt: float, motions: list[Array]) -> float | None:
-        before, self._revolution = self._revolution, Revolution(whole, inputs.scan.mount[:2])
-        if before is None or inputs.rolled is None or not 0.0 < dt < GAP:
+        newest = Revolution(whole, inputs.scan.mount[:2])
+        if inputs.rolled is None or not 0.0 < dt < GAP:
+            self._scale.begin(newest)
             return None
-        return scale_change(self._revolution, before, [*motions, np.array(inputs.rolled)])
+        return self._scale.change(newest, [*motions, np.array(inputs.rolled)])
 
     def _begin(self, front: KissFront | None, scan: Scan, pose: Array) -> None:
         self._reference = Cloud.of(scan), pose

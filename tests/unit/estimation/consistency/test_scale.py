@@ -9,7 +9,7 @@ from monstertruck_estimation.consistency.comparison import Measure
 from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.exchange import StepOutput
 from monstertruck_estimation.consistency.monitor import ConsistencyMonitor
-from monstertruck_estimation.consistency.scale import Revolution, scale_change
+from monstertruck_estimation.consistency.scale import Revolution, ScaleWatch, scale_change
 from monstertruck_estimation.slam.scans import ScanGeometry, prepare
 from monstertruck_kinematics.se2 import compose
 from monstertruck_runtime.clock import SECOND
@@ -61,7 +61,7 @@ def test_a_change_is_found_though_the_number_of_beams_and_the_first_ones_bearing
     for factor in (0.6, 1.5):
         found = scale_change(revolution(factor * after, newest), revolution(before, earlier), [np.zeros(3)])
         assert found == pytest.approx(factor, rel=0.01)
-    assert scale_change(revolution(after, newest), revolution(before, earlier), [np.zeros(3)]) is None
+    assert scale_change(revolution(after, newest), revolution(before, earlier), [np.zeros(3)]) == 1.0
 
 
 @pytest.mark.parametrize("motion", [(0.08, 0.0, 0.0), (0.05, 0.0, 0.1)])
@@ -74,13 +74,25 @@ def test_motion_between_the_revolutions_does_not_change_the_factor(motion):
         assert found == pytest.approx(factor, rel=0.01)
 
 
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
+def test_a_change_in_the_middle_of_a_revolution_is_found_at_the_next_one(share):
+    pose, watch = np.array(LANE[0][:3], float), ScaleWatch()
+    clean = ranges(HALL, pose)
+    later = np.arange(len(clean)) >= share * len(clean)
+    seen = (clean, clean, np.where(later, 1.6 * clean, clean), 1.6 * clean, np.where(later, clean, 1.6 * clean), clean)
+    found = [watch.change(revolution(one), [np.zeros(3), np.zeros(3)]) for one in seen]
+    assert found[:2] == [None, None]
+    assert math.prod(factor for factor in found[2:4] if factor) == pytest.approx(1.6, rel=0.01)
+    assert math.prod(factor for factor in found[2:] if factor) == pytest.approx(1.0, abs=0.02), "and changed back"
+
+
 def test_a_wall_that_the_robot_approaches_far_between_two_revolutions_changes_no_scale():
     """All ranges shrink by one factor; the wheels lead the registration, which does not reach so far by itself."""
     wall, moved = [((2.0, -20.0), (2.0, 20.0))], np.array((0.5, 0.0, 0.0))
     before, after = (ranges(wall, pose) for pose in (np.array((-2.0, 0.0, 0.0)), np.array((-1.5, 0.0, 0.0))))
     earlier, newest = (revolution(seen) for seen in (before, after))
     assert scale_change(newest, earlier, [np.zeros(3)]) == pytest.approx(0.875, abs=0.01)
-    assert scale_change(newest, earlier, [moved, np.zeros(3)]) is None
+    assert scale_change(newest, earlier, [moved, np.zeros(3)]) == 1.0
 
 
 def test_it_ends_when_the_ranges_change_back_or_the_lidar_has_been_silent():
