@@ -19,6 +19,8 @@ from pages import (
     source,
     symptoms,
     topics,
+    unrevealed,
+    wizards,
 )
 from pages.markdown import Page, join
 
@@ -54,6 +56,8 @@ def on_config(config: Any) -> Any:
         *api.pages(),
         *figures.pages(),
         benchmarks.page(),
+        wizards.page(),
+        unrevealed.page(),
         never_tried.page(texts),
         symptoms.page(),
         reasons.page(),

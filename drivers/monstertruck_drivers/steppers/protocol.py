@@ -1,8 +1,9 @@
-"""Line protocol of a microcontroller with up to four stepper motors; pure codec. Written out in ``docs/devices.md``.
+"""Line protocol of a microcontroller with up to four stepper motors; pure codec.
 
-A line is ``:BODY*CCCC`` and LF: BODY is words of printable ASCII, one space apart, CCCC the CRC-16/CCITT-FALSE of BODY
-in capital hex digits. The controller answers every complete line of the host once, with the request's sequence
-number, and sends nothing else. The first word of a request is a capital letter, of its answer the same in small:
+115200 baud, 8N1. A line is ``:BODY*CCCC`` and LF, at most 160 bytes: BODY is words of printable ASCII, one space apart,
+CCCC the CRC-16/CCITT-FALSE of BODY (polynomial 0x1021, initial value 0xFFFF) in capital hex digits. The controller
+answers every complete line of the host once, with the request's sequence number (0 to 255), and sends nothing else. The
+first word of a request is a capital letter, of its answer the same in small:
 
 ======================= ==================================================== ==========================================
 request                 meaning                                              answer
@@ -15,9 +16,14 @@ request                 meaning                                              ans
 ``S SEQ``               look, without feeding the watchdog                   a status
 ======================= ==================================================== ==========================================
 
-A status is ``s SEQ STATE BAD UPTIME POSITION... RATE...``: state, damaged lines since power-up (0-65535, wraps), uptime
-in ms (32 bits, wraps), the steps commanded so far (signed 32 bits, wrap) and the current rate of every motor. The
-answer to a request that cannot be carried out is ``e SEQ CODE``; a damaged line gets no answer.
+NAME is STEP4, VERSION 1; step periods are multiples of PERIOD us. The watchdog is 50 to 2000 ms. After power-up the
+motors are off at position 0, with 4000 and 8000 steps/s^2 and 500 ms.
+
+A status is ``s SEQ STATE BAD UPTIME POSITION... RATE...``: state (0 off, 1 running, 2 stopped, 3 by the watchdog),
+damaged lines since power-up (0-65535, wraps), uptime in ms (32 bits, wraps), the steps commanded so far (signed 32
+bits, wrap) and the current rate of every motor. The answer to a request that cannot be carried out is ``e SEQ CODE``
+(1 unknown, 2 invalid arguments, 3 not while a motor turns, 4 watchdog tripped: ``R`` needs a ``Q`` or ``D`` first); a
+damaged line gets no answer.
 """
 
 from binascii import crc_hqx

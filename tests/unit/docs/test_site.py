@@ -12,7 +12,9 @@ import pytest
 
 from monstertruck_drivers.catalog import DEVICES
 from monstertruck_schemas.topics import TOPICS
+from monstertruckd.config.wizards import WIZARDS
 from monstertruckd.tools.cli.main import app
+from monstertruckd.tools.drill.unrevealed import UNREVEALED
 from tests.unit.docs.command_lines import commands_of
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -89,6 +91,13 @@ def test_every_benchmark_with_figures_is_described(site: Path):
     text = (site / "benchmark-runs.html").read_text()
     commands = [json.loads(file.read_text())["command"] for file in (ROOT / "docs" / "figures").glob("*.json")]
     assert [command for command in commands if f'id="{Path(command.split()[1]).stem}"' not in text] == []
+
+
+def test_wizards_and_faults_that_nothing_reveals_have_their_places(site: Path):
+    text = (site / "wizards.html").read_text()
+    assert [key for wizard in WIZARDS.values() for key in wizard.keys if f"<code>{key}</code>" not in text] == []
+    text = (site / "unrevealed.html").read_text()
+    assert [row for row in UNREVEALED if f"<code>{row.families[0]}</code>" not in text] == []
 
 
 def test_what_was_never_tried_is_gathered_and_code_is_shown(site: Path):
