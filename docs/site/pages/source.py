@@ -1,7 +1,7 @@
 """Code that pages show: a paragraph that is only a link to a file becomes its code on the site.
 
-A link to a file in ``examples/`` shows the whole file. A link to a module shows the class or function that the link
-names, such as ``[PathTracker.steer](../planners/.../path_tracker.py)``.
+A link to a file in ``examples/`` or to a configuration shows the whole file. A link to a module shows the class or
+function that the link names, such as ``[PathTracker.steer](../planners/.../path_tracker.py)``.
 """
 
 import ast
@@ -26,7 +26,8 @@ def shown(markdown: str) -> str:
 
 def _block(found: re.Match[str]) -> str:
     text = (DOCS / found["path"]).read_text(encoding="utf-8")
-    code = text if found["path"].startswith("examples/") else _part(text, found["name"])
+    whole = found["kind"] != "py" or found["path"].startswith("examples/")
+    code = text if whole else _part(text, found["name"])
     return f'```{LANGUAGES[found["kind"]]} title="{found["name"]}"\n{code.rstrip()}\n```'
 
 
