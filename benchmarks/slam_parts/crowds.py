@@ -11,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from monstertruck_estimation.slam.mapping import Mapper
-from monstertruck_estimation.slam.scans import ScanGeometry, prepare
+from monstertruck_estimation.slam.config import GridConfig, MapperConfig
+from monstertruck_estimation.slam.mapping import MappingEstimator
+from monstertruck_estimation.slam.scans import ScanGeometry, prepare_input
+from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.se2 import between, compose
-from monstertruck_schemas.health import OdometryUse
+from monstertruck_schemas.health import LocalisationStatus, OdometryUse
 from slam_parts.drawn import MAPS, PERIOD, REACH, drawn
 
 SHARES = (0.1, 0.2, 0.3, 0.4)
@@ -54,19 +56,22 @@ def followed(
     stamps, ranges, odometry, poses, geometry = log
     rng = np.random.default_rng((seed, len(name), round(100 * share)))
     seen, hidden = among(ranges[:SCANS], poses, geometry, share, rng, SCANS // 3 * (seed % 2))
-    mapper, rows = Mapper(start=tuple(poses[0].tolist())), []
+    estimator, rows = MappingEstimator(MapperConfig(), GridConfig(), start=tuple(poses[0].tolist())), []
+    fields = geometry.start_angle, geometry.angle_increment, geometry.range_min, geometry.range_max
     for stamp, row, odom, pose in zip(stamps.tolist(), seen, odometry, poses, strict=False):
-        step = mapper.step(prepare(row, geometry, longest=mapper.config.longest), stamp, odom)
-        assert step is not None
-        off = between(pose, step.pose)
-        rows.append((math.hypot(off[0], off[1]), mapper.lost, mapper.odometry is not OdometryUse.USED))
-    off, lost, dropped = np.array(rows[1:]).T
-    wrong = (off > WRONG) & ~lost.astype(bool)
+        inputs = ScanInput(stamp, row, *fields, odom=tuple(odom.tolist()))
+        estimate = estimator.step(prepare_input(inputs, MapperConfig().longest), inputs)
+        assert estimate is not None
+        off = between(pose, np.array(estimate.pose))
+        reported = estimate.status in {LocalisationStatus.UNCERTAIN, LocalisationStatus.LOST}
+        rows.append((math.hypot(off[0], off[1]), reported, estimate.odometry is not OdometryUse.USED))
+    off, reported, dropped = np.array(rows[1:]).T
     return {
         "beams": hidden,
         "max_m": float(off.max()),
         "mean_m": float(off.mean()),
-        "unreported_s": longest(wrong) * PERIOD,
+        "reported": float(reported.mean()),
+        "unreported_s": longest((off > WRONG) & ~reported.astype(bool)) * PERIOD,
         "dropped": float(dropped.sum()),
     }
 

@@ -27,7 +27,7 @@ class MapperConfig(Schema):
     longest: Positive = 30.0
     """Maximum range that is used (m)."""
     odometry_floor: tuple[Positive, Positive] = (0.02, 0.05)
-    """Minimum standard deviation of an odometry step (m, rad)."""
+    """Minimum standard deviation of an odometry step (m, rad) of a robot that moves: late stamps, slip."""
     odometry_distance: Positive = 0.1
     """Standard deviation of a displacement per metre, forward and sideways."""
     odometry_turn: tuple[Positive, Positive] = (0.2, 0.1)

@@ -6,7 +6,6 @@ matched: at the edge of the map they are no evidence for or against a pose.
 """
 
 import math
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -17,13 +16,20 @@ from monstertruck_estimation.slam.correlation import Submap, merged
 from monstertruck_estimation.slam.global_search import GlobalLocaliser
 from monstertruck_estimation.slam.map_evidence import EvidenceGrid
 from monstertruck_estimation.slam.mapping import LOST_AFTER, estimate, fits, status_of
-from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry, constrained
+from monstertruck_estimation.slam.motion import (
+    ClockOffsetEstimator,
+    MotionPredictor,
+    ScanOdometry,
+    constrained,
+    without_weak_direction,
+)
 from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scan_matcher import (
     MatchStatus,
     PlanarMatcher,
     ScanMatch,
     deviations,
+    difference,
     rejected,
 )
 from monstertruck_estimation.slam.scans import Scan
@@ -220,7 +226,7 @@ class LocalisationEstimator:
         contradiction = self._evidence.judge(match.pose, scan.points, np.array(mount[:2])).contradiction
         if not (fits(match) and contradiction <= MAX_CONTRADICTION):
             return match, False
-        return _without_weak_direction(match, predicted[0], predicted[2]), True
+        return without_weak_direction(match, predicted[0], predicted[2]), True
 
     def _matched(self, scan: Scan, delta: Array, predicted: Predicted, mount: Pose2) -> tuple[ScanMatch, bool]:
         """Match the beams that end on mapped ground; return the match and whether it is valid."""
@@ -245,7 +251,7 @@ class LocalisationEstimator:
             good = contradiction <= MAX_CONTRADICTION and (clear or whole)
         if not (good and fits(match)):
             return match, False
-        return _without_weak_direction(match, guess, published), True
+        return without_weak_direction(match, guess, published), True
 
     def _with_scale_error(self, covariance: Array) -> Array:
         """Return ``covariance``, shape (3, 3), plus the covariance of the scale of an unmatched displacement.
@@ -285,27 +291,12 @@ class LocalisationEstimator:
         return True
 
 
-def _without_weak_direction(match: ScanMatch, guess: Array, covariance: Array) -> ScanMatch:
-    """Replace the pose of a degenerate match along its weak direction by ``guess`` with its ``covariance`` there."""
-    if match.information is None or not match.degenerate:
-        return match
-    information = constrained(match, match.information)
-    gain = np.linalg.solve(information + np.linalg.inv(covariance), information)
-    return replace(match, pose=guess + gain @ _difference(match.pose, guess))
-
-
 def _far(pose: Array, guess: Array, covariance: Array) -> bool:
     """Whether ``pose`` is further from ``guess`` than its ``covariance`` and a match's explain."""
-    off = _difference(pose, guess)
+    off = difference(pose, guess)
     distance = math.sqrt(float(off @ np.linalg.solve(covariance + MATCH_COVARIANCE, off)))
     far = 3.0  # standard deviations of the predicted pose beyond which a match is far from the motion
     return distance > far or _apart(pose, guess)
-
-
-def _difference(pose: Array, other: Array) -> Array:
-    off = pose - other
-    off[2] = math.remainder(off[2], math.tau)
-    return off
 
 
 def _strayed(match: ScanMatch, guess: Array) -> bool:

@@ -16,7 +16,13 @@ from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.grid import NONE, GridBuilder, passed_ends
 from monstertruck_estimation.slam.keyframes import LOOSENED, KeyframeMap, Trajectory
-from monstertruck_estimation.slam.motion import ClockOffsetEstimator, MotionPredictor, ScanOdometry, velocity
+from monstertruck_estimation.slam.motion import (
+    ClockOffsetEstimator,
+    MotionPredictor,
+    ScanOdometry,
+    velocity,
+    without_weak_direction,
+)
 from monstertruck_estimation.slam.movers import MoverDetector
 from monstertruck_estimation.slam.relocation import (
     OFF_MOTION,
@@ -225,6 +231,8 @@ class Mapper:
         if self._submap is None:
             return rejected(guess, covariance, MatchStatus.EMPTY)
         match = self._front.match(scan, delta, guess, covariance, self._submap)
+        if self._motion.by_wheels(delta):
+            match = without_weak_direction(match, guess, covariance)
         suspect, after_gap = self._loss.suspects(match, guess, covariance), self._loss.after_gap and match.accepted
         if self._loss.after_gap and self._led(match, delta, guess, covariance):
             return match

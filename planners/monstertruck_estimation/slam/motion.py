@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.config import MapperConfig
-from monstertruck_estimation.slam.scan_matcher import LOW_OVERLAP, ScanMatch, deviations
+from monstertruck_estimation.slam.scan_matcher import LOW_OVERLAP, ScanMatch, deviations, difference
 from monstertruck_estimation.slam.worker_io import ScanIncrement
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Twist2, between, compose, rotation
@@ -298,9 +299,19 @@ class MotionPredictor:
         """Return the covariance, shape (3, 3), of the motion ``delta`` by odometry."""
         config, (by_turn, by_way) = self._config, self._config.odometry_turn
         way, turned = math.hypot(delta[0], delta[1]), abs(float(delta[2]))
-        place = self.factors[0] * math.hypot(config.odometry_floor[0], config.odometry_distance * way)
-        turn = self.factors[1] * math.hypot(config.odometry_floor[1], math.hypot(by_turn * turned, by_way * way))
+        floor = self._moving(delta) * np.array(config.odometry_floor)
+        place = self.factors[0] * math.hypot(floor[0], config.odometry_distance * way)
+        turn = self.factors[1] * math.hypot(floor[1], math.hypot(by_turn * turned, by_way * way))
         return np.diag((place**2, place**2, turn**2))
+
+    def _moving(self, delta: Array) -> float:
+        """Return the share of the minimum noise that the motions by odometry and by the latest scan explain.
+
+        Late stamps and slip are errors of a motion: wheels of a robot that stands are exact, and the scans show it.
+        """
+        still = 0.01  # share of a robot that stands: the resolution of its encoders
+        motion = (_lengths(np.stack((delta, self._delta))) / self._config.odometry_floor).max()
+        return float(np.clip(motion, still, 1.0))
 
     def off(self, moved: Array) -> tuple[float, float] | None:
         """Return the difference of ``moved``, shape (3,), from odometry or from the last motion, if that is nearer.
@@ -410,6 +421,16 @@ def constrained(match: ScanMatch, information: Array) -> Array:
     along = np.array((math.cos(match.direction), math.sin(match.direction), 0.0))
     weight = information @ along
     return information - np.outer(weight, weight) / max(float(along @ weight), 1e-9)
+
+
+def without_weak_direction(match: ScanMatch, guess: Array, covariance: Array) -> ScanMatch:
+    """Replace pose and covariance of a degenerate match along its weak direction by those of ``guess``."""
+    if match.information is None or not match.degenerate:
+        return match
+    information = constrained(match, match.information)
+    posterior = np.linalg.inv(information + np.linalg.inv(covariance))
+    pose = guess + posterior @ information @ difference(match.pose, guess)
+    return replace(match, pose=pose, covariance=posterior)
 
 
 OFFSET_LEAST_SCANS: Final = 120

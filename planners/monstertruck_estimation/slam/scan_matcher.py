@@ -152,9 +152,15 @@ def gated(fit: Fit, guess: Array, covariance: Array) -> ScanMatch:
 
 def off_guess(pose: Array, guess: Array, covariance: Array) -> float:
     """Return the Mahalanobis distance of ``pose`` from ``guess``, both shape (3,), with its ``covariance``, (3, 3)."""
-    off = pose - guess
-    off[2] = math.remainder(off[2], math.tau)
+    off = difference(pose, guess)
     return math.sqrt(float(off @ np.linalg.solve(covariance, off)))
+
+
+def difference(pose: Array, other: Array) -> Array:
+    """Return the difference of two poses in the frame of both, shape (3,) (m, rad)."""
+    off = pose - other
+    off[2] = math.remainder(off[2], math.tau)
+    return off
 
 
 def rejected(guess: Array, covariance: Array, verdict: MatchStatus) -> ScanMatch:

@@ -152,6 +152,17 @@ def test_a_corridor_does_not_collapse():
     assert steps[-1].match.covariance[0, 0] > 4 * steps[-1].match.covariance[1, 1]
 
 
+def test_a_robot_that_stands_in_a_corridor_knows_its_place_and_one_that_drives_does_not():
+    """Wheels that stand are exact; those that drive may slip, and no wall shows it."""
+    truth = np.zeros((160, 3))
+    truth[100:, 0] = 0.05 * np.arange(1, 61)
+    steps = drive(Mapper(), CORRIDOR, truth, truth)
+    deviation = np.sqrt([step.covariance[0, 0] for step in steps])
+    assert deviation[99] < 0.03
+    assert deviation[-1] > 0.1
+    assert errors([step.pose for step in steps], truth).max() < 0.05
+
+
 def test_kiss_serves_as_front_end():
     truth = rounds(100, 0.5)
     mapper = Mapper(front=KissMatcher())
