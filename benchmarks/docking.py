@@ -80,7 +80,7 @@ def place(world: str, direction: str, rng: np.random.Generator) -> Array:
         row, column = int(rows[at]), int(columns[at])
         down, right = round(math.sin(turn)), round(math.cos(turn))
         aside = [(row + k * right, column + k * down) for k in range(-5, 6)]  # 5 cells of wall on both sides
-        inside = all(0 <= r < len(occupied) and 0 <= c < occupied.shape[1] for r, c in aside)
+        inside = all(0 < r < len(occupied) - 1 and 0 < c < occupied.shape[1] - 1 for r, c in aside)
         if not inside or not all(occupied[r, c] and not occupied[r - down, c - right] for r, c in aside):
             continue
         middle = (np.array((column, row)) + 0.5 - 0.5 * np.array((right, down))) * built.resolution + built.origin

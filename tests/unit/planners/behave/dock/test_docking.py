@@ -7,7 +7,8 @@ import pytest
 
 from monstertruck_planners.behave.dock.config import DockConfig, DockingConfig, chosen
 from monstertruck_planners.behave.dock.docking import STEERING_LENGTH, Dock, curvature, predicted
-from monstertruck_planners.behave.dock.estimate import staging_pose
+from monstertruck_planners.behave.dock.estimate import driven, seen, staging_pose
+from monstertruck_schemas.points import TagPose
 from monstertruck_schemas.reasons import Reason
 from tests.unit.planners.behave.dock.kit import Robot
 
@@ -41,6 +42,20 @@ def test_it_turns_its_rear_to_the_dock_after_a_look_at_the_tag(seed: int):
     assert robot.error[0] < 0.01
     assert robot.error[1] < math.radians(1.0)
     assert robot.phases[:6] == ["perceive", "look", "view", "back_off", "turn_out", "turn_in"]
+
+
+def test_many_images_from_one_place_do_not_outweigh_those_of_the_way():
+    def image(yaw: float) -> TagPose:
+        return TagPose(tag=7, x=0.6, y=0.0, z=0.2, yaw=yaw, covariance=np.diag((1e-6, 1e-6, 4e-6)).ravel())
+
+    base, estimate = np.zeros(3), None
+    for _ in range(10):
+        estimate = seen(estimate, image(0.0), base)
+        estimate = driven(estimate, base, 0.06)
+    for _ in range(100):
+        estimate = seen(estimate, image(0.014), base)
+    assert abs(estimate.mean[2]) < 0.007
+    assert estimate.deviation > 0.002
 
 
 def test_without_a_tag_it_does_not_move():
