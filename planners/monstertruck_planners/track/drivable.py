@@ -175,28 +175,33 @@ def _chase(points: Array, radius: float, step: float, ahead: int, most: float) -
     Returns:
         The largest distance from the points (m); +inf if it exceeds ``most`` or the body does not find back.
     """
-    way = points.tolist()
-    last = len(way) - 1
-    (px, py), (x, y) = way[-2], way[-1]
-    way += [[x + i * (x - px), y + i * (y - py)] for i in range(1, ahead + 1)]
-    (x, y), (nx, ny) = way[:2]
-    yaw, reached, farthest = math.atan2(ny - y, nx - x), 0, 0.0
+    xs, ys = points.T.tolist()
+    last, most = len(xs) - 1, most * most
+    for line in (xs, ys):
+        line += [line[last] + i * (line[last] - line[last - 1]) for i in range(1, ahead + 1)]
+    x, y, yaw = xs[0], ys[0], math.atan2(ys[1] - ys[0], xs[1] - xs[0])
+    reached, farthest, tightest = 0, 0.0, 1.0 / radius
     for _ in range(3 * last):
+        nearest = (xs[reached] - x) ** 2 + (ys[reached] - y) ** 2
         # 4: points that the body may pass in one step, more than it travels: it cannot skip a part of the path
-        nearest, reached = min(
-            (math.hypot(way[i][0] - x, way[i][1] - y), i) for i in range(reached, min(reached + 4, last) + 1)
-        )
-        farthest = max(farthest, nearest)
-        if farthest > most:
-            break
+        for i in range(reached + 1, min(reached + 4, last) + 1):
+            square = (xs[i] - x) ** 2 + (ys[i] - y) ** 2
+            if square < nearest:
+                nearest, reached = square, i
+        if nearest > farthest:
+            farthest = nearest
+            if farthest > most:
+                break
         if reached == last:
-            return farthest
-        dx, dy = way[reached + ahead][0] - x, way[reached + ahead][1] - y
-        along, aside = math.cos(yaw) * dx + math.sin(yaw) * dy, math.cos(yaw) * dy - math.sin(yaw) * dx
-        curvature = 2.0 * aside / max(dx * dx + dy * dy, LEAST_STEP)
-        if along < 0.0:
-            curvature = math.copysign(1.0 / radius, aside)
-        turn = step * min(max(curvature, -1.0 / radius), 1.0 / radius)
+            return math.sqrt(farthest)
+        dx, dy = xs[reached + ahead] - x, ys[reached + ahead] - y
+        c, s = math.cos(yaw), math.sin(yaw)
+        aside = c * dy - s * dx
+        if c * dx + s * dy < 0.0:
+            curvature = math.copysign(tightest, aside)
+        else:
+            curvature = min(max(2.0 * aside / max(dx * dx + dy * dy, LEAST_STEP), -tightest), tightest)
+        turn = step * curvature
         x, y, yaw = x + step * math.cos(yaw + turn / 2), y + step * math.sin(yaw + turn / 2), yaw + turn
     return math.inf
 
