@@ -242,6 +242,7 @@ def build_goals(
         zone_margin=0.0 if config.zones is None else config.zones.margin,
         seen_for=obstacle.memory_time if obstacle.unseen == "stop" else None,
         timed=not isinstance(clock, VirtualClock),
+        speed=config.tracker.speed,
     )
     return GoalService(
         setup,

@@ -198,6 +198,7 @@ class Reason(StrEnum):
     GOAL_ACCEPTED = "goal_accepted", 0, "a goal was taken on"
     ROUTE_FOUND = "route_found", 0, "a route was planned"
     ROUTE_DEFORMED = "route_deformed", 0, "the way leads round something that stands on the route"
+    YIELDS = "yields", 0, "the robot lets a person pass"
     ROUTE_FREE = "route_free", 0, "the route is driven as it was planned again"
     WAYPOINT_PASSED = "waypoint_passed", 0, "a waypoint on the way to the goal was passed"
     RECOVERING = "recovering", 0, "a way out of trouble is tried"

@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from monstertruck_planners.local.catalog import AnyLocalPlanner
+from monstertruck_planners.local.config import PeopleConfig
 from monstertruck_planners.route.catalog import AnyRoutePlanner
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_schemas.base import NotNegative, Positive, Schema
@@ -62,6 +63,8 @@ class LocalConfig(Schema):
     """Clearance required to return to the route (m)."""
     rejoin_distance: Positive = 0.06
     """Maximum distance from the route for returning to it (m), with 0.3 m per radian of heading error."""
+    people: PeopleConfig | None = PeopleConfig()
+    """People who walk; null: they are obstacles where they are"""
     blocked_timeout: Positive = 2.0
     """Time without a path round an obstacle until the route is blocked (s)."""
     detour: Positive = 45.0

@@ -16,17 +16,26 @@ from monstertruck_estimation.slam.grid import trace
 from monstertruck_kinematics.beams import nearest_beams
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, placed, points_placed, points_relative, poses_relative
-from monstertruck_planners.collision import OCCUPIED, DistanceField, first_contact, scan_points_at
+from monstertruck_planners.collision import (
+    OCCUPIED,
+    DistanceField,
+    Footprint,
+    first_contact,
+    on_body,
+    scan_points_at,
+)
 from monstertruck_planners.goals.config import WindowConfig
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Setup, explained_within
 from monstertruck_planners.local.api import LocalPlan, LocalPlannerState, nearest_pose, pose_distance
 from monstertruck_planners.local.catalog import make_local_planner
 from monstertruck_planners.local.config import RsbandConfig, TebConfig
+from monstertruck_planners.local.people import PeopleTracker, Walker, meets
 from monstertruck_planners.pose_path import PosePath
 from monstertruck_planners.route.api import Vehicle, make_planner, warm_up
 from monstertruck_planners.route.config import HybridConfig
 from monstertruck_planners.route.motion import moved
 from monstertruck_planners.zones.shapes import ZoneLayer, in_force
+from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.reasons import Reason
@@ -110,6 +119,14 @@ class Window:
         column, row = self._corner or (0, 0)
         return column * self.config.resolution, row * self.config.resolution
 
+    def discs(self, places: Array, radius: float, footprint: Footprint, pose: Pose2) -> NDArray[np.bool_]:
+        """Return the cells within ``radius`` (m) of places (n, 2) that lie clear of a footprint at a pose."""
+        clear = ~on_body(footprint, points_relative(places, pose), radius)
+        rows, columns = np.indices(self._odds.shape)
+        middles = (np.stack((columns, rows), axis=-1) + 0.5) * self.config.resolution + self.corner
+        away = np.hypot(*np.moveaxis(middles[:, :, None] - places[clear], -1, 0))
+        return np.asarray((away < radius).any(axis=-1))
+
     def field(self, known: DistanceField | None = None, closed: NDArray[np.bool_] | None = None) -> DistanceField:
         """Return the distance field of the window.
 
@@ -164,6 +181,9 @@ class DeformStep:
         """Number of the route; 0 before the first one."""
         self._rest: PosePath | None = None
         """Rest of the route from the start of its deformation; None while the route is free."""
+        self._people: PeopleTracker | None = None
+        self._yielding: int | None = None
+        """Stamp of the first scan since which the robot would approach people (ns)."""
 
     def step(self, task: DeformTask) -> DeformAnswer:
         """Process a scan and return the result for the route.
@@ -181,13 +201,16 @@ class DeformStep:
         if task.zones is not None:
             self._layer = ZoneLayer(in_force(task.zones), self._layer)
         zones, margin = self._layer.outside(setup.footprint, task.pose), setup.zone_margin
-        points, mapped = self._observe(setup, task)
+        points, mapped, walkers = self._observe(setup, task)
         if task.route is not None:
             self._begin(task.route, task.number, drivable=task.drivable)
         if not self._number:
             return DeformAnswer(0, "idle")
         here = self._vehicle.reference_pose(task.pose)
         self._advance(here)
+        if self._yields(setup, task, here, walkers):
+            self._state = LocalPlannerState()
+            return DeformAnswer(self._number, "yields", Reason.YIELDS, place=self._place)
         if (
             self._drivable
             and self._free(setup, here, task.pose, points, mapped)
@@ -197,7 +220,9 @@ class DeformStep:
             return DeformAnswer(self._number, "free", place=self._place, complete=True)
         if self._rest is None:
             self._rest = self._guide.part(self._place, len(self._guide.poses))
-        result = self._planner.plan(self._rest, self._field(zones, margin), here, self._state)
+        result = self._planner.plan(
+            self._rest, self._field(setup, task.pose, zones, margin, walkers), here, self._state
+        )
         self._state = result.state
         return self._answer(result)
 
@@ -211,6 +236,9 @@ class DeformStep:
         )
         self._planner = make_local_planner(self._vehicle, config.local_planner)
         self._window = Window(config.local.window)
+        people = config.local.people
+        self._people = None if people is None else PeopleTracker(people)
+        self._yielding = None
         if config.map is not None:
             self._walls = _walls_of(config.map)
 
@@ -220,24 +248,67 @@ class DeformStep:
         self._travelled = self._guide.travelled
         self._rest, self._state = None, LocalPlannerState()
 
-    def _observe(self, setup: Setup, task: DeformTask) -> tuple[Array, NDArray[np.bool_]]:
-        """Add a scan to the window; return the obstacles in base, and which of them the map explains.
+    def _observe(self, setup: Setup, task: DeformTask) -> tuple[Array, NDArray[np.bool_], tuple[Walker, ...]]:
+        """Add a scan to the window; return the obstacles in base, which of them the map explains, and the walkers.
 
-        The obstacles are the scan points and, outside the view of the lidar and at blind beams, earlier ones.
+        The obstacles are the scan points and, outside the view of the lidar and at blind beams, earlier ones. Walkers
+        are none while the robot lets them pass.
         """
         pose, points = task.pose, scan_points_at(task.scan, setup.lidar, task.stamp, task.twist)
         (sensor,) = placed(np.array([setup.lidar]), pose)
         ends = points_placed(points, pose)
-        self._window.add_scan((sensor[0], sensor[1]), pose[:2], ends, np.ones(len(points), np.bool_))
+        mapped = self._mapped(setup, task, ends)
+        walkers, walking = self._walkers(setup, task, ends, mapped, sensor[:2])
+        self._window.add_scan((sensor[0], sensor[1]), pose[:2], ends, ~walking)
         before = self._window.obstacles
         beams = _beams(points_relative(before, tuple(sensor)), task.scan)
         hidden = np.isin(beams, blind_beams(task.scan)) | (beams >= len(task.scan.codes))
-        ends = np.vstack((ends, before[hidden]))
-        points = np.vstack((points, points_relative(before[hidden], pose)))
+        points = np.vstack((points[~walking], points_relative(before[hidden], pose)))
+        return points, np.concatenate((mapped[~walking], self._mapped(setup, task, before[hidden]))), walkers
+
+    def _mapped(self, setup: Setup, task: DeformTask, ends: Array) -> NDArray[np.bool_]:
+        """Whether the map explains each point (n, 2) of its frame."""
         if self._walls is None:
-            return points, np.zeros(len(points), np.bool_)
+            return np.zeros(len(ends), np.bool_)
         tolerance = explained_within(setup.config, task.deviation) + self._walls.resolution / 2
-        return points, np.asarray(self._walls.lookup(ends) <= tolerance)
+        return np.asarray(self._walls.lookup(ends) <= tolerance)
+
+    def _walkers(
+        self, setup: Setup, task: DeformTask, ends: Array, mapped: NDArray[np.bool_], sensor: Array
+    ) -> tuple[tuple[Walker, ...], NDArray[np.bool_]]:
+        """Return the people who walk, and the points of those who are no obstacles where they are."""
+        none = np.zeros(len(ends), np.bool_)
+        if self._people is None:
+            return (), none
+        walkers, walking = self._people.observe(task.scan.stamp, ends, mapped, sensor)
+        return walkers, walking if self._waits(setup, task) else none
+
+    def _waits(self, setup: Setup, task: DeformTask) -> bool:
+        people, since = setup.config.local.people, self._yielding
+        return since is None or (people is not None and task.scan.stamp - since <= people.patience * SECOND)
+
+    def _yields(self, setup: Setup, task: DeformTask, here: Array, walkers: tuple[Walker, ...]) -> bool:
+        """Whether the robot stands to let people pass whom it would approach."""
+        people = setup.config.local.people
+        if people is None or not walkers:
+            self._yielding = None
+            return False
+        reach = setup.speed * people.horizon
+        ahead = self._ahead(here, reach)
+        if self._rest is not None and self._state.path is not None:
+            ahead = moved(self._state.path.part(0.0, reach).sample(0.05).poses, -self._vehicle.reference)
+        times = np.linspace(0.0, people.horizon, 9)
+        travelled = np.concatenate(((0.0,), np.cumsum(np.hypot(*np.diff(ahead[:, :2], axis=0).T))))
+        poses = ahead[np.minimum(np.searchsorted(travelled, setup.speed * times), len(ahead) - 1)]
+        poses[0] = task.pose
+        met = meets(walkers, poses, times, setup.footprint, people.distance, people.spread)
+        if met and self._yielding is None:
+            self._yielding = task.scan.stamp
+        # Once its patience has ended, the robot waits again when all people stand or have left.
+        waits = self._waits(setup, task)
+        if waits and not met:
+            self._yielding = None
+        return met and waits
 
     def _advance(self, here: Array) -> None:
         """Find the truck's place on the route, near the last place and not beyond a cusp it has not reached."""
@@ -281,13 +352,21 @@ class DeformStep:
         end = int(np.searchsorted(self._travelled, self._travelled[at] + reach)) + 1
         return moved(np.vstack((here, self._guide.poses[at + 1 : end])), -self._vehicle.reference)
 
-    def _field(self, zones: ZoneLayer, margin: float) -> DistanceField:
-        """Return the distance field of the window, the map's obstacles and the zones."""
+    def _field(
+        self, setup: Setup, pose: Pose2, zones: ZoneLayer, margin: float, walkers: tuple[Walker, ...]
+    ) -> DistanceField:
+        """Return the distance field of the window, the map's obstacles, the zones and where people will be."""
         window = self._window
-        closed = None
+        closed = np.zeros(window.cells.shape, np.bool_)
         if zones.shapes:
             corner = (*window.corner, 0.0)
-            closed = zones.keepout_cells(window.cells.shape, window.config.resolution, corner, margin)
+            closed |= zones.keepout_cells(window.cells.shape, window.config.resolution, corner, margin)
+        people = setup.config.local.people
+        if people is not None:
+            for walker in walkers:
+                # Paths lead behind a person: the ground ahead of him is closed as far as he walks in that time.
+                places = walker.at(np.linspace(0.0, people.horizon, 9))
+                closed |= window.discs(places, walker.radius + setup.config.local.clearance, setup.footprint, pose)
         return window.field(self._walls, closed)
 
     def _answer(self, result: LocalPlan) -> DeformAnswer:

@@ -145,6 +145,11 @@ class RouteDeformation:
         """Whether there is currently no path round the obstacle."""
         return self._finding == "blocked"
 
+    @property
+    def yields(self) -> bool:
+        """Whether the truck lets a person pass."""
+        return self._finding == "yields"
+
     def blocked(self, now: int) -> bool:
         """Whether the route is blocked: no path round the obstacle for some time, or a detour that takes too long."""
         return (self.held_up and now - self._since > self._local.blocked_timeout * SECOND) or (
@@ -215,7 +220,9 @@ def event_of(was: Finding, answer: DeformAnswer) -> tuple[Reason, Severity, str]
     match answer.finding:
         case "blocked" if was != "blocked":
             return answer.reason, Severity.WARNING, f"no way round what stands on the route ({text})"
-        case "new" if was in ("idle", "free", "blocked"):
+        case "yields" if was != "yields":
+            return Reason.YIELDS, Severity.INFO, Reason.YIELDS.text
+        case "new" if was in ("idle", "free", "blocked", "yields"):
             partly = answer.reason is Reason.PATH_PARTIAL
             how = f"only so far ({text})" if partly else "round what stands on it"
             return Reason.ROUTE_DEFORMED, Severity.INFO, f"the route is deformed, {how}"

@@ -37,6 +37,8 @@ class Setup:
     """Maximum age of seen ground in the gate (s); None if the gate lets the robot reverse anywhere."""
     timed: bool = False
     """Whether the time budget limits the route planner, or else its effort budget; only the latter is reproducible."""
+    speed: float = 0.18
+    """Speed of the tracker on a straight path (m/s)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +142,8 @@ class DeformTask:
     """Zones of the map, if newer than with the previous scan."""
 
 
-Finding = Literal["idle", "free", "kept", "new", "blocked"]
-"""No route yet; route free; deformed path kept; new deformed path; no path found."""
+Finding = Literal["idle", "free", "kept", "new", "blocked", "yields"]
+"""No route yet; route free; deformed path kept; new deformed path; no path found; the robot lets a person pass."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -101,6 +101,8 @@ class Observations:
     """Remaining length of the route (m)."""
     blocked: bool = False
     """Whether the latest scan shows an obstacle on the path ahead."""
+    yields: bool = False
+    """Whether the truck stands to let a person pass."""
     unseen: bool = False
     """Whether the gate stops the truck before ground that no sensor has seen."""
     estopped: bool = False
@@ -258,8 +260,8 @@ def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
     if observed.outcome is not None and observed.outcome in LEFT:
         report = Report(observed.outcome, Severity.WARNING, f"goal {run.number}: plans anew")
         return _with(_plan(run, config), report)
-    if observed.along > run.best + config.progress:
-        run = replace(run, best=observed.along, moved=observed.now)
+    if observed.along > run.best + config.progress or observed.yields:
+        run = replace(run, best=max(run.best, observed.along), moved=observed.now)
     if not backing:
         run = _progressed(run, observed.left, config)
     run = replace(run, blocked_scans=run.blocked_scans + 1 if observed.blocked or observed.unseen else 0)

@@ -310,6 +310,7 @@ class GoalService:
             along=along if followed is None else followed.before + along,
             left=self._left(followed, along),
             blocked=odometry is not None and followed is not None and self._blocked(followed, along, odometry, now),
+            yields=self._deformation is not None and self._deformation.yields,
             unseen=gate is not None and followed is not None and Reason.UNSEEN_STOP in gate.reasons,
             held="" if gate is None else in_words(gate.hindrances),
         )
@@ -474,8 +475,8 @@ class GoalService:
             self._paths.follow(answer.path, f"{name}-deformed", before)
         elif answer.finding == "free" and was not in ("idle", "free"):
             self._paths.follow(deformation.rest, name, before)
-        elif answer.finding == "blocked" and was != "blocked":
-            self._paths.brake(f"{name}-held-up")
+        elif answer.finding in ("blocked", "yields") and was != answer.finding:
+            self._paths.brake(f"{name}-{'held-up' if answer.finding == 'blocked' else 'yields'}")
         if (event := event_of(was, answer)) is not None:
             reason, severity, text = event
             self._out.events(reason, severity, self.name, f"goal {run.number}: {text}", goal=run.number)

@@ -34,6 +34,21 @@ class BandConfig(Schema):
     """Clearance beyond which obstacles exert no force, m."""
 
 
+class PeopleConfig(Schema):
+    """People who walk near the robot."""
+
+    speed: Positive = 0.25
+    """Least speed of a person who walks (m/s); slower things are obstacles where they stand."""
+    horizon: Annotated[float, Field(gt=0, le=5)] = 2.0
+    """Time over which people are predicted along their motion (s)"""
+    distance: NotNegative = 0.2
+    """Distance kept from their predicted places (m)."""
+    spread: NotNegative = 0.1
+    """Growth of that distance with the time predicted (m/s)."""
+    patience: Positive = 8.0
+    """Time for which the robot lets people pass (s); then it goes on, and they are obstacles where they are."""
+
+
 class LocalPlannerConfig(Schema):
     """Shared by all local planners."""
 

@@ -52,10 +52,10 @@ def seen(estimate: TagEstimate | None, tag: TagPose, base: Array) -> TagEstimate
     # The error that the images of a place share (m, m, rad): half a degree, found at a quarter of full light with a
     # gradient across the image. Each image adds what it tells beyond the images of its place before.
     own, shared = tag.covariance.reshape(3, 3), np.diag(np.square((0.001, 0.001, 0.009)))
-    told = np.linalg.inv(own / here + shared)
+    added = np.linalg.inv(own / here + shared)
     if here > 1:
-        told -= np.linalg.inv(own / (here - 1) + shared)
-    spread = by_local @ np.linalg.inv(told) @ by_local.T
+        added -= np.linalg.inv(own / (here - 1) + shared)
+    spread = by_local @ np.linalg.inv(added) @ by_local.T
     if estimate is None:
         return TagEstimate(place, spread)
     gain = estimate.covariance @ np.linalg.inv(estimate.covariance + spread)

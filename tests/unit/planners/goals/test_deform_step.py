@@ -8,11 +8,12 @@ import pytest
 
 from monstertruck_kinematics.truck import FourWheelSteering
 from monstertruck_planners.collision import Footprint
-from monstertruck_planners.goals.config import PlannerConfig
+from monstertruck_planners.goals.config import LocalConfig, PlannerConfig
 from monstertruck_planners.goals.deform_step import DeformStep, blind_beams
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Setup
-from monstertruck_planners.local.config import RsbandConfig
+from monstertruck_planners.local.config import PeopleConfig, RsbandConfig
 from monstertruck_planners.pose_path import PosePath
+from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.reasons import Reason
@@ -202,3 +203,40 @@ def test_a_setup_with_a_deformer_comes_first():
         step.step(DeformTask(first.scan, ORIGIN, setup))
     assert first.setup is not None
     assert step.step(DeformTask(first.scan, ORIGIN, first.setup)).finding == "idle"
+
+
+def among(person: tuple[tuple[float, float], tuple[float, float]], **people: float) -> list[str]:
+    """Findings within 4 s of a robot that stands at the start of its route while a person (place, velocity) walks."""
+    step, first = begun()
+    assert first.setup is not None
+    local = LocalConfig(people=PeopleConfig(**people))
+    config = first.setup.config.model_copy(update={"local": local})
+    step.step(replace(first, setup=replace(first.setup, config=config)))
+    (x, y), (vx, vy) = person
+    findings = []
+    for i in range(40):
+        px, py = x + vx * i / 10, y + vy * i / 10
+        box = (px - 0.15, py - 0.15, px + 0.15, py + 0.15)
+        seen = scan_of(ORIGIN, box).model_copy(update={"stamp": SECOND + i * SECOND // 10})
+        findings.append(step.step(DeformTask(seen, ORIGIN)).finding)
+    return findings
+
+
+def test_it_lets_a_person_pass_who_crosses_and_goes_on_behind_him():
+    findings = among(((0.8, -1.6), (0.0, 0.8)))
+    assert "yields" in findings
+    assert findings[-1] == "free"
+    assert set(findings) == {"free", "yields"}
+    assert 1.2 <= findings.count("yields") / 10 <= 3.0
+
+
+def test_a_person_who_walks_ahead_or_crosses_far_ahead_deforms_nothing():
+    assert set(among(((0.9, 0.0), (0.6, 0.0)))[8:]) == {"free"}
+    assert set(among(((1.4, -1.0), (0.0, 0.8)))[8:]) == {"free"}
+
+
+def test_its_patience_ends_and_then_a_person_is_an_obstacle():
+    findings = among(((0.8, -1.6), (0.0, 0.8)), patience=0.5)
+    assert findings.count("yields") <= 6
+    after = findings[findings.index("yields") :]
+    assert {"new", "blocked"} & set(after), "the person was no obstacle any more"

@@ -171,6 +171,9 @@ def test_a_detour_without_end_is_blocked_too():
         ("blocked", BLOCKED, None),
         ("kept", FREE, Reason.ROUTE_FREE),
         ("idle", FREE, None),
+        ("free", DeformAnswer(1, "yields"), Reason.YIELDS),
+        ("yields", DeformAnswer(1, "yields"), None),
+        ("yields", FREE, Reason.ROUTE_FREE),
     ],
 )
 def test_changes_are_reported_once(was: Finding, answer: DeformAnswer, reason: Reason | None):

@@ -156,6 +156,13 @@ def test_an_obstacle_on_the_way_is_planned_round_while_the_truck_drives_on():
     assert (reported(actions), Plan() in actions, Halt() in actions) == ([Reason.PATH_BLOCKED], True, False)
 
 
+def test_it_is_not_stuck_while_it_lets_people_pass():
+    run = SteppedRun()
+    run.step(answer=WAY)
+    assert run.step(round(3 * CONFIG.stuck / 0.1), yields=True) == ()
+    assert run.phase is GoalPhase.DRIVING
+
+
 def test_before_unseen_ground_it_plans_anew_and_at_last_gives_up():
     run = SteppedRun(PlannerConfig(recovery=("replan",)))
     run.step(answer=WAY)

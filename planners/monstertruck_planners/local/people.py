@@ -1,0 +1,173 @@
+"""People who walk near the robot: found in scans, followed, and predicted along their motion (pure).
+
+A group of neighbouring returns, as narrow as a person and hidden by nothing in front of it, is followed from scan to
+scan. It counts as a walker once it moves. Everything else stays an obstacle where it stands.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import points_relative
+from monstertruck_planners.collision import Footprint
+from monstertruck_planners.local.config import PeopleConfig
+from monstertruck_runtime.clock import SECOND
+
+GAP: Final = 0.3
+"""Greatest distance of neighbouring returns of one person (m): two legs."""
+MEMORY: Final = 0.8
+"""Time over which a velocity is measured (s)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Walker:
+    """A person who walks, as a disc."""
+
+    place: tuple[float, float]
+    """Centre (m)."""
+    velocity: tuple[float, float]
+    """In m/s."""
+    radius: float
+    """In m."""
+
+    def at(self, times: Array) -> Array:
+        """Return the predicted centres at times from now (s), shape (n, 2), m."""
+        return np.asarray(np.array(self.place) + times[:, None] * self.velocity)
+
+
+@dataclass(eq=False)
+class _PersonTrack:
+    """Places of one group of returns."""
+
+    rows: deque[tuple[int, float, float]] = field(default_factory=deque)
+    """Stamp (ns) and centre (m)."""
+    radius: float = 0.0
+
+    def place(self, stamp: int) -> tuple[float, float]:
+        """Return the place at a stamp, predicted by the measured velocity."""
+        at, x, y = self.rows[-1]
+        vx, vy = self.velocity()
+        passed = (stamp - at) / SECOND
+        return x + vx * passed, y + vy * passed
+
+    def velocity(self) -> tuple[float, float]:
+        """Return the velocity (m/s); 0 for a track shorter than half the memory."""
+        t, x, y = np.array(self.rows, dtype=float).T
+        t = (t - t[-1]) / SECOND
+        if t[0] > -MEMORY / 2:
+            return 0.0, 0.0
+        off = t - t.mean()
+        return float(off @ x / (off @ off)), float(off @ y / (off @ off))
+
+
+class PeopleTracker:
+    """Follows the people around the robot.
+
+    Args:
+        config: what counts as a walker.
+    """
+
+    def __init__(self, config: PeopleConfig) -> None:
+        self._config = config
+        self._tracks: list[_PersonTrack] = []
+
+    def observe(
+        self, stamp: int, points: Array, mapped: NDArray[np.bool_], sensor: Array
+    ) -> tuple[tuple[Walker, ...], NDArray[np.bool_]]:
+        """Take a scan.
+
+        Args:
+            stamp: of the scan (ns).
+            points: returns in the frame of the map, in the order of the beams, shape (n, 2), m.
+            mapped: whether the map explains each point, shape (n,).
+            sensor: place of the lidar, shape (2,), m.
+
+        Returns:
+            The walkers, and whether each point belongs to one, shape (n,).
+        """
+        known, self._tracks = self._tracks, []
+        walkers, walking = [], np.zeros(len(points), np.bool_)
+        for group in _groups(points, mapped, sensor):
+            ends = points[group[[0, -1]]]
+            x, y = ends.mean(axis=0).tolist()
+            track = _nearest(known, stamp, (x, y))
+            if track is None:
+                track = _PersonTrack()
+            else:
+                known.remove(track)
+            track.rows.append((stamp, x, y))
+            track.radius = max(track.radius, math.dist(*ends) / 2)
+            while stamp - track.rows[0][0] > MEMORY * SECOND:
+                track.rows.popleft()
+            self._tracks.append(track)
+            velocity = track.velocity()
+            if math.hypot(*velocity) >= self._config.speed:
+                walkers.append(Walker((x, y), velocity, track.radius))
+                walking[group] = True
+        # A person who is hidden for a moment is still there.
+        self._tracks += [track for track in known if stamp - track.rows[-1][0] < MEMORY / 2 * SECOND]
+        return tuple(walkers), walking
+
+
+def _groups(points: Array, mapped: NDArray[np.bool_], sensor: Array) -> Iterator[NDArray[np.intp]]:
+    """Yield the indices of each group of points that may be a person."""
+    new = np.flatnonzero(~mapped)
+    cuts = np.flatnonzero(np.hypot(*np.diff(points[new], axis=0).T) > GAP) + 1
+    ranges = np.hypot(*(points - sensor).T)
+    for group in np.split(new, cuts):
+        # 0.8: greatest width of a person with a load, m
+        if len(group) < 2 or math.dist(*points[group[[0, -1]]]) > 0.8:
+            continue
+        first, last = int(group[0]), int(group[-1])
+        before, after = ranges[max(first - 1, 0)], ranges[min(last + 1, len(points) - 1)]
+        # 0.1: noise and roundness of a person, m
+        if before > ranges[first] - 0.1 and after > ranges[last] - 0.1:
+            yield group
+
+
+def _nearest(tracks: Sequence[_PersonTrack], stamp: int, place: tuple[float, float]) -> _PersonTrack | None:
+    """Return the track whose predicted place is nearest, within the gap of a person's returns."""
+    near = [(math.dist(track.place(stamp), place), i) for i, track in enumerate(tracks)]
+    far, i = min(near, default=(math.inf, 0))
+    return tracks[i] if far < GAP else None
+
+
+def meets(
+    walkers: Sequence[Walker], poses: Array, times: Array, footprint: Footprint, distance: float, spread: float
+) -> bool:
+    """Whether a robot comes nearer than it may to somebody who walks on as predicted.
+
+    A robot that stands, or that moves away from a person, does not approach.
+
+    Args:
+        walkers: people.
+        poses: planned poses of base at the times, from now on, shape (n, 3).
+        times: from now (s), shape (n,).
+        footprint: outline.
+        distance: kept between outline and person (m).
+        spread: growth of a person's disc with time (m/s).
+    """
+    here = tuple(poses[0].tolist())
+    for walker in walkers:
+        places = walker.at(times)
+        limits = distance + walker.radius + spread * times
+        away = np.array([_beyond(footprint, places[i], poses[i]) for i in range(len(times))])
+        standing = np.array([_beyond(footprint, place, here) for place in places])
+        if ((away < limits) & (away < standing - 1e-3)).any():
+            return True
+    return False
+
+
+def _beyond(footprint: Footprint, point: Array, pose: Array | tuple[float, ...]) -> float:
+    """Return the distance of a point (2,) from the outline at a pose (m); 0 inside."""
+    x, y, yaw = (float(value) for value in pose)
+    ((along, across),) = points_relative(point[None], (x, y, yaw)).tolist()
+    return math.hypot(
+        max(abs(along - footprint.offset) - footprint.half_length, 0.0), max(abs(across) - footprint.half_width, 0.0)
+    )
