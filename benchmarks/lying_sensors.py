@@ -324,6 +324,7 @@ def quiet(name: str, seconds: float, overlay: dict[str, Any]) -> Quiet:
                 before = truth
         said = compared.drain()
         alarms = dict.fromkeys(f"{doubt.sensor}: {doubt.text}" for message in said for doubt in message.doubts)
+        alarms |= dict.fromkeys("stands while its wheels roll" for message in said if message.standing is not None)
         return Quiet(tuple(alarms), said[-1].measures, driven)
 
     return run_virtual(main, start=SECOND)
@@ -405,6 +406,8 @@ def replayed(log: Recording) -> tuple[list[str], float, float]:
         monitor.observe_scan(output)
         if monitor.unshown is not None:
             alarms.append(f"{seconds - 1.0:.1f} s: moves {monitor.unshown.distance:.2f} m while its wheels stand")
+        if (body := monitor.standing) is not None:
+            alarms.append(f"{seconds - 1.0:.1f} s: stands while its wheels roll {body.rolled:.2f} m")
         if found := monitor.findings():
             alarms += [f"{seconds - 1.0:.1f} s: {doubt.sensor}: {doubt.text}" for doubt in found]
             monitor.activate(stamp)

@@ -1,10 +1,10 @@
 """Detects contact while an operator drives into ground that no sensor has seen, and backs off.
 
-Three measures show that an obstacle holds the body while its wheels are driven: a motor draws more than its rolling
-current, a shaft or a free wheel is slower than commanded, or the body turns less than commanded. The gate compares them
-only while the commanded motion is steady, because a motor that accelerates its gears draws as much current as a motor
-that pushes. After a contact the gate reverses the last motion for a few centimetres. Then the robot stands until the
-operator releases the stick or requests another direction.
+Four measures show that an obstacle holds the body while its wheels are driven: a motor draws more than its rolling
+current, a shaft or a free wheel is slower than commanded, the body turns less than commanded, or the scans show a body
+that stands while its wheels roll. The gate compares them only while the commanded motion is steady, because a motor
+that accelerates its gears draws as much current as a motor that pushes. After a contact the gate reverses the last
+motion for a few centimetres. Then the robot stands until the operator releases the stick or requests another direction.
 """
 
 import math
@@ -21,7 +21,8 @@ from monstertruck_schemas.event import Measurement
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveRequest
 from monstertruck_schemas.sensor import DriveFeedback, DriveMode, Imu, WheelEncoders
-from monstertruck_schemas.topics import DRIVES, ENCODERS, IMU, Topic
+from monstertruck_schemas.state import Consistency, StandingBody
+from monstertruck_schemas.topics import CONSISTENCY, DRIVES, ENCODERS, IMU, Topic
 from monstertruckd.gate.checks import Check, GateView, PaceLimit, Tick
 from monstertruckd.gate.config import ContactConfig
 from monstertruckd.gate.motion import Course, scaled
@@ -64,7 +65,7 @@ class ContactCheck(Check):
     """
 
     reasons = (Reason.CONTACT,)
-    reads = (IMU, ENCODERS)
+    reads = (IMU, ENCODERS, CONSISTENCY)
 
     def __init__(self, view: GateView, config: ContactConfig) -> None:
         super().__init__(view)
@@ -98,6 +99,9 @@ class ContactCheck(Check):
                 self._take_encoders(seen)
             case Imu():
                 self._take_gyro(seen)
+            case Consistency(standing=StandingBody() as body) if self._driven(body.since):
+                least = self._config.share * body.rolled
+                self._touch(ContactFinding("distance by the scans", body.shown, "m", least), seen.received)
 
     def instead(self, request: DriveRequest, now: int) -> DriveRequest:
         """Return the request to be driven: the holder's request or, after a contact, its opposite."""

@@ -281,7 +281,7 @@ class ObstacleGuard:
             ground, before = sweep.ground[unknown], sweep.before[unknown]
             if _on_the_spot(*twist[:2]):
                 self._free = float(before[_near(ground, measured[near], depth)].min(initial=self._free))
-            elif twist[0] < 0:
+            elif twist[0] < 0 or _is_sideways(twist, self._footprint):
                 self._stop_before(twist, before)
                 continue
             elif _is_ahead(twist):
@@ -448,6 +448,12 @@ def _near(points: Array, others: Array, within: float) -> NDArray[np.bool_]:
 def _is_ahead(twist: _Steps) -> bool:
     """Whether a motion leads into the lidar's field of view."""
     return twist[0] * TWIST_STEP >= AHEAD
+
+
+def _is_sideways(twist: _Steps, body: Footprint) -> bool:
+    """Whether a whole side of the body moves outwards: the centre of rotation lies neither beside nor under it."""
+    _, y, turn = twist
+    return y != 0 and abs(y + turn * body.offset) >= abs(turn) * body.half_length
 
 
 def _finite(value: float) -> float | None:

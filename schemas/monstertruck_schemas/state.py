@@ -191,6 +191,19 @@ class UnshownMotion(Schema):
     """Turn since then, rad."""
 
 
+class StandingBody(Schema):
+    """Evidence by the scans that the body stands although its wheels roll; a turn of 1 rad counts as 1 m."""
+
+    since: Nanoseconds
+    """Stamp of the latest scan before it stood."""
+    stamp: Nanoseconds
+    """Stamp of the latest scan."""
+    rolled: Annotated[float, Field(ge=0)]
+    """Distance by the wheels since then, m."""
+    shown: float
+    """Distance by the scans since then, in the direction of the wheels' motion, m."""
+
+
 class Consistency(Message):
     """Comparison of the robot's independent measures of motion. Retained."""
 
@@ -203,6 +216,8 @@ class Consistency(Message):
     """Scan odometry in use: kiss or own; None if there is none."""
     unshown: UnshownMotion | None = None
     """Motion of the body that the wheels do not show, or None."""
+    standing: StandingBody | None = None
+    """Evidence that the body stands although its wheels roll, or None."""
 
 
 class GateMode(StrEnum):

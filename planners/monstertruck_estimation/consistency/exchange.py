@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 from typing import Final
 
+from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.delay import SIGMAS, Delay, LagQuestion
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.se2 import Pose2
+from monstertruck_schemas.state import StandingBody
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +39,9 @@ class StepInput:
     """Claim that the robot stands, as far as its wheels do."""
     rolled: Pose2 | None = None
     """Motion by the wheels since the previous scan; None if unknown."""
+    slip: float = ConsistencyConfig().slip
+    delay: float = ConsistencyConfig().delay
+    """See ``ConsistencyConfig``."""
 
 
 REFUTING: Final = 12
@@ -106,6 +111,8 @@ class StepOutput:
     """Change of scale since an earlier revolution, as a factor on the ranges; None without a change."""
     front: str = ""
     """Scan odometry in use."""
+    stands: StandingBody | None = None
+    """Evidence that the body stands although its wheels roll; None without."""
     delay: Delay | None = None
     """Answer to the question about the lag."""
 

@@ -33,7 +33,7 @@ from monstertruck_estimation.wheel_motion import WheelIncrement
 from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.state import Doubt, DoubtKind, UnshownMotion
+from monstertruck_schemas.state import Doubt, DoubtKind, StandingBody, UnshownMotion
 
 WINDOWS: Final = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0)
 """Times over which motions are compared, up to the configured one (s)."""
@@ -90,6 +90,8 @@ class ConsistencyMonitor:
         self._resting: RestWatch | None = None
         if {Measure.WHEELS, Measure.SCANS} <= sensors.keys():
             self._resting = RestWatch(self._tracks[Measure.WHEELS], config.slip)
+        self.standing: StandingBody | None = None
+        """Evidence by the latest scan that the body stands although its wheels roll; None without."""
         self._pending: _OpenDisagreement | None = None
         self._asked = 0
         self._found: dict[str, Doubt] = {}
@@ -180,6 +182,7 @@ class ConsistencyMonitor:
             while output.stamp - self._steps[0].since > delay_over:
                 self._steps.popleft()
         self._scans.append(output.stamp)
+        self.standing = output.stands
         if self._resting is not None:
             self._resting.observe(output)
         if output.verdict is not None and self._pending is not None:

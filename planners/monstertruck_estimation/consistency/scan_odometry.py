@@ -18,12 +18,14 @@ from monstertruck_estimation.consistency.delay import scan_delay
 from monstertruck_estimation.consistency.exchange import Claim, RestEvidence, ScanVerdict, StepInput, StepOutput
 from monstertruck_estimation.consistency.rest_proof import rest_evidence
 from monstertruck_estimation.consistency.scale import Revolution, ScaleWatch
+from monstertruck_estimation.consistency.standing import StandingWatch, place_covariance, spread
 from monstertruck_estimation.consistency.tracks import KEPT
 from monstertruck_estimation.slam.registration import Cloud, Fit, fitting, measure, register
 from monstertruck_estimation.slam.scans import Scan, prepare_input, scans_in_a_room
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.state import StandingBody
 
 GAP: Final = 1.5
 """Maximum time between scans that are compared (s)."""
@@ -79,6 +81,7 @@ class ScanMotionStep:
         """Reference scan of the registration, and its pose."""
         self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=128)  # number of scans kept for claims
         """Stamp, scan and its pose."""
+        self._standing: StandingWatch | None = None
 
     def step(self, inputs: StepInput) -> StepOutput:
         """Take one scan."""
@@ -106,22 +109,23 @@ class ScanMotionStep:
             self._last = None
             self._scale.begin(None)
             return StepOutput(stamp, None, front=name)
-        found = None
+        cloud, found = Cloud.of(whole), None
         if last is not None and 0.0 < dt < GAP:
-            found = self._found(front, scan, whole, last[1], lasting)
-        cloud = Cloud.of(whole)
+            found = self._found(front, scan, whole, cloud, last[1], lasting)
         self._last = stamp, cloud
         factor = self._scale_change(inputs, whole, dt, [lasting if found is None else found[0], np.zeros(3)])
         if found is None or last is None:
-            self._begin(front, scan, self._pose)
+            self._begin(front, scan, cloud, self._pose)
             self._motions.clear()
+            self._standing = None
             self._changes.clear()
             self._kept.clear()
             self._kept.append((stamp, whole, self._pose))
             return StepOutput(stamp, None, scale=factor, front=name)
-        motion, overlap, deviations = found
+        motion, overlap, fit, widened = found
+        deviations = deviations_of(fit)
         self._pose = compose(self._pose, motion)
-        self._keep(front, scan)
+        self._keep(front, scan, cloud)
         if follows:
             changed = motion - lasting
             self._changes.append((float(changed[:2] @ changed[:2]), float(changed[2] ** 2)))
@@ -132,7 +136,17 @@ class ScanMotionStep:
         verdict, rest = self._judged(whole, inputs.claim), self._evidence(whole, inputs)
         x, y, yaw = motion.tolist()
         scatter = scatter_of(self._changes)
-        return StepOutput(stamp, last[0], (x, y, yaw), deviations, scatter, overlap, verdict, rest, factor, name)
+        stands = self._stands(inputs, last[0], motion, place_covariance(fit, widened))
+        return StepOutput(
+            stamp, last[0], (x, y, yaw), deviations, scatter, overlap, verdict, rest, factor, name, stands
+        )
+
+    def _stands(self, inputs: StepInput, since: int, motion: Array, covariance: Array) -> StandingBody | None:
+        if inputs.rolled is None:
+            self._standing = None
+            return None
+        self._standing = self._standing or StandingWatch(inputs.slip, inputs.delay)
+        return self._standing.observe(since, inputs.scan.stamp, np.array(inputs.rolled), motion, covariance)
 
     def _scale_change(self, inputs: StepInput, whole: Scan, dt: float, motions: list[Array]) -> float | None:
         newest = Revolution(whole, inputs.scan.mount[:2])
@@ -141,47 +155,47 @@ class ScanMotionStep:
             return None
         return self._scale.change(newest, [*motions, np.array(inputs.rolled)])
 
-    def _begin(self, front: KissFront | None, scan: Scan, pose: Array) -> None:
-        self._reference = Cloud.of(scan), pose
+    def _begin(self, front: KissFront | None, scan: Scan, cloud: Cloud, pose: Array) -> None:
+        self._reference = cloud, pose
         if front is not None:
             front.begin(scan, pose)
 
-    def _keep(self, front: KissFront | None, scan: Scan) -> None:
+    def _keep(self, front: KissFront | None, scan: Scan, whole: Cloud) -> None:
         if front is not None:
             front.keep(scan, self._pose)
         assert self._reference is not None
         moved = between(self._reference[1], self._pose)
         keep_way = 0.3  # maximum distance from the reference scan, m
         if math.hypot(moved[0], moved[1]) > keep_way or abs(moved[2]) > 0.35:  # maximum turn, rad
-            self._reference = Cloud.of(scan), self._pose
+            self._reference = whole, self._pose
 
     def _found(
-        self, front: KissFront | None, scan: Scan, whole: Scan, before: Cloud, lasting: Array
-    ) -> tuple[Array, float, tuple[float, float]] | None:
-        """Return the motion since the previous scan, its overlap and deviations; None if no motion fits.
+        self, front: KissFront | None, scan: Scan, whole: Scan, cloud: Cloud, before: Cloud, lasting: Array
+    ) -> tuple[Array, float, Fit, float] | None:
+        """Return the motion since the previous scan, its overlap, fit and ``spread``; None if no motion fits.
 
         kiss-icp's pairs of points on walls along the path hold the robot back by up to 0.1 m while it starts moving:
         its pose is only the start of the registration to the reference, whose pairs slide along surfaces.
         """
         assert self._reference is not None
-        cloud, origin = self._reference
+        reference, origin = self._reference
         guess = compose(self._pose, lasting)
         if front is not None:
             guess = front.match(scan, guess)
-        fit = register(scan, cloud, between(origin, guess)) if np.isfinite(guess).all() else None
+        fit = register(whole, reference, between(origin, guess)) if np.isfinite(guess).all() else None
         fits = 0.5  # minimum overlap of a valid motion with the previous scan
         if fit is not None and np.isfinite(fit.pose).all():
             motion = between(self._pose, compose(origin, fit.pose))
             overlap = measure(whole, before, motion).overlap
             if overlap >= fits:
-                return motion, overlap, deviations_of(fit)
+                return motion, overlap, fit, spread(fit, whole, reference)
         # The velocity has changed, or the map holds objects that have gone.
         tries = [register(whole, before, start) for start in (np.zeros(3), lasting)]
         best = max(tries, key=lambda fit: fit.overlap)
         if best.overlap < fits:
             return None
-        self._begin(front, scan, compose(self._pose, best.pose))
-        return best.pose, best.overlap, deviations_of(best)
+        self._begin(front, scan, cloud, compose(self._pose, best.pose))
+        return best.pose, best.overlap, best, spread(best, whole, before)
 
     def _since(self, claim: Claim | None) -> tuple[int, Scan, Array] | None:
         return None if claim is None else next((kept for kept in self._kept if kept[0] == claim.since), None)

@@ -123,6 +123,8 @@ class ConsistencyService:
         self._active = False
         self._anew = False
         """Whether the scan odometry must forget its past."""
+        self._tilted = False
+        """Whether the plane of the latest scan was tilted."""
         self._front: str | None = None
         self._published: tuple[object, ...] = ()
         self._published_at = 0
@@ -224,7 +226,8 @@ class ConsistencyService:
                 self.monitor.observe_whole(DeviceRole.LIDAR, scan.stamp, whole)
                 work = self._work(setup, scan)
                 if work is None:
-                    self.monitor.observe_scan(StepOutput(scan.stamp, None))
+                    if self._anew:
+                        self.monitor.observe_scan(StepOutput(scan.stamp, None))
                     continue
                 output: StepOutput = await actor.step(work)
                 self._front = output.front
@@ -232,11 +235,15 @@ class ConsistencyService:
                 self._publish()
 
     def _work(self, setup: ScanSetup, scan: LaserScan) -> StepInput | None:
-        """Return the worker's task for a scan; None if its plane is tilted."""
+        """Return the worker's task for a scan; None if its plane is tilted.
+
+        A single tilted scan is only left out: the jolt of a contact looks like a tilt.
+        """
         angles = None if setup.angles is None else setup.angles.at(scan)
         max_tilt = 0.1  # scans whose plane was tilted more than this are left out, rad: they show the ground
-        if scan.tilt is not None and scan.tilt > max_tilt:
-            self._anew = True
+        before, self._tilted = self._tilted, scan.tilt is not None and scan.tilt > max_tilt
+        if self._tilted:
+            self._anew |= before
             return None
         slopes = None if angles is None else plane_slopes(*angles, yaw=setup.mount.yaw)
         height = setup.mount.z if setup.mount.z > 0 else None
@@ -249,7 +256,9 @@ class ConsistencyService:
         end = scan.stamp + round(len(scan.ranges) * scan.time_increment * SECOND)
         claim, rest = monitor.claim(scan.stamp), monitor.rest_claim(scan.stamp, end)
         rolled = monitor.rolled(scan.stamp)
-        return StepInput(inputs, front, claim=claim, lag=monitor.lag(), rest=rest, rolled=rolled)
+        config = self._config
+        tolerated = {"slip": config.slip, "delay": config.delay}
+        return StepInput(inputs, front, claim=claim, lag=monitor.lag(), rest=rest, rolled=rolled, **tolerated)
 
     # Publishing
 
@@ -264,10 +273,10 @@ class ConsistencyService:
         if self._doubts and not doubts:
             self._events(Reason.SENSORS_AGREE, Severity.INFO, self.name, ", ".join(sorted(known)))
         self._doubts = doubts
-        used, unshown = self.monitor.in_use(now), self.monitor.unshown
+        used, unshown, standing = self.monitor.in_use(now), self.monitor.unshown, self.monitor.standing
         measures = tuple(measure.value for measure in used)
         distances = tuple(measure.value for measure in used if self.monitor.measures_way(measure))
-        visible = (measures, tuple((doubt.sensor, doubt.since) for doubt in doubts), self._front, unshown)
+        visible = (measures, tuple((doubt.sensor, doubt.since) for doubt in doubts), self._front, unshown, standing)
         if visible == self._published and now - self._published_at < PERIOD:
             return
         self._published, self._published_at = visible, now
@@ -281,5 +290,6 @@ class ConsistencyService:
                 doubts=doubts,
                 scans=self._front,
                 unshown=unshown,
+                standing=standing,
             )
         )

@@ -5,10 +5,12 @@ from functools import partial
 
 import pytest
 
+from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import Order
 from monstertruck_schemas.sensor import Imu, Vector3, WheelEncoders
+from monstertruck_schemas.state import Consistency, StandingBody
 from monstertruckd.gate.config import ContactConfig, GateConfig, weakened
 from monstertruckd.gate.contact import ContactCheck
 from tests.unit.gate.rig import DRIVETRAIN, Rig, check_of, header
@@ -180,6 +182,32 @@ def test_only_an_operator_who_holds_the_second_control_is_backed_off():
     rig.tick(50)
     rig.load = PUSHING
     assert rig.until(Reason.CONTACT) is None
+
+
+def standing(rig, since):
+    """The scans show since ``since`` s ago that the body stands."""
+    body = StandingBody(since=rig.now - round(since * SECOND), stamp=rig.now, rolled=0.02, shown=0.001)
+    rig.gate.observe(Consistency(**header(rig.now), measures=("wheels",), standing=body), topics.CONSISTENCY)
+
+
+def test_scans_that_show_a_standing_body_while_its_wheels_roll_are_noticed():
+    rig = backing()
+    standing(rig, 0.3)
+    rig.tick()
+    assert Reason.CONTACT in rig.out.reasons
+    (figure,) = check_of(rig.gate, ContactCheck).figures(Reason.CONTACT, rig.now)
+    assert (figure.name, figure.value, figure.unit) == ("distance by the scans", 0.001, "m")
+    assert figure.limit == pytest.approx(0.02 * ContactConfig().share)
+
+
+def test_a_body_that_stood_before_its_wheels_rolled_as_commanded_is_no_contact():
+    rig = backing()
+    standing(rig, 30.0)
+    rig.tick()
+    assert Reason.CONTACT not in rig.out.reasons
+    rig.gate.observe(Consistency(**header(rig.now), measures=("wheels",)), topics.CONSISTENCY)
+    rig.tick()
+    assert Reason.CONTACT not in rig.out.reasons
 
 
 def test_free_wheels_that_stand_are_noticed():

@@ -1,0 +1,109 @@
+"""Detect a body that stands while its wheels roll: likelihood of standing against rolling on, from scan to scan.
+
+The distance by the scans is a function of the distance by the wheels: a broken line. Up to the break both hypotheses
+have the slope of the places before it; after the break the body stands (slope 0), or rolls on with the greatest
+tolerated slip. The difference of both sums of squared residuals, in variances of a place, is twice the logarithm of the
+likelihood ratio. Every place since the wheels' velocity became steady may be the break.
+"""
+
+import math
+from collections import deque
+from typing import Final
+
+import numpy as np
+
+from monstertruck_estimation.slam.registration import CORRELATION, Cloud, Fit
+from monstertruck_estimation.slam.scans import Scan
+from monstertruck_kinematics.elementary import Array
+from monstertruck_runtime.clock import SECOND
+from monstertruck_schemas.state import StandingBody
+
+LIKELIER: Final = 16.0
+"""Minimum of twice the logarithm of the likelihood ratio: 4 standard deviations. A false finding moves the robot 3 cm
+back while an operator watches it."""
+AFTER: Final = 2
+"""Minimum number of places after the break."""
+BEFORE: Final = 3
+"""Minimum number of places that determine the slope before the break; with fewer it is 1."""
+FREE: Final = 3
+"""Minimum number of places in addition to the coefficients of the lines; the stated variance counts as much as so many
+places show."""
+
+
+class StandingWatch:
+    """Watches the motion from scan to scan for a body that stands.
+
+    Args:
+        slip: tolerated slip, as a fraction of the wheels' motion.
+        delay: tolerated delay of the scans, s.
+    """
+
+    def __init__(self, slip: float, delay: float) -> None:
+        self._rolls_at_least = 1.0 - slip
+        self._delay = round(delay * SECOND)
+        self._velocity: Array | None = None
+        self._steady_since = 0
+        compared = 20  # number of the latest places that are compared
+        self._places: deque[tuple[int, float, float, float]] = deque(maxlen=compared)
+        """Stamp, distance by the wheels and by the scans, variance of the latter."""
+
+    def observe(self, since: int, stamp: int, rolled: Array, moved: Array, covariance: Array) -> StandingBody | None:
+        """Take the motion between two scans; return the evidence of a standing body.
+
+        Args:
+            since: stamp of the earlier scan, ns.
+            stamp: stamp of the later scan, ns.
+            rolled: motion by the wheels, shape (3,), m, m, rad.
+            moved: motion by the scans, shape (3,), m, m, rad.
+            covariance: of the pose at the later scan, shape (3, 3).
+        """
+        velocity, before = rolled / (stamp - since) * SECOND, self._velocity
+        self._velocity, speed = velocity, float(np.linalg.norm(velocity))
+        if before is None or not np.linalg.norm(velocity - before) < (1.0 - self._rolls_at_least) * speed:
+            self._places.clear()
+            self._steady_since = stamp
+            return None
+        if since - self._steady_since < self._delay:
+            return None  # scans that late still show the earlier velocity
+        direction = velocity / speed
+        _, way, shown, _ = self._places[-1] if self._places else (since, 0.0, 0.0, 0.0)
+        variance = float(direction @ covariance @ direction)
+        self._places.append((stamp, way + float(rolled @ direction), shown + float(moved @ direction), variance))
+        return self._judged()
+
+    def _judged(self) -> StandingBody | None:
+        _, rolled, shown, variances = np.array(self._places).T
+        likeliest, found = LIKELIER, None
+        for start in range(len(rolled) - AFTER):
+            before, after = np.minimum(rolled - rolled[start], 0.0), np.maximum(rolled - rolled[start], 0.0)
+            columns, places = np.ones((len(rolled), 1)), shown - before
+            if start >= BEFORE:
+                columns, places = np.column_stack((columns, before)), shown
+            free = len(rolled) - columns.shape[1] - 1
+            if free < FREE:
+                continue
+            sides = np.column_stack((places, places - self._rolls_at_least * after))
+            coefficients = np.linalg.lstsq(columns, sides, rcond=None)[0]
+            stands, rolls = ((sides - columns @ coefficients) ** 2).sum(axis=0).tolist()
+            likelier = (rolls - stands) * (FREE + free) / (FREE * float(variances.mean()) + stands)
+            if likelier > likeliest:
+                likeliest = likelier
+                way, seen = float(rolled[-1] - rolled[start]), float(shown[-1] - shown[start])
+                found = StandingBody(since=self._places[start][0], stamp=self._places[-1][0], rolled=way, shown=seen)
+        return found
+
+
+def spread(fit: Fit, scan: Scan, cloud: Cloud) -> float:
+    """Return the variance of the pairs' distances, as a fraction of the stated one."""
+    stated = float(scan.variances[:, 0].mean() + cloud.variances[:, 0].mean())
+    return fit.residual**2 / stated
+
+
+def place_covariance(fit: Fit, spread: float) -> Array:
+    """Return the covariance of a registered pose in base, shape (3, 3), for the measured ``spread`` of the pairs.
+
+    Errors that neighbouring beams share are left out: they are the same in all scans from nearly one place.
+    """
+    c, s = math.cos(fit.pose[2]), math.sin(fit.pose[2])
+    turned = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+    return np.asarray(spread * CORRELATION * np.linalg.inv(turned.T @ fit.information @ turned + np.eye(3)))
