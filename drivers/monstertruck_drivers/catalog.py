@@ -260,6 +260,8 @@ class DeviceKind(Plugin):
     framing: Framing | None = None
     """Bits of a byte on its serial line; None selects 8N1."""
     usb: UsbIdentity | None = None
+    current: bool = False
+    """Whether a motor controller measures the current of each motor."""
 
     @property
     def role(self) -> RoleSpec:
@@ -442,6 +444,7 @@ DEVICES: Final = DeviceCatalog(
         implementation="monstertruck_drivers.epos.driver:EposDriver",
         emulator="monstertruck_drivers.epos.emulator:emulated",
         identity="monstertruck_drivers.epos.identity:identify",
+        current=True,
         baud=EPOS_BAUD,
         usb=UsbIdentity("0403:6001", "FT232R USB UART", "ttyUSB"),
     ),
@@ -475,6 +478,7 @@ DEVICES: Final = DeviceCatalog(
         implementation="monstertruck_drivers.vesc.driver:VescDriver",
         emulator="monstertruck_drivers.vesc.emulator:emulated",
         identity="monstertruck_drivers.vesc.session:identify",
+        current=True,
         baud=VESC_BAUD,
         usb=UsbIdentity("0483:5740", "ChibiOS/RT Virtual COM Port", "ttyACM"),
     ),

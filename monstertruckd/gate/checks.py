@@ -128,10 +128,16 @@ class GateView:
         return holder.request.source if holder is not None and holder.inside else None
 
     @property
+    def operated(self) -> bool:
+        """Whether an operator drives."""
+        holder = self._states.holder
+        return holder is not None and not holder.inside and holder.request.role in OPERATORS
+
+    @property
     def confirmed(self) -> bool:
         """Whether the driving operator holds the second control, to drive into unseen ground."""
         holder = self._states.holder
-        return holder is not None and not holder.inside and holder.request.role in OPERATORS and holder.request.unseen
+        return self.operated and holder is not None and holder.request.unseen
 
 
 class Check:

@@ -110,11 +110,11 @@ class ObstacleLimits(Schema):
     the lidar's range. A recorded URG-04LX has 0.95 to 1.0, and less than half in one of 800 sectors."""
     unseen_speed: LivePositive = 0.1
     """Speed limit while a sector of travel is not seen, m/s; a sector not seen for ``scan.stale_after`` stops the
-    truck. Also the limit for a body that moves sideways, turns on the spot or swings its tail onto ground not seen
-    recently by any scan."""
+    truck. Also the limit for a body that turns on the spot or swings its tail onto ground not seen recently by any
+    scan."""
     unseen: Literal["stop", "slow"] = "stop"
-    """Reaction to ground not seen recently by any scan, in reverse and with a tail that swings towards something; slow:
-    limit to ``unseen_speed``."""
+    """Reaction to ground not seen recently by any scan, in reverse, sideways and with a tail that swings towards
+    something; slow: limit to ``unseen_speed``."""
     confirmed_speed: Annotated[float, Field(gt=0, le=0.05), LIVE] = 0.05
     """Speed limit into unseen ground while the operator holds the second control, m/s."""
     memory_time: Annotated[float, Field(gt=0, le=120)] = 30.0

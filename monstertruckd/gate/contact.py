@@ -1,4 +1,4 @@
-"""Detects contact while an operator drives into ground that no sensor has seen, and backs off.
+"""Detects contact while an operator drives into ground that no lidar has seen, and backs off.
 
 Four measures show that an obstacle holds the body while its wheels are driven: a motor draws more than its rolling
 current, a shaft or a free wheel is slower than commanded, the body turns less than commanded, or the scans show a body
@@ -234,8 +234,13 @@ class ContactCheck(Check):
 
     def _touch(self, found: ContactFinding, now: int) -> None:
         """Begin to back off if the robot drives on into unseen ground, or near a dock, and not already away from it."""
-        watched = self.view.confirmed or self.view.dock is not None
-        if watched and self._request is not None and self._leads(self._request, self._steady):
+        view = self.view
+        blind = view.operated and not view.samples.scan_fresh(now)
+        if (
+            (blind or view.confirmed or view.dock is not None)
+            and self._request is not None
+            and self._leads(self._request, self._steady)
+        ):
             self._touched, self._finding, self._began, self._backed = self._request, found, now, 0.0
             self._reached.clear()
             self._slow.clear()

@@ -18,6 +18,7 @@ async def examine(context: HostContext, *, ask_devices: bool = True) -> list[Fin
         *software.packages(context),
         *software.configuration(context),
         *software.motion(context),
+        *software.contact(context),
         *software.sensors(context),
         *[finding async for finding in software.service(context)],
         *software.rules(context),

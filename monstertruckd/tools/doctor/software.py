@@ -100,6 +100,26 @@ def motion(context: HostContext) -> Iterator[Finding]:
         yield warn("scan odometry", Reason.NOT_INSTALLED, text, _install_command(context, lacking))
 
 
+def contact(context: HostContext) -> Iterator[Finding]:
+    """Which measures show that an obstacle holds the robot, or the force and speed at which it pushes."""
+    config = context.config
+    if config is None or config.missing_actuators() is not None:
+        return
+    devices, compared = config.devices, config.consistency
+    scans = devices.lidar is not None and compared is not None and compared.scans is not None
+    current = all(device.kind.current for device in devices.shafts().values())
+    measures = (("motor current", current), ("free wheels", devices.encoders is not None), ("scans", scans))
+    shown = [name for name, there in measures if there and config.gate.contact is not None]
+    if shown:
+        yield fine("contact", f"shown by {', '.join(shown)}")
+        return
+    seen = (
+        "no sensor shows that the wheels slip at an obstacle: the robot arrives at up to "
+        f"{config.gate.speed:g} m/s and pushes with up to {config.geometry.pull:g} N; add free wheels or a lidar"
+    )
+    yield warn("contact", Reason.CONTACT, seen)
+
+
 def sensors(context: HostContext) -> Iterator[Finding]:
     """Sensors that the gate waits for although the configuration has none: the robot could never be armed."""
     config = context.config

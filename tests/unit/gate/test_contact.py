@@ -8,7 +8,7 @@ import pytest
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import Order
+from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.sensor import Imu, Vector3, WheelEncoders
 from monstertruck_schemas.state import Consistency, StandingBody
 from monstertruckd.gate.config import ContactConfig, GateConfig, weakened
@@ -208,6 +208,17 @@ def test_a_body_that_stood_before_its_wheels_rolled_as_commanded_is_no_contact()
     rig.gate.observe(Consistency(**header(rig.now), measures=("wheels",)), topics.CONSISTENCY)
     rig.tick()
     assert Reason.CONTACT not in rig.out.reasons
+
+
+@pytest.mark.parametrize("planner", [False, True])
+def test_without_a_lidar_an_operator_is_backed_off_everywhere(planner):
+    rig = Backing(scan={"stale_after": 0.25, "critical": False})
+    rig.silent = {"scan"}
+    rig.driver = {"speed": 0.15, "inside": True, "role": Role.TRACKER} if planner else {"speed": 0.15}
+    rig.tick(60)
+    assert rig.speed == pytest.approx(0.15)
+    rig.load = PUSHING
+    assert (rig.until(Reason.CONTACT) is None) is planner
 
 
 def test_free_wheels_that_stand_are_noticed():

@@ -5,7 +5,17 @@ from pathlib import Path
 
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.tools.doctor.context import Account, HostContext, Level, account_of, inspect
-from monstertruckd.tools.doctor.software import configuration, motion, packages, python, rights, rules, sensors, service
+from monstertruckd.tools.doctor.software import (
+    configuration,
+    contact,
+    motion,
+    packages,
+    python,
+    rights,
+    rules,
+    sensors,
+    service,
+)
 from monstertruckd.tools.install.plan import RULES, UNIT
 from tests.unit.tools.doctor.kit import EmulatedHost, bad, see
 from tests.unit.tools.install.kit import PROGRAM, ROOT, TRUCK
@@ -184,6 +194,15 @@ def test_measures_of_the_motion_and_what_is_missing(tmp_path: Path):
         assert missing.seen == f"{name} not installed: the motion by scans is not measured"
     alone = see(tmp_path / "c", motion, lambda emulated: emulated.change(consistency=None))["motion"]
     assert (alone.level, alone.reason) == (Level.WARN, Reason.UNWITNESSED)
+
+
+def test_measures_of_a_contact_and_the_limit_without_one(tmp_path: Path):
+    assert see(tmp_path / "a", contact, without())["contact"].seen == "shown by motor current, scans"
+    by_current = see(tmp_path / "b", contact, lambda emulated: emulated.change(consistency=None))["contact"]
+    assert by_current.seen == "shown by motor current"
+    nothing = see(tmp_path / "c", contact, lambda emulated: emulated.change(gate={"contact": None}))["contact"]
+    assert (nothing.level, nothing.reason) == (Level.WARN, Reason.CONTACT)
+    assert "at up to 0.21 m/s and pushes with up to 25 N" in nothing.seen
 
 
 def test_a_gate_that_waits_for_a_sensor_that_the_robot_does_not_have(tmp_path: Path):
