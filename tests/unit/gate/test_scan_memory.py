@@ -338,7 +338,7 @@ def test_unseen_ground_counts_whichever_way_the_motion_goes(x):
 
 @pytest.mark.parametrize(
     ("motion", "stops"),
-    [((0.2, 0.2), True), ((0.2, 0.1), True), ((0.2, 0.0), False), ((0.0, 0.2), False), ((0.2, -0.2), False)],
+    [((0.2, 0.2), True), ((0.4, 0.3), True), ((0.2, 0.0), False), ((0.0, 0.2), False), ((0.2, -0.2), False)],
 )
 def test_a_motion_that_moves_a_whole_side_outwards_stops_before_unseen_ground(motion, stops):
     """A turn about a point beside the body swings its tail only as far as its length allows."""
