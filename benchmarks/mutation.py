@@ -58,9 +58,10 @@ TARGETS = {
     **{
         f"monstertruckd/gate/{name}.py": ("tests/unit/gate",)
         for name in (
-            *("approach", "arbitration", "assist", "checks", "config", "consistency", "contact", "core", "docking", "fence"),
-            *("following", "latch", "limiter", "motion", "obstacles", "own_checks", "peers", "rear_sonars", "runaway"),
-            *("samples", "scan_memory", "sensors", "service", "sonars", "stops", "visibility", "zones"),
+            *("approach", "arbitration", "assist", "checks", "config", "consistency", "contact"),
+            *("core", "docking", "fence", "following", "latch", "limiter", "motion"),
+            *("obstacles", "own_checks", "peers", "rear_sonars", "runaway", "samples", "scan_memory"),
+            *("sensors", "service", "sonars", "stops", "visibility", "zones"),
         )
     },
     **{
