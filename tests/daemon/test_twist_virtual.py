@@ -16,7 +16,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import DriveForm, DriveRequest, RequestedTwist
 from monstertruck_schemas.state import GateMode, GateState, Odometry
 from monstertruckd.config.load import load_config
-from monstertruckd.tools.simulation.config import SimulatedTruckConfig
+from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 from tests.long_kit import mostly_long
@@ -48,10 +48,11 @@ class Seen:
         return c * dx + s * dy, c * dy - s * dx, float(np.unwrap(way[:, 3])[-1] - way[0, 3])
 
 
-def drive(name: str, *requests: tuple[float, tuple[float, float, float]]) -> Seen:
+def drive(name: str, *requests: tuple[float, tuple[float, float, float]], unseen: str = "stop") -> Seen:
     """Drive a robot of configs/robots by (seconds, twist) in turn; its tracker stays out of it."""
     config, _ = load_config(FOLDER / f"{name}.yaml", SimulatedTruckConfig)
     config = config.model_copy(update={"recorder": None, "tracker": None, "path": None})
+    config = with_overlay(config, {"gate": {"obstacle": {"unseen": unseen}}})
 
     async def main(clock: VirtualClock) -> Seen:
         rig, seen = VirtualRig(config, clock), Seen()
@@ -113,13 +114,19 @@ def test_turning_on_the_spot(name: str, side: int):
     ),
 )
 def test_moving_sideways(name: str, side: int):
-    seen = drive(name, (5.0, (0.0, 0.1 * side, 0.0)))
+    seen = drive(name, (5.0, (0.0, 0.1 * side, 0.0)), unseen="slow")
     ahead, aside, turned = seen.moved
     assert aside * side == pytest.approx(0.5, abs=0.2 if name == "independent" else 0.05)
     assert abs(ahead) < 0.03
     assert abs(turned) < 0.03
     assert set(seen.answers) == {Reason.OK}
     assert_odometry_agrees(seen)
+
+
+def test_sideways_a_robot_stops_before_ground_that_no_scan_has_seen():
+    seen = drive("mecanum", (3.0, (0.0, 0.1, 0.0)))
+    assert Reason.UNSEEN_STOP in {reason for state in seen.states for reason in state.reasons}
+    assert abs(seen.moved[1]) < 0.03
 
 
 @pytest.mark.parametrize("name", mostly_long(["mecanum", "independent"], {"independent"}))
@@ -165,7 +172,7 @@ def test_the_truck_drives_a_curve_by_twist_and_one_too_tight_is_clipped():
 
 
 def test_a_wall_stops_sideways_motion_before_contact():
-    seen = drive("mecanum", (20.0, (0.0, -0.1, 0.0)))
+    seen = drive("mecanum", (20.0, (0.0, -0.1, 0.0)), unseen="slow")
     assert Reason.OBSTACLE_STOP in {reason for state in seen.states for reason in state.reasons}
     assert not seen.truth[:, 5].any()
     assert seen.moved[1] < -0.1
