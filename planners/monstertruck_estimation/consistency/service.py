@@ -256,9 +256,10 @@ class ConsistencyService:
         end = scan.stamp + round(len(scan.ranges) * scan.time_increment * SECOND)
         claim, rest = monitor.claim(scan.stamp), monitor.rest_claim(scan.stamp, end)
         rolled = monitor.rolled(scan.stamp)
-        config = self._config
-        tolerated = {"slip": config.slip, "delay": config.delay}
-        return StepInput(inputs, front, claim=claim, lag=monitor.lag(), rest=rest, rolled=rolled, **tolerated)
+        slip, delay = self._config.slip, self._config.delay
+        return StepInput(
+            inputs, front, claim=claim, lag=monitor.lag(), rest=rest, rolled=rolled, slip=slip, delay=delay
+        )
 
     # Publishing
 
