@@ -87,7 +87,15 @@ EXAMPLES: Final = {
     "explorer": r"AuthorConfig|:Author\b|class Author\b",
 }
 """A present example of each kind for which no trial is written, by the names that belong to it alone."""
-PLACES: Final = {"wizard": 1, "tracker": 3, "motor_controller": 1, "body": 2, "task": 1, "sensor_role": 4}
+PLACES: Final = {
+    "wizard": 1,
+    "tracker": 3,
+    "motor_controller": 1,
+    "body": 2,
+    "task": 1,
+    "sensor_role": 4,
+    "page_panel": 2,
+}
 """Files that a change may touch, beside its own."""
 PLACES_OF_PATHS: Final = ("planners/", MESSAGES)
 """Where classes of such names are paths to be driven, not names of files."""

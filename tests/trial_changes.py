@@ -1,4 +1,5 @@
-"""Changes that a newcomer makes, each written out: one more sensor, motor controller, body, wizard, task.
+"""Changes that a newcomer makes, each written out: one more sensor, motor controller, body, wizard, task,
+pane of the page.
 
 A trial is applied to a copy of the packages and has to work there: `tests/daemon/test_trial_changes.py` runs it,
 `benchmarks/house.py` prints how many files it changes.
@@ -370,11 +371,78 @@ run_virtual(main)
     )
 
 
+MEMORY_PANE: Final = """// How much memory the robot's computer has left.
+import { element } from "./dom.js";
+import { addPane } from "./panes.js";
+import { number, words } from "./words.js";
+
+export class Memory {
+  /** @param {import("./socket.js").Link} link */
+  constructor(link) {
+    const free = element("p");
+    addPane("memory", free);
+    link.on("host", (host) => {
+      free.textContent = words("memory.free", { gigabytes: number(host.memory_available / 1e9, 1) });
+    });
+  }
+}
+"""
+
+SHOWN: Final = """
+import asyncio
+from pathlib import Path
+
+from monstertruckd.station.server import PAGE, TYPES, _strings
+from tests.daemon.browser_kit import CHROMIUM, chromium, new_tab
+
+async def serve(route, request):
+    name = request.url.rpartition("/")[2] or "index.html"
+    if name == "strings.json":
+        await route.fulfill(body=_strings(), content_type="application/json")
+    else:
+        await route.fulfill(body=(PAGE / name).read_bytes(), content_type=TYPES[Path(name).suffix])
+
+async def main():
+    async with chromium(Path.cwd()) as browser:
+        page = await new_tab(browser)
+        await page.route("http://page/**", serve)
+        await page.goto("http://page/")
+        await page.click("text=Memory")
+        assert await page.is_visible("#pane-memory")
+        assert not await page.is_visible("#pane-drive")
+
+assert (PAGE / "memory.js").is_file()
+if CHROMIUM is not None:
+    asyncio.run(main())
+"""
+"""The page alone, in a browser if there is one."""
+
+
+def _page_panel() -> Trial:
+    """A pane of the station's page, of a message that it gets already."""
+    page = "monstertruckd/station/page"
+    insertions = (
+        Insertion(
+            f"{page}/main.js",
+            'import { MissionTool } from "./mission.js";\n',
+            'import { Memory } from "./memory.js";\n',
+        ),
+        Insertion(f"{page}/main.js", "new Guide();\n", "new Memory(link);\n"),
+        Insertion(
+            f"{page}/strings/en.json",
+            '  "tab.tryout": "Try",\n',
+            '  "tab.memory": "Memory",\n  "memory.free": "{gigabytes} GB free",\n',
+        ),
+    )
+    return Trial({f"{page}/memory.js": MEMORY_PANE}, insertions, "include: configs/demo.yaml\n", SHOWN)
+
+
 TRIALS: Final[Mapping[str, Callable[[], Trial]]] = {
     "sensor_role": _sensor,
     "motor_controller": _motor_controller,
     "body": _body,
     "wizard": _wizard,
     "task": _task,
+    "page_panel": _page_panel,
 }
 """By the kind of change."""

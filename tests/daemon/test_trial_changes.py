@@ -1,4 +1,4 @@
-"""One more sensor, motor controller, body, wizard, task: each is tried in a copy of the packages, and works there."""
+"""One more sensor, motor controller, body, wizard, task, pane: each is tried in a copy of the packages, and works."""
 
 from pathlib import Path
 

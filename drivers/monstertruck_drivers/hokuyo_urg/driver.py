@@ -35,9 +35,9 @@ from monstertruck_drivers.hokuyo_urg.protocol import (
     split_lx_ranges,
     split_ranges,
 )
-from monstertruck_drivers.link import Link, Port
+from monstertruck_drivers.link import Link
 from monstertruck_drivers.scanning.clock_map import Anchor, ClockMap
-from monstertruck_drivers.scanning.clock_watch import ClockWatch
+from monstertruck_drivers.scanning.driver import ScannerDriver
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import (
     DeviceError,
@@ -46,7 +46,7 @@ from monstertruck_runtime.errors import (
     ProtocolError,
     WrongDeviceError,
 )
-from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_runtime.ports import Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan
@@ -285,38 +285,13 @@ class ScipSession:
             raise WrongDeviceError(f"{self._link.name}: expected unit {wanted}, found {found}")
 
 
-class HokuyoDriver:
-    """Scanner that speaks SCIP on a port: tty or network socket.
+class HokuyoDriver(ScannerDriver[ScipConfig]):
+    """Scanner that speaks SCIP."""
 
-    Args:
-        config: how it is driven.
-        port: where it is plugged in.
-        clock: time.
-        out: where scans go.
-        events: where faults, recoveries and losses are reported.
-        name: of the service.
-    """
-
-    def __init__(
-        self,
-        config: ScipConfig,
-        port: Port,
-        clock: Clock,
-        out: Publisher[LaserScan],
-        events: EventSink,
-        name: str = "lidar",
-    ) -> None:
-        self.name = name
-        self.scans = 0
-        """Scans published since the daemon started."""
-        self.dropped = 0
-        """Damaged scans since the daemon started."""
-        self._config = config
-        self._port = port
-        self._clock = clock
-        self._out = out
-        self._events = events
-        self._watch = ClockWatch(events, name)
+    scans = 0
+    """Scans published since the daemon started."""
+    dropped = 0
+    """Damaged scans since the daemon started."""
 
     async def run(self, ready: Ready) -> None:
         """One session: wake, identify, compare clocks, stream; the laser is off when it ends.

@@ -14,18 +14,17 @@ from monstertruck_drivers.ld19.protocol import (
     Ld19Packet,
     Ld19Parser,
 )
-from monstertruck_drivers.link import Link, Port
+from monstertruck_drivers.link import Link
 from monstertruck_drivers.scanning.clock_map import ClockMap
-from monstertruck_drivers.scanning.clock_watch import ClockWatch
+from monstertruck_drivers.scanning.driver import ScannerDriver
 from monstertruck_drivers.scanning.publishing import publish
 from monstertruck_drivers.scanning.turns import BeamSamples, TurnCutter, on_equal_steps
 from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
-from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_runtime.ports import Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import LaserScan
 
 
 def packet_stream(link: Link, clock: Clock) -> DeviceStream[Ld19Packet]:
@@ -74,30 +73,8 @@ class PacketSamples:
         )
 
 
-class Ld19Driver:
-    """LD06, LD19 or STL-19P on a port.
-
-    Args:
-        config: model, frame and patience.
-        port: where it is plugged in.
-        clock: time.
-        out: where scans go.
-        events: where readiness and changes of its clock are reported.
-        name: of the service.
-    """
-
-    def __init__(
-        self,
-        config: Ld19Config,
-        port: Port,
-        clock: Clock,
-        out: Publisher[LaserScan],
-        events: EventSink,
-        name: str = "lidar",
-    ) -> None:
-        self.name = name
-        self._config, self._port, self._clock, self._out, self._events = config, port, clock, out, events
-        self._watch = ClockWatch(events, name)
+class Ld19Driver(ScannerDriver[Ld19Config]):
+    """LD06, LD19 or STL-19P on a port."""
 
     async def run(self, ready: Ready) -> None:
         """Serve one session.

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_drivers.emulation import Array
-from monstertruck_drivers.link import Link, Port
+from monstertruck_drivers.link import Link
 from monstertruck_drivers.rplidar.config import RplidarConfig
 from monstertruck_drivers.rplidar.protocol import (
     COUNTS,
@@ -20,15 +20,15 @@ from monstertruck_drivers.rplidar.protocol import (
     decode_standard,
 )
 from monstertruck_drivers.rplidar.session import RplidarSession, ScannerUnit
+from monstertruck_drivers.scanning.driver import ScannerDriver
 from monstertruck_drivers.scanning.publishing import publish
 from monstertruck_drivers.scanning.turns import ArrivalTimes, BeamSamples, TurnCutter, on_equal_steps
 from monstertruck_drivers.streaming import DeviceStream
-from monstertruck_runtime.clock import SECOND, Clock
+from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.errors import DeviceTimeoutError, ProtocolError
-from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_runtime.ports import Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.sensor import LaserScan
 
 STANDS: Final = ": its motor does not turn (an A1's turns with port.dtr false)"
 
@@ -85,29 +85,8 @@ class SampleDecoder:
         return BeamSamples(*decoded, arrival - self._latency - before_last)
 
 
-class RplidarDriver:
-    """A RPLIDAR on a port.
-
-    Args:
-        config: model, mode, motor and patience.
-        port: where it is plugged in.
-        clock: time.
-        out: where scans go.
-        events: where readiness and its health are reported.
-        name: of the service.
-    """
-
-    def __init__(
-        self,
-        config: RplidarConfig,
-        port: Port,
-        clock: Clock,
-        out: Publisher[LaserScan],
-        events: EventSink,
-        name: str = "lidar",
-    ) -> None:
-        self.name = name
-        self._config, self._port, self._clock, self._out, self._events = config, port, clock, out, events
+class RplidarDriver(ScannerDriver[RplidarConfig]):
+    """A RPLIDAR on a port."""
 
     async def run(self, ready: Ready) -> None:
         """One session: identify, check its health, start motor and scan; both are off when it ends.

@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from monstertruck_drivers.link import Link, Port
+from monstertruck_drivers.link import Link
 from monstertruck_drivers.scanning.clock_map import ClockMap
-from monstertruck_drivers.scanning.clock_watch import ClockWatch
+from monstertruck_drivers.scanning.driver import ScannerDriver
 from monstertruck_drivers.scanning.turns import MISSING
 from monstertruck_drivers.sheet_lidar.config import SheetLidarConfig
 from monstertruck_drivers.sheet_lidar.protocol import STAMP_TURN, SheetParser, SheetScan
 from monstertruck_drivers.streaming import DeviceStream
 from monstertruck_runtime.clock import SECOND, Clock
-from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_runtime.ports import Ready
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
@@ -18,31 +18,8 @@ from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
 EXPECTED = "of a scanner with the configured number of beams: another device, or another data sheet"
 
 
-class SheetLidarDriver:
-    """Scanner on a port.
-
-    Args:
-        config: data sheet, frame and patience.
-        port: where it is plugged in.
-        clock: time.
-        out: where scans go.
-        events: where readiness and changes of its clock are reported.
-        name: of the service.
-    """
-
-    def __init__(
-        self,
-        config: SheetLidarConfig,
-        port: Port,
-        clock: Clock,
-        out: Publisher[LaserScan],
-        events: EventSink,
-        name: str = "lidar",
-    ) -> None:
-        self.name = name
-        self._config, self._port, self._clock, self._out, self._events = config, port, clock, out, events
-        self._watch = ClockWatch(events, name)
-        self._without = NO_ECHO if config.no_return == "free" else MISSING
+class SheetLidarDriver(ScannerDriver[SheetLidarConfig]):
+    """Scanner on a port."""
 
     async def run(self, ready: Ready) -> None:
         """Serve one session.
@@ -84,7 +61,9 @@ class SheetLidarDriver:
                 range_min=config.range_min,
                 range_max=config.range_max,
                 ranges=np.where(met, scan.ranges / 1000.0, np.inf),
-                codes=np.where(met, VALID_BEAM, self._without).astype(np.uint8),
+                codes=np.where(met, VALID_BEAM, NO_ECHO if self._config.no_return == "free" else MISSING).astype(
+                    np.uint8
+                ),
                 range_noise=config.sheet.noise,
             )
         )

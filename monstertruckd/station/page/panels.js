@@ -1,6 +1,7 @@
 // The panels beside the map: safety gate, truck, system, events, banners.
 import { byId, element, svg } from "./dom.js";
 import { wheelAngles } from "./geometry.js";
+import { watchTabs } from "./panes.js";
 import { Past } from "./series.js";
 import { degrees, modeText, moves, number, reason, words } from "./words.js";
 
@@ -50,7 +51,7 @@ export class Panels {
     link.on("trouble", ({ text }) => setText("refusal", text));
     this.buildTop();
     this.buildHorizon();
-    this.tabs();
+    watchTabs();
     setInterval(() => this.refresh(), 100);
   }
 
@@ -356,28 +357,5 @@ export class Panels {
       ["versions.robot", facts?.versions.monstertruckd],
       ...Object.entries(facts?.versions ?? {}).filter(([name]) => ["python", "system", "git"].includes(name)),
     ]);
-  }
-
-  tabs() {
-    const tabs = /** @type {HTMLElement[]} */ ([...document.querySelectorAll("[role=tab]")]);
-    const choose = (tab) => {
-      for (const each of tabs) {
-        const chosen = each === tab;
-        each.setAttribute("aria-selected", String(chosen));
-        each.tabIndex = chosen ? 0 : -1;
-        if (chosen) each.scrollIntoView({ block: "nearest", inline: "nearest" });
-        byId(each.getAttribute("aria-controls")).hidden = !chosen;
-      }
-    };
-    tabs.forEach((tab, i) => {
-      tab.onclick = () => choose(tab);
-      tab.onkeydown = (event) => {
-        const by = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-        if (!by) return;
-        const next = tabs[(i + by + tabs.length) % tabs.length];
-        choose(next);
-        next.focus();
-      };
-    });
   }
 }

@@ -10,7 +10,7 @@ scans holds it. Forward approaches use odometry between images, which does not j
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Final, Literal, Self
+from typing import Any, ClassVar, Final, Generic, Literal, Self, TypeVar
 
 import numpy as np
 
@@ -94,8 +94,11 @@ class Docking:
     """Voltage at rest on arrival (V)."""
 
 
-class Dock:
-    """Docks the robot.
+C = TypeVar("C", DockingConfig, UndockConfig)
+
+
+class AtDock(Generic[C]):
+    """Base of the behaviours at a dock.
 
     Args:
         config: settings of the run.
@@ -107,10 +110,9 @@ class Dock:
     """
 
     reads: ClassVar[tuple[Topic[Any], ...]] = (ODOMETRY, GATE)
-    may_read: ClassVar[tuple[Topic[Any], ...]] = (TAGS, POSE, BATTERY)
 
-    def __init__(self, config: DockingConfig, body: BehaviourBody) -> None:
-        self._config = config
+    def __init__(self, config: C, body: BehaviourBody) -> None:
+        self._config: C = config
         self._name, self._dock = chosen(config.docks, config.dock)
         self._turns = _Turns(body)
         self._reverse = self._dock.direction == "reverse"
@@ -118,9 +120,15 @@ class Dock:
         """End of the robot that docks."""
 
     @classmethod
-    def fit(cls, config: DockingConfig, body: BehaviourBody) -> Self:
-        """Return docking for a body; raises the same errors as the class."""
+    def fit(cls, config: C, body: BehaviourBody) -> Self:
+        """Return the behaviour for a body; raises the same errors as the class."""
         return cls(config, body)
+
+
+class Dock(AtDock[DockingConfig]):
+    """Docks the robot."""
+
+    may_read: ClassVar[tuple[Topic[Any], ...]] = (TAGS, POSE, BATTERY)
 
     def begin(self) -> Docking:
         """Return the state before the first step."""
@@ -300,30 +308,10 @@ class Undocking:
     """Base in odom at the start."""
 
 
-class Undock:
-    """Drives the robot out of a dock.
+class Undock(AtDock[UndockConfig]):
+    """Drives the robot out of a dock."""
 
-    Args:
-        config: settings of the run.
-        body: body of the robot.
-
-    Raises:
-        ValueError: no such dock.
-        KinematicsError: the body cannot turn.
-    """
-
-    reads: ClassVar[tuple[Topic[Any], ...]] = (ODOMETRY, GATE)
     may_read: ClassVar[tuple[Topic[Any], ...]] = (POSE,)
-
-    def __init__(self, config: UndockConfig, body: BehaviourBody) -> None:
-        self._config = config
-        self._name, self._dock = chosen(config.docks, config.dock)
-        self._turns = _Turns(body)
-
-    @classmethod
-    def fit(cls, config: UndockConfig, body: BehaviourBody) -> Self:
-        """Return undocking for a body; raises the same errors as the class."""
-        return cls(config, body)
 
     def begin(self) -> Undocking:
         """Return the state before the first step."""

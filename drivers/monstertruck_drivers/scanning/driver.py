@@ -1,0 +1,37 @@
+"""Base of the scanners' drivers."""
+
+from typing import Generic, TypeVar
+
+from monstertruck_drivers.link import Port
+from monstertruck_drivers.scanning.clock_watch import ClockWatch
+from monstertruck_runtime.clock import Clock
+from monstertruck_runtime.ports import EventSink, Publisher
+from monstertruck_schemas.sensor import LaserScan
+
+C = TypeVar("C")
+
+
+class ScannerDriver(Generic[C]):
+    """Scanner on a port: a tty or a network socket.
+
+    Args:
+        config: settings.
+        port: where it is plugged in.
+        clock: time.
+        out: where scans go.
+        events: where readiness, faults and changes of its clock are reported.
+        name: of the service.
+    """
+
+    def __init__(
+        self,
+        config: C,
+        port: Port,
+        clock: Clock,
+        out: Publisher[LaserScan],
+        events: EventSink,
+        name: str = "lidar",
+    ) -> None:
+        self.name = name
+        self._config, self._port, self._clock, self._out, self._events = config, port, clock, out, events
+        self._watch = ClockWatch(events, name)
