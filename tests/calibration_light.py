@@ -45,6 +45,10 @@ from monstertruckd.tools.calibrate.steering import BAND, SPAN
 from monstertruckd.tools.calibrate.steering_model import Maps, SteeringModel, SteeringRun, half_widths
 from tests.calibration_kit import Verdict
 
+BASE = 0.3
+
+WEAVE = (0.3, 0.3, 0.3, 0.3, 1.2)
+
 CHASSIS: Final = build_chassis(TruckBody(), Dimensions(DriveTrain(644.0, 0.075), 0.32, 0.26))
 MAPS: Final = Maps((1439.2, 1439.2), (-10.48, 10.48))
 AHEAD: Final = 0.235
@@ -177,7 +181,7 @@ def _weaves(rng: np.random.Generator) -> list[Verdict]:
     dead = max(delay - lag, 0.0)
     late = ASSUMED.servo_wait * rng.uniform(-1, 1)  # how long commands wait for a pulse since this start
     at = np.arange(0.0, 12.0, 0.04)
-    changes = np.cumsum(weave.WEAVE * 4)
+    changes = np.cumsum(WEAVE * 4)
     sides = np.array([1.0 if k % 2 else -1.0 for k in range(len(changes))])
     seen = []
     for sign in (1, -1):
@@ -185,7 +189,7 @@ def _weaves(rng: np.random.Generator) -> list[Verdict]:
             commanded = Steps(0.6, changes, 1.2 * sides)
             turned = 0.15 * sign * commanded.integral(at, dead + lag + late, lag**2)
             turned = turned + 0.01 * rng.normal() * at + 0.003 * rng.standard_normal(at.size)
-            stride = round(weave.BASE / 0.04)
+            stride = round(BASE / 0.04)
             ways = 0.15 * sign * at
             seen.append(weave.Weave(commanded, at, ways, stride, turned[stride:] - turned[:-stride]))
 

@@ -28,6 +28,12 @@ from monstertruckd.tools.calibrate import odometry, slip, weave
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
+BASE = 0.3
+
+SPEED = 0.15
+
+WEAVE = (0.3, 0.3, 0.3, 0.3, 1.2)
+
 PERIOD: Final = 0.02
 """Step in which the world is advanced and read, s: the period of the servos' pulses."""
 ACCELERATION: Final = 20_000.0
@@ -159,11 +165,11 @@ def steering_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
     chassis, step = config.sim.world.truck.chassis(), config.gate.steering_rate * PERIOD
     assert isinstance(chassis, TruckChassis)
     assert isinstance(chassis.linkage, LinkedAxles)
-    changes = np.cumsum([0.0, *weave.WEAVE * ROUNDS])
+    changes = np.cumsum([0.0, *WEAVE * ROUNDS])
     seen = []
     for way in (1, -1):
         hands, angle, sent, states = HandDriven(config), 0.0, [], []
-        hands.drive(way * weave.SPEED)
+        hands.drive(way * SPEED)
         hands.wait(SETTLED)
         for start in np.arange(0.0, changes[-1], PERIOD):
             side = 1 if np.searchsorted(changes, start + PERIOD / 2) % 2 else -1
@@ -172,7 +178,7 @@ def steering_truth(config: SimulatedTruckConfig) -> dict[str, Value]:
             sent.append((hands.now / SECOND, chassis.bicycle.body_twist(1.0, angle, -angle)[2]))
             states += hands.wait(PERIOD)
         times, x, y = np.array([(state.time_ns / SECOND, state.x, state.y) for state in states]).T
-        yaws, stride = np.unwrap([state.yaw for state in states]), round(weave.BASE / PERIOD)
+        yaws, stride = np.unwrap([state.yaw for state in states]), round(BASE / PERIOD)
         ways = way * np.append(0.0, np.cumsum(np.hypot(np.diff(x), np.diff(y))))
         seen.append(weave.Weave(Steps.of(*np.array(sent).T), times, ways, stride, yaws[stride:] - yaws[:-stride]))
 

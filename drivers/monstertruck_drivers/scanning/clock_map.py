@@ -9,9 +9,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from monstertruck_runtime.clock import SECOND
+from monstertruck_runtime.clock import MILLISECOND, SECOND
 
-MILLISECOND: Final = 1_000_000
 BLOCK: Final = 10
 """Scans per block; the drift estimate uses only the promptest scan of a block."""
 BLOCKS: Final = 20

@@ -28,20 +28,16 @@ from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps, unexplained
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 
-WEAVE: Final = (0.3, 0.3, 0.3, 0.3, 1.2)
-"""Seconds between changes of side: many changes determine the lag, and a long arc the gain, which has a similar effect
-where changes follow each other evenly."""
-SPEED: Final = 0.15
 ANGLE: Final = 0.12
 """Small, so that the curvature is about linear in it."""
-BASE: Final = 0.3
-"""Seconds between two headings that are compared, about as long as the steering keeps to one side."""
 
 
 def weaves(rounds: int) -> list[MoveStep]:
     """Forward and back, in turn."""
     return [
-        MoveStep(f"weaving {direction}", sign * SPEED, ANGLE, -ANGLE, 1.8, weave=WEAVE)  # m
+        # Seconds between changes of side: many changes determine the lag, and a long arc the gain, which has a
+        # similar effect where changes follow each other evenly.
+        MoveStep(f"weaving {direction}", sign * 0.15, ANGLE, -ANGLE, 1.8, weave=(0.3, 0.3, 0.3, 0.3, 1.2))  # m
         for _ in range(rounds)
         for sign, direction in ((1, "ahead"), (-1, "back"))
     ]
@@ -73,7 +69,8 @@ class Weave:
             return None
         seen = [reading for reading in record.attitude if steady[0] <= reading.stamp / SECOND <= steady[-1]]
         at = np.array([reading.stamp for reading in seen]) / SECOND
-        stride = max(round(BASE * (at.size - 1) / float(at[-1] - at[0])), 1) if at.size > 1 else 1
+        # Seconds between two headings that are compared, about as long as the steering keeps to one side.
+        stride = max(round(0.3 * (at.size - 1) / float(at[-1] - at[0])), 1) if at.size > 1 else 1
         if at.size <= stride:
             return None
         yaws = -steady_headings(seen, iron)

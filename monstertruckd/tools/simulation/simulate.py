@@ -1,6 +1,7 @@
 """``monstertruckd simulate``: emulated robots as a process, their devices behind ptys."""
 
 import asyncio
+import math
 import signal
 import sys
 from array import array
@@ -29,13 +30,13 @@ from monstertruck_sim.faults import FaultInjector, SimContext
 from monstertruck_sim.robot import SimulatedRobot
 from monstertruck_sim.stand import SimulatedStand
 from monstertruck_sim.world.config import HeldBoard
+from monstertruck_sim.world.obstacles import Box, Disc, penetration
 from monstertruck_sim.world.scene import Surroundings
 from monstertruck_sim.world.world import World
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, needs_computer
 from monstertruckd.tools.simulation.emulate import claimed
 from monstertruckd.tools.simulation.fleet import shared_scene
 from monstertruckd.tools.simulation.program import program
-from monstertruckd.tools.simulation.room import EmulatedRoom
 from monstertruckd.tools.simulation.tape import EmulatedTape
 
 Say = Callable[[str], None]
@@ -45,6 +46,56 @@ ANOTHER: Final = (
     "A second robot beside it needs a configuration with a `robot` and `zenoh: listen` of its own"
 )
 """Advice for ports that are in use."""
+
+
+ROOM_WORDS: Final = "room post X Y (an upright post at a place of the world, m), room clear (remove all posts)"
+MOST_POSTS: Final = 50
+"""Posts at one time: every one costs time in each scan."""
+
+
+class EmulatedRoom:
+    """Posts in a world, which the robot's sensors see and which stop it.
+
+    Args:
+        world: with the robot.
+        clock: time.
+        body: length and width of the robot, m.
+    """
+
+    def __init__(self, world: World, clock: Clock, body: tuple[float, float]) -> None:
+        self._world, self._clock, self._body = world, clock, body
+        self._posts: list[Disc] = []
+
+    def command(self, words: list[str]) -> None:
+        """Put a post or remove all.
+
+        Raises:
+            InputError: other words, a place where the robot stands, or too many posts.
+        """
+        now = self._clock.now()
+        match words:
+            case ["post", x, y]:
+                try:
+                    post = Disc(float(x), float(y), 0.1)  # m
+                except ValueError:
+                    raise InputError(f"expected {ROOM_WORDS}") from None
+                if not (math.isfinite(post.x) and math.isfinite(post.y)):
+                    raise InputError(f"expected {ROOM_WORDS}")
+                self._put(now, post)
+            case ["clear"]:
+                while self._posts:
+                    self._world.remove(now, self._posts.pop())
+            case _:
+                raise InputError(f"expected {ROOM_WORDS}")
+
+    def _put(self, now: int, post: Disc) -> None:
+        if len(self._posts) >= MOST_POSTS:
+            raise InputError(f"{MOST_POSTS} posts are in the room; remove them first")
+        robot = self._world.truth(now)
+        if penetration(Box(robot.x, robot.y, *self._body, robot.yaw), post) > 0:
+            raise InputError(f"post at {post.x:.2f}, {post.y:.2f} m: the robot is there")
+        self._world.add(now, post)
+        self._posts.append(post)
 
 
 class TruthLog:

@@ -585,10 +585,6 @@ def partners(poses: Array) -> NDArray[np.int64]:
     return np.array(result, dtype=np.int64).reshape(-1, 2)
 
 
-WITNESSES: Final = 1500
-"""Maximum number of pairs that check it, evenly chosen."""
-
-
 def witnesses(keys: list[Keyframe], poses: Array, part: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return pairs (earlier, later), shape (n, 2), of one place at times far apart that are not ``partners``.
 
@@ -606,7 +602,8 @@ def witnesses(keys: list[Keyframe], poses: Array, part: NDArray[np.int64]) -> ND
         near = near[np.linspace(0, len(near) - 1, min(len(near), REFINE_PARTNERS)).astype(np.intp)]
         others = [int(j) for j in near if (int(j), k) not in used]
         result += [(j, k) for j in others if _share(keys, poses, j, k) > REFINE_OVERLAP]
-    chosen = np.linspace(0, len(result) - 1, min(len(result), WITNESSES)).astype(np.intp)
+    # Maximum number of pairs that check it, evenly chosen.
+    chosen = np.linspace(0, len(result) - 1, min(len(result), 1500)).astype(np.intp)
     return np.array(result, dtype=np.int64).reshape(-1, 2)[chosen]
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_sim.world.obstacles import Disc
-from monstertruckd.tools.simulation.room import MOST, EmulatedRoom
+from monstertruckd.tools.simulation.simulate import MOST_POSTS, EmulatedRoom
 
 RADIUS = 0.1
 
@@ -60,8 +60,8 @@ def test_no_post_stands_in_the_robot(space: Space, room: EmulatedRoom, place: tu
 
 
 def test_posts_are_bounded(space: Space, room: EmulatedRoom):
-    for i in range(MOST):
+    for i in range(MOST_POSTS):
         room.command(["post", str(5 + i), "0"])
-    with pytest.raises(InputError, match=f"{MOST} posts"):
+    with pytest.raises(InputError, match=f"{MOST_POSTS} posts"):
         room.command(["post", "9", "9"])
-    assert len(space.obstacles) == MOST
+    assert len(space.obstacles) == MOST_POSTS

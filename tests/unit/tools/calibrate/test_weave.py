@@ -19,7 +19,11 @@ from monstertruck_schemas.cmd import SteeringCommand
 from monstertruck_schemas.sensor import STANDARD_GRAVITY, Attitude, DriveFeedback, DriveMode, Vector3
 from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
-from monstertruckd.tools.calibrate.weave import ANGLE, SPEED, WEAVE, estimates, response, weaves
+from monstertruckd.tools.calibrate.weave import ANGLE, estimates, response, weaves
+
+SPEED = 0.15
+
+WEAVE = (0.3, 0.3, 0.3, 0.3, 1.2)
 
 CHASSIS = build_chassis(TruckBody(), Dimensions(DriveTrain(644.0, 0.075), 0.32, 0.26))
 STEP = 0.001
