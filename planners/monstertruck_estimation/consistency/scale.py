@@ -93,14 +93,20 @@ def _fits(scan: Scan, cloud: Cloud, motion: Array) -> np.ndarray[tuple[int], np.
 
 
 def _factor(newest: Revolution, earlier: Revolution, motions: list[Array]) -> float | None:
-    """Compare points of the same bearing, by the motion under which they agree best on one factor."""
+    """Compare points of the same bearing, by the motion under which they agree best on one factor.
+
+    None if too few are compared, or the factor does not stand out of their scatter: the lidar looks at another place.
+    """
     bearings, distances = _polar(newest.scan.points, newest.origin)
     seen = [_polar(transform(inverse(motion), earlier.scan.points), newest.origin) for motion in motions]
     found = [_ratios(bearings, distances, *earlier_ones) for earlier_ones in seen]
     if min(map(len, found)) < 30:  # minimum number of points with one of the same bearing
         return None
-    spreads = [float(np.median(np.abs(ratios - np.median(ratios)))) for ratios in found]
-    return math.exp(float(np.median(found[int(np.argmin(spreads))])))
+    medians = [float(np.median(ratios)) for ratios in found]
+    spreads = [float(np.median(np.abs(ratios - middle))) for ratios, middle in zip(found, medians, strict=True)]
+    best = int(np.argmin(spreads))
+    sigmas, normal = 3.0, 1.4826  # significance; standard deviations per median deviation of normal values
+    return math.exp(medians[best]) if abs(medians[best]) > sigmas * normal * spreads[best] else None
 
 
 def _polar(points: Array, origin: tuple[float, float]) -> tuple[Array, Array]:

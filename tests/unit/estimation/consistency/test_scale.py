@@ -15,7 +15,7 @@ from monstertruck_kinematics.se2 import compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.state import DoubtKind
 from tests.unit.estimation.consistency.kit import PERIOD, SENSORS, Lies, drive, straight
-from tests.unit.estimation.slam.kit import HALL, LIDAR, ranges
+from tests.unit.estimation.slam.kit import HALL, LIDAR, box, ranges
 
 LANE = straight(start=(-4.5, 2.0, 0.0))
 
@@ -72,6 +72,16 @@ def test_motion_between_the_revolutions_does_not_change_the_factor(motion):
     for factor in (0.3, 1.6):
         found = scale_change(revolution(factor * after), revolution(before), [np.zeros(3), np.array(motion)])
         assert found == pytest.approx(factor, rel=0.01)
+
+
+@pytest.mark.parametrize("seed", [17, 22, 35, 38])
+def test_another_place_is_no_change_of_scale(seed):
+    """Scans that came late end at once: the lidar shows a place far from the one before."""
+    rng, lane = np.random.default_rng(seed), box(-1.1, -6.0, 1.1, 6.0)
+    sheet = ScanGeometry(math.pi, -math.tau / 450, 0.02, 12.0, noise=0.0225)
+    poses = np.column_stack((rng.uniform(-1.0, 1.0, 2), rng.uniform(-0.95, 0.95, 2), rng.uniform(-3.0, 3.0, 2)))
+    before, after = (revolution(ranges(lane, pose, sheet, 450, 0.02, rng), sheet) for pose in poses)
+    assert scale_change(after, before, [np.zeros(3), np.array((0.08, 0.0, 0.0))]) in (None, 1.0)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
