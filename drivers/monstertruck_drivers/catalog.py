@@ -11,12 +11,12 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from functools import partial
 from typing import Any, Final, Literal, NamedTuple
 
 from monstertruck_drivers.arduino_bridge.protocol import BOARD_BAUD
 from monstertruck_drivers.ax12.protocol import AX12_BAUD
 from monstertruck_drivers.bno085.protocol import BNO085_BAUD
+from monstertruck_drivers.cable import DeviceEnd
 from monstertruck_drivers.emulation import Emulator, EmulatorSetup, FileEmulator
 from monstertruck_drivers.epos.protocol import EPOS_BAUD
 from monstertruck_drivers.ld19.protocol import LD19_BAUD
@@ -268,6 +268,15 @@ class DeviceKind(Plugin):
         """Its primary role."""
         return self.roles[0]
 
+    async def serve(self, emulator: Emulator, end: DeviceEnd) -> None:
+        """Run an emulated device until cancelled.
+
+        Raises:
+            InputError: a mistake in its code.
+        """
+        with self.refusing(self.emulator):
+            await emulator.run(end)
+
     def emulated(self, setup: EmulatorSetup) -> Any:
         """Return an emulated device: an ``Emulator``, or a ``FileEmulator`` for a monitor; loads its module.
 
@@ -299,16 +308,18 @@ class DeviceKind(Plugin):
             WrongDeviceError: another device.
             PortBusyError: another process holds the port.
         """
-        ask = partial(self.called, self.identity)
         settings = settings or self.default_settings()
         if self.opens not in ("serial", "i2c"):
-            return self._facts(await ask(where, clock, settings))
+            return await self._facts(where, clock, settings)
         async with await where.open() as link:
-            facts = self._facts(await ask(link, clock, settings))
+            facts = await self._facts(link, clock, settings)
         return {"device": self.doc, "port": where.name, **facts}
 
-    def _facts(self, found: Any) -> dict[str, Any]:
+    async def _facts(self, where: Any, clock: Clock, settings: Schema) -> dict[str, Any]:
         """What identifies a device, by name, as JSON can write it."""
+        asking = self.called(self.identity, where, clock, settings)
+        with self.refusing(self.identity):
+            found = await asking
         place = f"kind {self.name}: {self.identity}"
         if not isinstance(found, dict):
             raise InputError(f"{place}: expected a dict of facts, found {found!r}")
@@ -345,20 +356,27 @@ class DeviceCatalog(Catalog[DeviceKind]):
         if row.usb is not None and not re.fullmatch(r"[0-9a-f]{4}:[0-9a-f]{4}", row.usb.usb_id):
             return f"usb.usb_id: expected vendor:product such as 0403:6001, found {row.usb.usb_id!r}"
         for role in row.roles:
-            if not re.fullmatch(r"[a-z][a-z0-9_]*", role.name) or not role.writes:
-                return f"role {role.name!r}: expected a name of small letters, digits and _ that writes a topic"
-            if hasattr(Schema, role.name) or role.name in RESERVED:
-                return f"role {role.name}: the name has another meaning"
-            if role.duty is Duty.ACTUATOR and role not in OUR_ROLES:
-                return f"role {role.name}: actuators are this repository's alone"
-            if self._roles.get(role.name, role) != role:
-                return f"role {role.name}: there is another one of that name"
-            written = (*role.writes.values(), *row.also.values())
-            if not_its := [t.name for t in written if t.writer is not Writer.DRIVER]:
-                return f"role {role.name}: drivers do not write {', '.join(not_its)}"
-            if unknown := [t.name for t in written if topics.BY_NAME.get(t.name) != t]:
-                return f"role {role.name}: {', '.join(unknown)} is no entry point of monstertruck.topics"
+            if fault := self._fault_of_role(row, role):
+                return fault
         self._roles.update({role.name: role for role in row.roles})
+        return None
+
+    def _fault_of_role(self, row: DeviceKind, role: RoleSpec) -> str | None:
+        if not re.fullmatch(r"[a-z][a-z0-9_]*", role.name) or not role.writes:
+            return f"role {role.name!r}: expected a name of small letters, digits and _ that writes a topic"
+        if hasattr(Schema, role.name) or role.name in RESERVED:
+            return f"role {role.name}: the name has another meaning"
+        if role.duty is Duty.ACTUATOR and role not in OUR_ROLES:
+            return f"role {role.name}: actuators are this repository's alone"
+        if self._roles.get(role.name, role) != role:
+            return f"role {role.name}: there is another one of that name"
+        if role.elements is not None and role.elements not in row.settings_class().model_fields:
+            return f"role {role.name}: elements: {row.settings} has no field {role.elements}"
+        written = (*role.writes.values(), *row.also.values())
+        if not_its := [t.name for t in written if t.writer is not Writer.DRIVER]:
+            return f"role {role.name}: drivers do not write {', '.join(not_its)}"
+        if unknown := [t.name for t in written if topics.BY_NAME.get(t.name) != t]:
+            return f"role {role.name}: {', '.join(unknown)} is no entry point of monstertruck.topics"
         return None
 
     @property

@@ -353,6 +353,8 @@ class Signals:
         return None
 
     def _remember(self, name: str, value: Any) -> None:
+        if name not in self.kinds:
+            raise InputError(f"signal {name!r}: expected one of {', '.join(self.kinds)}")
         self._newest[name] = value
         if isinstance(value, int | float):
             self._greatest[name] = max(self._greatest.get(name, 0.0), abs(value))

@@ -66,6 +66,7 @@ class SimulatedRobot:
             role: emulated(role, kind_of(settings), settings) for role, settings in monitors.present().items()
         }
         """What the computer's files show, by monitor."""
+        self._kinds = {role: device.kind for role, device in devices.present().items()}
         self.emulators: dict[str, Emulator] = {
             role: emulated(role, device.kind, device.driver) for role, device in devices.present().items()
         }
@@ -96,7 +97,7 @@ class SimulatedRobot:
             async with asyncio.TaskGroup() as group:
                 for role, emulator in self.emulators.items():
                     port = self.ports[role]
-                    group.create_task(emulator.run(port.device), name=f"emulator {role}")
+                    group.create_task(self._kinds[role].serve(emulator, port.device), name=f"emulator {role}")
                     port.plug()
                 for name, files in self.monitored.items():
                     group.create_task(files.run(), name=f"emulator {name}")

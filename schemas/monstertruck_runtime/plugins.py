@@ -10,16 +10,18 @@ distributions add rows through entry points that name a ``Plugin``::
 
 import importlib
 import inspect
+import traceback
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Generic, Literal, TypeVar, cast, get_args, get_origin
+from typing import Annotated, Any, Generic, Literal, TypeVar, cast, get_args, get_origin
 
-from pydantic import BaseModel, GetCoreSchemaHandler, ValidationError
+from pydantic import BaseModel, GetCoreSchemaHandler, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, core_schema
 
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import InputError, TruckError
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.entry_points import ExtensibleTable
 
@@ -101,7 +103,24 @@ class Plugin:
             given = ", ".join([*(type(one).__name__ for one in arguments), *(f"{name}=" for name in named)])
             text = f"expected to be called with ({given}), found {signature}: {error}"
             raise InputError(f"kind {self.name}: {place}: {text}") from error
-        return make(*arguments, **named)
+        with self.refusing(place):
+            return make(*arguments, **named)
+
+    @contextmanager
+    def refusing(self, place: str) -> Iterator[None]:
+        """Context of calls into the plug-in's code: its mistakes are refused with their place.
+
+        Raises:
+            InputError: the code raises something else than our errors.
+        """
+        try:
+            yield
+        except TruckError:
+            raise
+        except Exception as error:
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            text = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {error}"
+            raise InputError(f"kind {self.name}: {place}: {text}") from error
 
     def default_settings(self) -> Schema:
         """Settings without any key from a configuration.
@@ -144,7 +163,7 @@ class Catalog(ExtensibleTable[P], Generic[P]):
             return f"{row.settings}: expected a subclass of {self._base.__name__}"
         if kind_of(model) != row.name:
             return f'{row.settings}: expected a field `kind: Literal["{row.name}"]`'
-        return None
+        return wrong_default(model, row.settings)
 
     @cached_property
     def settings(self) -> Mapping[str, type[Schema]]:
@@ -214,6 +233,20 @@ class KindSection:
         if isinstance(section, dict):
             return section.get("kind", self.default)
         return getattr(section, "kind", None)
+
+
+def wrong_default(model: type[BaseModel], place: str) -> str | None:
+    """Return the first field of a model whose default its annotation does not allow; None if all fit."""
+    for name, field in model.model_fields.items():
+        if field.is_required():
+            continue
+        annotation: Any = Annotated[field.annotation, field, *field.metadata]
+        try:
+            TypeAdapter(annotation).validate_python(field.get_default(call_default_factory=True, validated_data={}))
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            return f"{place}: {name}: {first['msg']}, found the default {first['input']!r}"
+    return None
 
 
 def kind_of(model: type[BaseModel]) -> str | None:

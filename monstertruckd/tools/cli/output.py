@@ -267,6 +267,15 @@ def until_stopped(main: "Callable[[WallClock], Coroutine[Any, Any, None]]") -> N
         run_wall(main)
 
 
+def _expected(group: BaseExceptionGroup[BaseException]) -> TruckError | None:
+    """First expected error in a tree of groups; None without one."""
+    for error in group.exceptions:
+        found = _expected(error) if isinstance(error, BaseExceptionGroup) else error
+        if isinstance(found, TruckError):
+            return found
+    return None
+
+
 class NumberCommand(TyperCommand):
     """One command: refuses nan, which passes every comparison with a least or greatest value, before anything runs."""
 
@@ -342,6 +351,8 @@ class CommandGroup(TyperGroup):
         try:
             with _usage_in_one_line():
                 return super().invoke(ctx)
+        except BaseExceptionGroup as group:
+            raise _expected(group) or group from None
         finally:
             if sys.stdout is not None:
                 sys.stdout.flush()

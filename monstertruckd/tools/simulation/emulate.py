@@ -76,11 +76,11 @@ async def _served(
 ) -> AsyncIterator[Emulated]:
     setup = EmulatorSetup(kind.role.name, None, clock, World(WorldConfig(), seed), seed, port)
     emulator = kind.emulated(setup)
-    task = asyncio.create_task(emulator.run(port.device), name=f"emulator {device}")
-    port.plug()
-    try:
-        yield Emulated(emulator, port)
-    finally:
-        port.unplug()
-        task.cancel()
-        await asyncio.wait([task])
+    async with asyncio.TaskGroup() as group:
+        task = group.create_task(kind.serve(emulator, port.device), name=f"emulator {device}")
+        port.plug()
+        try:
+            yield Emulated(emulator, port)
+        finally:
+            port.unplug()
+            task.cancel()

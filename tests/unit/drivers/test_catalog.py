@@ -221,6 +221,15 @@ def test_a_kind_says_what_its_parts_should_be():
         asyncio.run(dataclasses.replace(kind, opens="computer").identify(None, None))
 
 
+def test_a_mistake_in_an_emulator_is_refused_with_its_place():
+    class Broken:
+        async def run(self, end):
+            raise AttributeError("least")
+
+    with pytest.raises(InputError, match=r"kind ld19: \S+: \S+test_catalog\.py:\d+: AttributeError: least"):
+        asyncio.run(DEVICES["ld19"].serve(Broken(), None))
+
+
 def no_emulator(setup):
     return {}
 

@@ -204,3 +204,5 @@ def test_codes_in_an_array_are_spared_by_faults_that_calculate():
 def test_a_kind_of_signal_that_does_not_exist_is_named():
     with pytest.raises(InputError, match=r"signal range: expected SignalKind\.NUMBER or .*, found 'nummer'"):
         Signals(lambda: 0, {"range": "nummer"}, np.random.default_rng(0))
+    with pytest.raises(InputError, match="signal 'rang': expected one of range"):
+        Signals(lambda: 0, {"range": SignalKind.NUMBER}, np.random.default_rng(0)).report("rang", 1)

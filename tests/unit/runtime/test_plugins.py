@@ -1,6 +1,7 @@
 """Catalogs: our rows, and those of distributions that are installed with us."""
 
 import json
+import re
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -148,7 +149,12 @@ def test_settings_of_another_distribution_travel_to_another_machine(install):
 
 class Painter:
     def __init__(self, config, *, colour):
-        self.colour = colour
+        self.colour = colour.lower()
+
+
+class HasteConfig(Schema):
+    kind: Literal["haste"] = "haste"
+    wait: float = "soon"
 
 
 def test_an_implementation_that_takes_other_arguments_is_named():
@@ -156,6 +162,10 @@ def test_an_implementation_that_takes_other_arguments_is_named():
     assert plugin.build(BallConfig(), colour="red").colour == "red"
     with pytest.raises(InputError, match=r"kind ball: \S+:Painter: expected to be called with \(BallConfig, hue=\)"):
         plugin.build(BallConfig(), hue="red")
+    with pytest.raises(InputError, match=r"kind ball: \S+: \S+test_plugins\.py:\d+: AttributeError: 'int' object"):
+        plugin.build(BallConfig(), colour=3)
+    with pytest.raises(InputError, match="expected from within"), plugin.refusing("here"):
+        raise InputError("expected from within")
     with pytest.raises(InputError, match=r"kind ball: \S+:GROUP: expected a class or a function, found 'monstertruck"):
         plugin.callable_at(f"{__name__}:GROUP")
     with pytest.raises(InputError, match=r"kind ball: json\.dumps: No module"):
@@ -170,3 +180,8 @@ def test_settings_without_a_default_are_named():
     globals()["Wanting"] = Wanting
     with pytest.raises(InputError, match=r"kind ball: \S+:Wanting: size: expected a default"):
         row("ball", "Wanting").default_settings()
+
+
+def test_a_default_that_its_own_field_refuses_is_named():
+    assert toys().fault(row("ball", "BallConfig")) is None
+    assert re.match(r"\S+:HasteConfig: wait: .*found the default 'soon'", toys().fault(row("haste", "HasteConfig")))

@@ -70,6 +70,14 @@ def test_an_error_is_one_sentence_and_its_reasons_code(
     assert (streams.out, streams.err) == ("", f"{error}\n")
 
 
+def test_an_error_of_a_task_among_others_is_one_sentence_too(capsys: pytest.CaptureFixture[str]):
+    def command() -> None:
+        raise ExceptionGroup("tasks", [ValueError("a bug"), ExceptionGroup("more", [NotFoundError("no such robot")])])
+
+    assert ending(command) == Reason.NOT_FOUND.exit_code
+    assert capsys.readouterr().err == "no such robot\n"
+
+
 def test_a_missing_package_is_one_sentence(capsys: pytest.CaptureFixture[str]):
     def command() -> None:
         import no_such_package  # noqa: F401
