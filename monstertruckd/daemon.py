@@ -76,7 +76,7 @@ class Daemon:
     """One robot; ``run`` it once.
 
     Args:
-        config: of the robot.
+        config: configuration of the robot.
         clock: wall or virtual time.
         ports: serial ports by device role, instead of the configured ones.
         computer: its USB tree, kernel files and disk; default: those under ``config.machine``.

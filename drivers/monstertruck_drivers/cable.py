@@ -348,7 +348,7 @@ class SocketPort:
     and resets the connection from before.
 
     Args:
-        address: of 127.0.0.0/8.
+        address: address of 127.0.0.0/8.
         number: TCP port; 0 = any free one.
 
     Raises:

@@ -141,7 +141,7 @@ class Transaction(Generic[T]):
         self._advance(None, error)
 
     def _advance(self, data: bytes | None, error: Exception | None = None) -> None:
-        """Go on until bytes are needed that are not here yet."""
+        """Continue until the parser needs bytes that have not arrived."""
         try:
             while True:
                 wait = self._steps.send(data) if error is None else self._steps.throw(error)  # type: ignore[arg-type]

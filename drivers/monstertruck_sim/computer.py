@@ -77,7 +77,7 @@ class EmulatedComputer:
 
     Args:
         folder: gets proc, sys and dev; must exist.
-        devices: of the truck.
+        devices: devices of the truck.
         cables: what each device's emulator serves, by role.
         clock: time.
     """

@@ -118,8 +118,8 @@ class SimContext:
     """Targets of faults: the simulated side, and from the daemon only its disk, its workers and its computer's supply.
 
     Args:
-        config: of the simulation.
-        devices: of the robot.
+        config: configuration of the simulation.
+        devices: devices of the robot.
         robot: world and emulators.
         computer: USB tree and cables.
         clock: time.
@@ -273,7 +273,7 @@ class CatalogFault(Fault[SimContext]):
     """A fault as the catalog draws it.
 
     Args:
-        kind: of its kind.
+        kind: kind of its kind.
         must_stop: the truck must stand soon, and stay so.
         disarms: once it stands, it must not start again by itself.
     """
@@ -300,8 +300,8 @@ class FaultCatalog:
     """Faults that a robot can have.
 
     Args:
-        devices: of the robot.
-        monitors: of its computer, by name.
+        devices: devices of the robot.
+        monitors: monitors of its computer, by name.
         records: whether its daemon writes a log.
         restarts: whether its computer can be switched off.
         workers: names of its daemon's worker processes.

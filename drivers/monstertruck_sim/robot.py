@@ -38,7 +38,7 @@ class SimulatedRobot:
         root: folder of the emulated computer, for its monitors.
         offload: where the camera's pictures are drawn.
         scene: world that it shares with other robots; None = its own.
-        name: of the robot.
+        name: name of the robot.
     """
 
     def __init__(

@@ -19,7 +19,7 @@ class SimulatedStand:
         world: with the robot in it.
         clock: time.
         put: gets every pose.
-        seed: of the noise; None = none.
+        seed: seed of the noise; None = none.
     """
 
     def __init__(

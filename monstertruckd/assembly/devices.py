@@ -41,7 +41,7 @@ class Cabling:
 
     Args:
         config: the ports.
-        computer: whose ports they are.
+        computer: computer whose ports they are.
         bus: where tree and events go.
         given: ports by role that replace the configured ones.
     """

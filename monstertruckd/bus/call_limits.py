@@ -62,7 +62,7 @@ class CallLimits:
         """Why a call is not taken; empty if it is. Each emergency stop that is taken has to be ``ended``.
 
         Args:
-            name: of the call.
+            name: name of the call.
             source: caller; None if the key names no source.
             waiting: calls that wait to be served.
         """

@@ -311,7 +311,7 @@ class StandIntake:
     """Receives a test stand's observations of the robot, for the recorder; to be made on the loop.
 
     Args:
-        bus: whose taps get it.
+        bus: bus whose taps get it.
         clock: time.
         guard: as of ``Intake``.
         refusals: reports refused messages.

@@ -91,7 +91,7 @@ class Rpc:
 
         Args:
             sender: who calls, by the key.
-            name: of the call.
+            name: name of the call.
             payload: JSON object.
         """
         reason, answered = await self._answer(sender, name, payload)

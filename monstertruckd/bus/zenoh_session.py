@@ -60,7 +60,7 @@ MAX_CALL = 16_384
 """Bytes of the largest payload of a call."""
 Put = Callable[[bytes], None]
 Call = tuple[zenoh.Query, Listener]
-"""A query, and the session it came in by."""
+"""A query with its session."""
 
 _SCHEMA_PREFIX = "schema/"
 _SOURCE_PLACE = re.compile(r" at /\S+:\d+\.?")

@@ -295,7 +295,7 @@ def with_values(config: C, results: Iterable[Result], source: Path | str) -> C:
 
     Args:
         config: as configured, or calibrated before.
-        results: of the wizards.
+        results: results of the wizards.
         source: named in complaints.
 
     Raises:

@@ -110,8 +110,8 @@ def beyond_devices(devices: Devices, monitors: Monitors, standstill: float, body
     """Every device setting beyond the body's limits, with the limit.
 
     Args:
-        devices: of the robot.
-        monitors: of the robot.
+        devices: devices of the robot.
+        monitors: monitors of the robot.
         standstill: ``gate.standstill``, m/s.
         body: limits of its motion.
     """
@@ -130,7 +130,7 @@ def weakened_devices(devices: Devices, monitors: Monitors) -> Iterator[str]:
     """Every device setting less safe than its default, with its value and the default.
 
     Args:
-        devices: of the robot.
+        devices: devices of the robot.
         monitors: likewise.
     """
     for role, device in devices.present().items():

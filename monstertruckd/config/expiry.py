@@ -178,8 +178,8 @@ class CalibrationWatch:
 
     Args:
         config: the running one.
-        results: of the calibration in use.
-        bus: whose messages are marked.
+        results: results of the calibration in use.
+        bus: bus whose messages are marked.
         clock: time.
         events: gets an event when one ends.
         offload: where files are written.

@@ -31,7 +31,7 @@ def too_slow(
 
     Args:
         speed: ``gate.speed``, m/s.
-        odometry: of the robot, as all others.
+        odometry: odometry of the robot, as all others.
         tracker: None if there is none.
         planner: None if there is none.
         slam: None if there is none.

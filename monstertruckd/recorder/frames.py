@@ -149,7 +149,7 @@ def checked_attachment(record: Attachment, content: bytes) -> Attachment:
 
     Args:
         record: the attachment.
-        content: of its record in the file.
+        content: content of its record in the file.
     """
     (expected,) = CHECKSUM.unpack(content[-CHECKSUM.size :])
     if expected in (0, zlib.crc32(content[: -CHECKSUM.size])):

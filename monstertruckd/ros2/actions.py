@@ -116,7 +116,7 @@ def chosen(goals: Mapping[bytes, ActionGoal[W]], number: bytes, stamp: int) -> t
     """Goals that a request to cancel means: one, all until a time, or all.
 
     Args:
-        goals: by UUID.
+        goals: goals by UUID.
         number: zero = any.
         stamp: real time, ns; zero = any.
     """
@@ -139,7 +139,7 @@ class ActionServer(Generic[W]):
 
     Args:
         action: execution of its goals.
-        node: of ROS 2.
+        node: node of ROS 2.
         operators: sessions of the nodes that send goals.
         active: whether goals are accepted at present.
         clock: time.

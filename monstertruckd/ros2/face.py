@@ -69,10 +69,10 @@ class RosFace:
     """One robot on one node.
 
     Args:
-        client: of the robot.
-        node: of ROS 2.
+        client: client of the robot.
+        node: node of ROS 2.
         operators: sessions of the nodes that ask for something.
-        facts: of the robot's configuration.
+        facts: facts of the robot's configuration.
         options: as chosen.
         clock: time.
     """

@@ -43,7 +43,7 @@ class RosLocalisation:
       frame odom it is composed with that transform. Without a publisher of the transform, odom is map.
 
     Args:
-        node: of ROS 2.
+        node: node of ROS 2.
         operators: sessions of the nodes.
         names: stamps and frames, as they are now.
         clock: time.
@@ -131,7 +131,7 @@ class RosMaps:
     A map may be of any age, but not from an unknown publisher.
 
     Args:
-        node: of ROS 2.
+        node: node of ROS 2.
         operators: sessions of the nodes.
         names: stamps and frames, as they are now.
     """

@@ -177,7 +177,7 @@ def path_in(message: RosMessage, pose_in: PoseReader, stamp: int) -> Path:
     Args:
         message: the message.
         pose_in: reads a pose.
-        stamp: of the path, ns.
+        stamp: stamp of the path, ns.
 
     Raises:
         InputError: it is too short or too long, or in another frame than map or odom.
@@ -279,7 +279,7 @@ class Navigation:
     kinds are not affected. Localisation cannot be paused.
 
     Args:
-        node: of ROS 2.
+        node: node of ROS 2.
         operators: sessions of the nodes that send goals.
         client: follows the robot's state.
         pose_in: reads poses.

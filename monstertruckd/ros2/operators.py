@@ -57,7 +57,7 @@ def check_arrival(arrival: RosArrival, now: int, newest: dict[bytes, int]) -> No
     """Accept a message that is neither old nor a repetition.
 
     Args:
-        arrival: of a known publisher.
+        arrival: arrival of a known publisher.
         now: real time, ns.
         newest: latest sequence numbers by publisher; updated with the message.
 
@@ -135,7 +135,7 @@ class Operators:
 
     Args:
         connect: makes the client of a source.
-        owner: of this side's certificate; None = without.
+        owner: owner of this side's certificate; None = without.
         clock: time.
         report: gets every refusal: node and text.
     """

@@ -52,7 +52,7 @@ class RosParameters:
     """Serves them.
 
     Args:
-        node: of ROS 2.
+        node: node of ROS 2.
         operators: sessions of the nodes that set one.
         client: reads them.
     """

@@ -92,7 +92,7 @@ class RclpyNode:
     """One node; an async context manager.
 
     Args:
-        name: of the node, and its namespace, ``/`` or ``/truck1``.
+        name: name of the node, and its namespace, ``/`` or ``/truck1``.
         domain: ``ROS_DOMAIN_ID``.
     """
 

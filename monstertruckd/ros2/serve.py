@@ -60,7 +60,7 @@ async def serve_face(
     """Show a robot to ROS 2 until cancelled.
 
     Args:
-        address: of the robot.
+        address: address of the robot.
         join: makes the node.
         facts: what ROS 2 needs of the robot's configuration.
         options: as chosen.

@@ -112,7 +112,7 @@ class ZenohNode:
     """One node; an async context manager.
 
     Args:
-        name: of the node, and its namespace, ``/`` or ``/truck1``.
+        name: name of the node, and its namespace, ``/`` or ``/truck1``.
         domain: ``ROS_DOMAIN_ID``.
         settings: as by ``session_settings``.
         clock: time.

@@ -19,7 +19,7 @@ from monstertruckd.station.viewer import Viewer
 
 UNIONS: Final = (Union, types.UnionType)
 HEADER: Final = frozenset(Message.model_fields)
-"""Stamp, sequence and the like, which are plotted by nobody."""
+"""Fields that are not plotted: stamp, sequence and the like."""
 
 
 @cache

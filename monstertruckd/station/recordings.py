@@ -19,7 +19,7 @@ async def fetch_recording(
 
     Args:
         truck: the robot.
-        name: of the recording.
+        name: name of the recording.
         to: file, made with the first bytes.
         progress: gets the share that is there, 0..1.
         most: maximum size, bytes; None for no limit.

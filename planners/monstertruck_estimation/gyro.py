@@ -72,7 +72,7 @@ class Gyro:
             since: ns.
             stamp: ns.
             wheels: mean yaw rate by the wheels, rad/s; None if they slip, and are not compared.
-            distance: of the fastest shaft, m.
+            distance: distance of the fastest shaft, m.
         """
         found = [rate for at, rate in self._rates if since < at <= stamp]
         # SECOND // 10: a rate this much older than the wheels' reading still stands for it, ns

@@ -101,7 +101,7 @@ class InertialInput:
         inertial: the unit.
         measured: its measurements.
         events: where a disagreement is reported.
-        source: of the events.
+        source: source of the events.
     """
 
     def __init__(self, inertial: Inertial, measured: Mailbox[Imu], events: EventSink, source: str) -> None:

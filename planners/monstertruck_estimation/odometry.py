@@ -370,7 +370,7 @@ class OdometryService:
         odometry: ``state/odometry``.
         pose: ``state/pose``; None = published by localisation.
         imu: measurements of an inertial measurement unit, if there is one.
-        encoders: of wheels that are not driven, if the estimator takes them.
+        encoders: encoders of wheels that are not driven, if the estimator takes them.
         events: about rejected headings.
         rate: poses per second.
     """

@@ -393,7 +393,7 @@ class EncoderInput:
         reckoning: the estimator.
         measured: readings.
         events: where a disagreement is reported.
-        source: of the events.
+        source: source of the events.
     """
 
     def __init__(

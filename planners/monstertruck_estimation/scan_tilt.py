@@ -76,7 +76,7 @@ class ScanAngles:
 
     Args:
         compass: the body's tilt.
-        joints: of the mount; None if the lidar is fixed to the body.
+        joints: joints of the mount; None if the lidar is fixed to the body.
         odometry: gives the body's acceleration to correct its tilt; None for no correction.
     """
 
@@ -119,7 +119,7 @@ class TiltStamper:
 
     Args:
         out: where scans go.
-        angles: of body and mount.
+        angles: angles of body and mount.
     """
 
     def __init__(self, out: Publisher[LaserScan], angles: ScanAngles) -> None:

@@ -686,7 +686,7 @@ def omni_chassis(size: Dimensions, circle: float = 0.2, count: int = 3) -> Chass
     Args:
         size: the robot's.
         circle: its radius, m.
-        count: of the wheels.
+        count: count of the wheels.
     """
     return _driven_wheels(size, omni(circle, size.drivetrain.wheel_radius, count))
 

@@ -45,7 +45,7 @@ class SkidModel:
     """A parametrised skid-steer robot.
 
     Attributes:
-        name: of the model.
+        name: name of the model.
         parameters: their names, in order.
         start: first guess.
         lower: bounds.
@@ -75,7 +75,7 @@ def skid_model(
     also the ratio of the sides' gains.
 
     Args:
-        name: of the model.
+        name: name of the model.
         radius: nominal wheel radius, m.
         half_track: c, m.
         bounded: keep the ICRs within 3 c and the slip ratio within 1.15; else only to physical signs.
@@ -220,7 +220,7 @@ def fit_trajectory(
         window: samples over which motion is predicted; longer windows weigh noise less.
         huber: residual, in units of the noise, above which a window counts linearly; None for plain squares.
         position_noise: expected error of a window's displacement, m.
-        heading_noise: of its turn, rad.
+        heading_noise: heading noise of its turn, rad.
 
     Raises:
         KinematicsError: shapes that do not fit together, times that do not increase, NaN, or too few samples.

@@ -156,7 +156,7 @@ def dragged_speeds(
 
     Args:
         geometry: wheelbase, track, reference point.
-        speed: of the reference point along its travel.
+        speed: speed of the reference point along its travel.
         angles: front left, front right, rear left, rear right.
     """
     slide, turn_rate, _ = common_motion(geometry, angles)

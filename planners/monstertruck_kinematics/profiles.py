@@ -117,8 +117,8 @@ def shortest_ramp(v0: float, a0: float, v1: float, max_acceleration: float, max_
         v0: present speed.
         a0: present acceleration; one beyond the limit is taken as the limit.
         v1: speed at the end.
-        max_acceleration: of the whole ramp.
-        max_jerk: of the whole ramp.
+        max_acceleration: greatest acceleration of the whole ramp.
+        max_jerk: greatest jerk of the whole ramp.
 
     Raises:
         KinematicsError: a limit not above 0, or figures that are not finite.
@@ -222,7 +222,7 @@ class CubicProfile:
     Args:
         distance: m (or rad), negative for backwards.
         max_speed: m/s.
-        ramp_time: of either ramp, s; the peak acceleration is 1.5 max_speed / ramp_time.
+        ramp_time: ramp time of either ramp, s; the peak acceleration is 1.5 max_speed / ramp_time.
 
     Raises:
         KinematicsError: a limit not above 0, or a distance that is not finite.

@@ -35,7 +35,7 @@ class Bicycle:
     Args:
         wheelbase: l, m.
         driven: wheel whose speed u is the input.
-        radius: of the wheels, m.
+        radius: radius of the wheels, m.
 
     Raises:
         KinematicsError: a length is not above 0.
@@ -89,7 +89,7 @@ class Tricycle(Bicycle):
     Args:
         wheelbase: d, from the rear axle to the front wheel, m.
         driven: front for the lecture's tricycle.
-        radius: of the wheels, m.
+        radius: radius of the wheels, m.
         track: between the rear wheels, m.
     """
 
@@ -122,7 +122,7 @@ class Ackermann:
     Args:
         wheelbase: L, m.
         track: w, m.
-        radius: of the wheels, m.
+        radius: radius of the wheels, m.
 
     Raises:
         KinematicsError: a length is not above 0.
@@ -190,7 +190,7 @@ class FourWheelSteer:
 
     Args:
         geometry: wheelbase, track and reference point.
-        radius: of the wheels, m.
+        radius: radius of the wheels, m.
 
     Raises:
         KinematicsError: a field is out of range.
@@ -233,7 +233,7 @@ class IndependentSteer:
 
     Args:
         positions: (x, y) of the wheels, m; at least two at different places.
-        radius: of the wheels, m.
+        radius: radius of the wheels, m.
 
     Raises:
         KinematicsError: fewer than two places, or a field out of range.

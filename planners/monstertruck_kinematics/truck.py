@@ -157,7 +157,7 @@ class FourWheelSteering:
         """Velocity (vx, vy, wz) of C in the body frame (eqs. 2.34, 2.54-2.56).
 
         Args:
-            speed: of C along its direction of travel, m/s, negative backwards.
+            speed: speed of C along its direction of travel, m/s, negative backwards.
             front: bicycle angle of the front axle.
             rear: bicycle angle of the rear axle.
 
@@ -358,7 +358,7 @@ class Axles(ABC):
     """The steered axles of a body.
 
     Args:
-        ranges: of the front and rear servo angle that the servo controller's pulses reach.
+        ranges: ranges of the front and rear servo angle that the servo controller's pulses reach.
     """
 
     ranges: tuple[Range, Range] = field(default=(FULL, FULL), kw_only=True)
@@ -404,7 +404,7 @@ class LinkedAxles(Axles):
     """Axles with wheel angles by the fitted polynomials.
 
     Args:
-        geometry: of the body; its reference point is the middle between the axles.
+        geometry: geometry of the body; its reference point is the middle between the axles.
         front: servo to wheels.
         rear: servo to wheels; None if its wheels are fixed straight ahead, and the rear axle angle is 0: the front one
             gives the turn, the sideslip of the rear axle's middle (0.5 deg at full lock) is neglected.
@@ -486,7 +486,7 @@ class Reach:
     curves over the curvature, each along two of the rectangle's edges.
 
     Args:
-        geometry: of the body, its reference point the base.
+        geometry: geometry of the body, its reference point the base.
         axles: with their ranges.
     """
 

@@ -17,7 +17,7 @@ class Differential:
     """Differential drive about the middle of its axle: v = r (w_R + w_L)/2, omega = r (w_R - w_L)/track.
 
     Args:
-        radius: of the wheels, m.
+        radius: radius of the wheels, m.
         track: distance between the wheels, m.
 
     Raises:
@@ -72,7 +72,7 @@ class SkidSteer:
     speeds s = gain r times the wheel rate.
 
     Args:
-        radius: of the wheels, m.
+        radius: radius of the wheels, m.
         icr_left: lateral position y_L of the left side's ICR in the reference point's frame, m (ideal: c).
         icr_right: y_R of the right side's (ideal: -c).
         icr_x: longitudinal position x_ICR of the ICRs, m.
@@ -201,7 +201,7 @@ def omni(circle: float = 0.2, wheel_radius: float = 0.05, count: int = 3) -> Swe
     Args:
         circle: radius of the circle, m.
         wheel_radius: m.
-        count: of wheels, three or more.
+        count: count of wheels, three or more.
 
     Raises:
         KinematicsError: fewer than three wheels, or a length not above 0.

@@ -129,7 +129,7 @@ class DiscFootprint:
     def __post_init__(self) -> None:
         if not (self.centres and self.radius > 0):
             raise InputError(
-                f"footprint of {len(self.centres)} discs of {self.radius} m: expected one at least, above 0 m"
+                f"footprint of {len(self.centres)} discs of {self.radius} m: expected a disc, radius above 0 m"
             )
 
     @property
@@ -272,7 +272,7 @@ def free_distance(
 
     Args:
         footprint: outline.
-        twist: of the base.
+        twist: twist of the base.
         points: obstacles in base, shape (n, 2), m.
         reach: distance checked, m.
         step: greatest motion of the outline between two poses checked, m.
@@ -287,7 +287,7 @@ def swept_poses(twist: UnitTwist, distances: Array) -> Array:
     """Poses of the base, starting at the origin, on the arc of a constant twist.
 
     Args:
-        twist: of the base.
+        twist: twist of the base.
         distances: travelled, shape (m,), m; negative backwards.
 
     Returns:
@@ -331,7 +331,7 @@ def scan_points_at(
     Args:
         scan: the revolution.
         mount: pose (x, y, yaw) of the lidar in base, m, m, rad.
-        stamp: of the base frame, ns.
+        stamp: stamp of the base frame, ns.
         twist: vx, vy, wz of the base since the beams, m/s and rad/s.
 
     Returns:
@@ -388,7 +388,7 @@ class DistanceField:
         occupied: shape (rows, columns), bool, row 0 at the lowest y.
         resolution: metres per cell.
         origin: pose (x, y, yaw) of the outer corner of cell (0, 0).
-        previous: of the same place before: only the surroundings of what differs are computed again.
+        previous: previous of the same place before: only the surroundings of what differs are computed again.
         unseen: shape of ``occupied``: ground that nothing may reverse onto; None: none.
 
     Raises:

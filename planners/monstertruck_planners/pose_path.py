@@ -107,7 +107,7 @@ def stops(directions: Array, steering: Sequence[Steering]) -> NDArray[np.bool_]:
 
     Args:
         directions: shape (n,), +1 or -1 of each step.
-        steering: of each step, or empty.
+        steering: steering of each step, or empty.
 
     Returns:
         Shape (n - 1,).

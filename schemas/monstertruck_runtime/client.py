@@ -144,7 +144,7 @@ class TruckClient(Operator):
             one robot of this computer could be meant.
         source: this program's name in requests; default ``user@host:pid``. With a certificate it is the common name,
             or that with a colon and anything behind it, which is the default: requests under other names never arrive.
-        role: of its requests; decides their priority.
+        role: role of its requests; decides their priority.
         clock: time of stamps and deadlines; robots do not trust it.
         timeout: seconds to wait for the link and for answers.
         tls: certificate files for ``tls/...`` endpoints; None for the files of ``station_tls``.
@@ -447,8 +447,8 @@ class TruckClient(Operator):
 
         Args:
             order: which of both.
-            name: of the point.
-            place: of a mark, in map, m; None = where the robot is.
+            name: name of the point.
+            place: place of a mark, in map, m; None = where the robot is.
             yaw: rad; None for the robot's yaw.
 
         Returns:
@@ -471,7 +471,7 @@ class TruckClient(Operator):
 
         Args:
             order: what.
-            name: of the zone.
+            name: name of the zone.
             area: polygon of a new zone.
             seconds: how long it is off (s).
 
@@ -536,7 +536,7 @@ class TruckClient(Operator):
             packed: see ``MapRequest.packed``.
             size: width and height in cells.
             resolution: m.
-            origin: of the corner of the first cell in map.
+            origin: origin of the corner of the first cell in map.
         """
         width, height = size
         request = MapRequest(

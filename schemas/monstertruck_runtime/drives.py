@@ -104,7 +104,7 @@ async def run_task(
 
     Args:
         client: who starts it.
-        topic: of its reports.
+        topic: topic of its reports.
         needs: the service that runs the task.
         start: requests it; the answer has its ``number``.
         stop: stops the task, if this client started it.

@@ -112,7 +112,7 @@ def write_save(
     Once this returns, the save outlasts a power cut. The save before is kept, and one with the grid before.
 
     Args:
-        folder: of the map.
+        folder: folder of the map.
         parts: content by file name.
         owned: patterns of the names that the caller answers for: those not among ``parts`` are left out.
         run: that made the map; None = the run of the map that is there.

@@ -50,10 +50,10 @@ def path_from(text: str, file: FilePath, *, closed: bool, frame: str = "odom", c
     """Read a path from a file's text; whether it can be tracked is not checked.
 
     Args:
-        text: of the file.
+        text: text of the file.
         file: its name; the suffix tells table from YAML.
         closed: the path is a lap.
-        frame: of its poses.
+        frame: frame of its poses.
         columns: names of a table's columns, which replace those in the file.
 
     Raises:
@@ -103,9 +103,9 @@ def path_text(path: Path, form: PathForm, *, speed: float | None = None, width: 
 
     Args:
         path: what to write.
-        form: of the file.
-        speed: of a raceline whose path sets no speeds, m/s.
-        width: of the track on each side of a centreline, m.
+        form: format of the file.
+        speed: speed of a raceline whose path sets no speeds, m/s.
+        width: width of the track on each side of a centreline, m.
 
     Raises:
         InputError: the form needs a speed or width, or cannot hold motion backward.

@@ -145,7 +145,7 @@ class Catalog(ExtensibleTable[P], Generic[P]):
     Settings models of other distributions are loaded with their entry points, ours on first use.
 
     Args:
-        group: of the entry points.
+        group: group of the entry points.
         rows: ours; their class is what other distributions have to give.
         base: of the settings models.
     """
@@ -250,7 +250,7 @@ def wrong_default(model: type[BaseModel], place: str) -> str | None:
 
 
 def kind_of(model: type[BaseModel]) -> str | None:
-    """The one kind whose settings a model holds; None if it is no such model."""
+    """The only kind that a settings model belongs to; None for other models."""
     field = model.model_fields.get("kind")
     if field is None or get_origin(field.annotation) is not Literal:
         return None

@@ -120,7 +120,7 @@ def parse_request(model: type[R], payload: dict[str, Any]) -> R:
 
     Raises:
         RequestRefusedError: a number is not finite.
-        InputError: it is no such request; the text names the first wrong field.
+        InputError: the request is invalid; the text names the first wrong field.
     """
     try:
         return model.model_validate_json(json.dumps(payload), extra="ignore")  # a newer client may say more
@@ -142,8 +142,8 @@ def register_numbered(
 
     Args:
         rpc: registry of remote calls.
-        name: of the call.
-        model: of its payload.
+        name: name of the call.
+        model: model of its payload.
         take: carries out the request.
         kept: returns once the request outlasts a power cut; the call is answered then. None if nothing is kept.
     """
@@ -229,7 +229,7 @@ def planner_request(seq: int, gate: GateState, now: int, source: str, lease: flo
     """A planner's drive request to the gate with the latest state ``gate``.
 
     Args:
-        seq: of the publisher.
+        seq: sequence number of the publisher.
         gate: its nonce and stamp authenticate the request.
         now: ns.
         source: the planner.
@@ -276,7 +276,7 @@ def examine(request: Request, gate: GateState | None, sequences: Sequences, now:
     Args:
         request: what was asked.
         gate: newest state of the gate.
-        sequences: of this kind of requests.
+        sequences: sequences of this kind of requests.
         now: ns.
         max_age: greatest age of its gate stamp, s; None for a request that moves nothing.
 

@@ -41,7 +41,7 @@ def only_robot(name: str | None, choice: Callable[[str, str], str]) -> str:
     """Endpoint if none is given: the default port, unless several robots, or one at another port, answer.
 
     Args:
-        name: of the robot; None if it is not given either.
+        name: name of the robot; None if it is not given either.
         choice: describes the choice of a robot, by its name and endpoint.
 
     Raises:

@@ -38,7 +38,7 @@ class SlowComputer:
     """A computer with cores ``factor`` times slower than this one.
 
     Args:
-        clock: whose time is moved on; at most one slow computer per clock.
+        clock: clock whose time is moved on; at most one slow computer per clock.
         factor: how much slower it is.
     """
 

@@ -76,7 +76,7 @@ def replace_file(path: Path, content: str | bytes, mode: int = 0o644, *, follow_
     Args:
         path: the file, or a link to it.
         content: new content; text becomes UTF-8.
-        mode: of a new file.
+        mode: mode of a new file.
         follow_links: a link stays one and its file gets the content; otherwise the file takes the link's place.
 
     Raises:

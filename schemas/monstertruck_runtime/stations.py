@@ -71,7 +71,7 @@ def session_config(endpoint: str, timeout: float, tls: ClientTls | None) -> dict
     """Configuration of a Zenoh session that dials one endpoint, and neither listens nor discovers.
 
     Args:
-        endpoint: of the robot.
+        endpoint: endpoint of the robot.
         timeout: for the link, s.
         tls: for ``tls/...`` endpoints.
     """
@@ -97,7 +97,7 @@ def link_refusal(endpoint: str, ca: Path, tls: ClientTls | None, timeout: float)
     """Why this or the other side refuses a ``tls/...`` link, which Zenoh does not report; empty if it is accepted.
 
     Args:
-        endpoint: of the robot.
+        endpoint: endpoint of the robot.
         ca: certificate of the robot's authority.
         tls: certificate of this station, or None.
         timeout: seconds for each step.

@@ -24,7 +24,7 @@ class _BoundedComposer(Composer):
     """Builds the nodes of one document, until they are too many.
 
     Args:
-        loader: of the document.
+        loader: loader of the document.
         most: nodes.
         expand: count the target of an alias each time; otherwise the reader bounds it.
     """

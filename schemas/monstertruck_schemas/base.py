@@ -218,7 +218,7 @@ def position_deviation(covariance: NDArray[np.float64]) -> float:
     """Standard deviation of a position along the axis where it is largest, m.
 
     Args:
-        covariance: of (x, y, yaw), shape (9,) or (3, 3).
+        covariance: covariance of (x, y, yaw), shape (9,) or (3, 3).
     """
     xx, xy, _, _, yy, *_ = np.ravel(covariance).tolist()
     return math.sqrt(max((xx + yy) / 2 + math.hypot((xx - yy) / 2, xy), 0.0))

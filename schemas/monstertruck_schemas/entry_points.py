@@ -54,7 +54,7 @@ class ExtensibleTable(Mapping[str, R]):
     Each entry point has the name of the row that it points to.
 
     Args:
-        group: of the entry points, for instance ``monstertruck.trackers``.
+        group: group of the entry points, for instance ``monstertruck.trackers``.
         ours: rows of this repository.
     """
 

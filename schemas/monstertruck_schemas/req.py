@@ -272,7 +272,7 @@ class ExploreOrder(StrEnum):
 
 
 class ExploreRequest(Request):
-    """Explore from here on, or end that."""
+    """Order to start or to end an exploration."""
 
     order: ExploreOrder
     home: bool | None = None

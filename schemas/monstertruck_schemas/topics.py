@@ -249,7 +249,7 @@ ZONES: Final = Topic(
     retained=True,
 )
 PEERS: Final = Topic(
-    "state/peers", Peers, W.ESTIMATION, "Poses that other robots say of themselves, with when each came in", 10,
+    "state/peers", Peers, W.ESTIMATION, "Poses published by other robots, with the time of their receipt", 10,
     stale_after=0.5,
 )  # fmt: skip
 CONSISTENCY: Final = Topic(

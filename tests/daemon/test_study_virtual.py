@@ -105,7 +105,7 @@ def test_a_loss_of_the_controller_stops_all_wheels_and_ends_the_run(tmp_path: Pa
 
 def test_a_log_without_a_run_and_too_fast_a_run_are_refused(tmp_path: Path):
     golden = Path(__file__).resolve().parents[1] / "data" / "golden" / "0.1.0" / "run.mcap"
-    with pytest.raises(InputError, match="nobody drove by shaft speeds"):
+    with pytest.raises(InputError, match="no client drove by shaft speeds"):
         read_runs(golden)
     config = stand(tmp_path).model_copy(update={"recorder": None})
 

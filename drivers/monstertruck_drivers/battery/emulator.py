@@ -30,7 +30,7 @@ class IioEmulator(FaultyDevice):
         root: folder that stands for /.
         clock: time.
         source: volts at the pin at an instant, ns.
-        seed: of the noise.
+        seed: seed of the noise.
         channel: input the divider hangs on.
         device: the converter's name.
     """

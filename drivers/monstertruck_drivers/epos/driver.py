@@ -145,7 +145,7 @@ class EposDriver:
         commands: ``cmd/drive``; read by this driver alone.
         out: ``sensor/drive``, ``stamp`` in the middle of the exchange that read the position.
         events: gets the identity of the controller, and faults.
-        name: of the service.
+        name: name of the service.
     """
 
     def __init__(
@@ -278,7 +278,7 @@ class _DriveSession:
         """Notice a controller that restarted, by the mark that it lost, and mark it again.
 
         Args:
-            attempts: of each exchange.
+            attempts: attempts of each exchange.
 
         Raises:
             DeviceRestartedError: it did, while it was in use.

@@ -81,11 +81,11 @@ FINE: Final = (Reason.OK, Severity.INFO)
 class LinkQualityDriver:
     """Publishes the link's quality and reports when it becomes weak, is lost, and is fine again.
 
-    That a station is out of reach is found by its heartbeat, never by the signal: this is for people and plans.
+    Heartbeats, not the signal, decide whether a station is in reach; the signal serves operators and planning.
 
     Args:
         config: interface and limits.
-        computer: whose interfaces.
+        computer: computer whose interfaces.
         clock: time.
         out: link health.
         events: changes for the worse and back.

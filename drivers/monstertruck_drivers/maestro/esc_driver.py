@@ -37,7 +37,7 @@ class MaestroEscDriver(MaestroDriver):
         steering: pulses being sent, as servo angles.
         battery: pack voltage; None when the battery is measured elsewhere.
         events: where errors of the device are reported.
-        name: of the service.
+        name: name of the service.
     """
 
     def __init__(

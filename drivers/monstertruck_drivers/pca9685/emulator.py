@@ -53,7 +53,7 @@ class Pca9685Emulator(FaultyDevice):
     Args:
         clock: time.
         servos: physics of the servos; None = the pulses move nothing.
-        address: by its pins.
+        address: address by its pins.
         oscillator: frequency of its oscillator (Hz).
         seed: seed of false signals.
     """

@@ -36,7 +36,7 @@ class Pca9685EscDriver(Pca9685Driver):
         steering: pulses being sent, as servo angles.
         battery: not used.
         events: where faults of the chip are reported.
-        name: of the service.
+        name: name of the service.
     """
 
     def __init__(

@@ -28,7 +28,7 @@ class Pca9685Session:
     Args:
         link: open link to the bus.
         clock: time.
-        address: of the chip.
+        address: address of the chip.
         timeout: timeout of one transfer (s).
     """
 

@@ -22,7 +22,7 @@ class RoboclawDriver:
         clock: time.
         out: angles of the wheels.
         events: who answers, and its restarts.
-        name: of the service.
+        name: name of the service.
     """
 
     def __init__(

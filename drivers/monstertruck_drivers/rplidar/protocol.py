@@ -238,7 +238,7 @@ class RecordParser:
     """Collects bytes to records of one type; counts the bytes that belong to none.
 
     Args:
-        kind: of the samples.
+        kind: kind of the samples.
     """
 
     def __init__(self, kind: DataType) -> None:
@@ -371,7 +371,7 @@ def ultra_encode(millimetres: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 _INVALID: Final = (-512, 511)
-"""Differences that mean: no return."""
+"""Differences that mark a beam without a return."""
 
 
 def ultra_distances(data: bytes, following: bytes) -> Array:

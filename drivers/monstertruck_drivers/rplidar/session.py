@@ -205,7 +205,7 @@ class RplidarSession:
             self._heard += 1
             passed += 1
             if passed > 4096:  # more than any unit sends before it answers
-                raise WrongDeviceError(f"{self._link.name}: {passed} bytes, but no answer of a RPLIDAR")
+                raise WrongDeviceError(f"{self._link.name}: {passed} bytes, but no answer from an RPLIDAR")
             head = head[1:] + await self._exactly(1, what)
         return head
 

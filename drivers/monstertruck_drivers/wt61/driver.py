@@ -76,7 +76,7 @@ class Wt61Driver:
         clock: time.
         out: measurements, in the unit's own axes.
         events: not used.
-        name: of the service, and of the frame.
+        name: name of the service, and of the frame.
     """
 
     def __init__(

@@ -228,7 +228,7 @@ def lap(shape: RoundedRectangle = LOOP, spacing: float = 0.05) -> Array:
     """The drawn lap of a world, counter-clockwise from its start pose and back to it.
 
     Args:
-        shape: of the lap.
+        shape: shape of the lap.
         spacing: wanted distance of the points, m; the true one divides the lap evenly.
 
     Returns:

@@ -75,7 +75,7 @@ def mounted(pose: Pose2, config: CameraConfig, attitude: tuple[float, float, flo
     """The camera of a robot at ``pose``.
 
     Args:
-        pose: of the robot's geometric centre.
+        pose: pose of the robot's geometric centre.
         config: its mount.
         attitude: pitch, roll (rad) and height (m) of the body.
     """
@@ -96,7 +96,7 @@ class SimulatedView:
         crowd: who walks around.
         holder: holds a board before it.
         wall_height: m.
-        seed: of the noise; None: no noise.
+        seed: seed of the noise; None: no noise.
 
     Raises:
         NotInstalledError: tags need the extra ``vision``.
@@ -226,7 +226,7 @@ class Painter:
         Args:
             ranges: (n,) horizontal distance along each of ``azimuths``, m; inf = nothing.
             panels: the last one on top.
-            place: of the camera.
+            place: place of the camera.
         """
         depth = np.maximum(ranges * self._along, 0.05).astype(np.float32)
         shade = (WALLS + 127 / (1 + depth / 4.0)).astype(np.uint8)  # distance of half brightness, m

@@ -22,7 +22,7 @@ class WhiteNoise:
     """Standard normal noise of ``size`` channels, drawn by the block of neighbouring indices.
 
     Args:
-        seed: of the world.
+        seed: seed of the world.
         stream: one of the streams above.
         size: channels.
     """
@@ -45,7 +45,7 @@ class SlowNoise:
     """White noise drawn every ``period_ns``, straight lines between.
 
     Args:
-        seed: of the world.
+        seed: seed of the world.
         stream: one of the streams above.
         size: channels.
         period_ns: between draws.

@@ -64,7 +64,7 @@ class Sweep(Protocol):
         """Ranges, m; inf = nothing.
 
         Args:
-            poses: of the robot at the beams' instants, (6, n): x, y, yaw, pitch, roll, height.
+            poses: poses of the robot at the beams' instants, (6, n): x, y, yaw, pitch, roll, height.
             beams: directions in the body frame; None: ``BEAM_ANGLES`` in the body's plane.
             times_ns: instants of the beams, (n,), rising.
             reach: greatest horizontal distance looked at, m.
@@ -90,7 +90,7 @@ class PlaneSweep:
     Args:
         cast: ranges to the walls.
         terrain: the ground; None = level.
-        config: of the lidar.
+        config: configuration of the lidar.
     """
 
     def __init__(self, cast: Caster, terrain: Terrain | None, config: LidarConfig) -> None:
@@ -150,9 +150,9 @@ def over(
     Args:
         cast: horizontal ranges to the walls.
         ground: under them.
-        config: of the lidar.
-        origins: of the beams in the map frame, m.
-        yaw: of the robot, (n,).
+        config: configuration of the lidar.
+        origins: origins of the beams in the map frame, m.
+        yaw: yaw of the robot, (n,).
         beams: directions in the robot's level frame.
         times_ns: instants of the beams.
         reach: greatest horizontal distance looked at, m.
@@ -180,7 +180,7 @@ class SimulatedLidar:
         plant: carrier of the sensor.
         sweep: ranges along the beams.
         config: true parameters.
-        seed: of the noise; None: no noise.
+        seed: seed of the noise; None: no noise.
     """
 
     def __init__(self, plant: Plant, sweep: Sweep, config: LidarConfig, seed: int | None) -> None:

@@ -85,7 +85,7 @@ def leaning(cast: Caster, yaw: float, pitch: float, roll: float, over: float) ->
 
     Args:
         cast: ranges to the walls in the level; its angles are those that the rays of a level body would have.
-        yaw: of the body in the map frame, rad.
+        yaw: yaw of the body in the map frame, rad.
         pitch: its nose down positive, rad.
         roll: its right side down positive, rad.
         over: height of the walls over the sonars (m); sound above it passes.

@@ -61,10 +61,10 @@ class RigidSpace(Space):
     """``Space`` of rigid bodies: spare ones represent objects, people and other robots.
 
     Args:
-        footprint: of the robot, in its surroundings.
+        footprint: footprint of the robot, in its surroundings.
         plant: the robot, in its model.
         ground: under everything.
-        name: of the robot.
+        name: name of the robot.
     """
 
     def __init__(self, footprint: PlanOutline, plant: RigidPlant, ground: UnevenGround, name: str) -> None:
@@ -155,7 +155,7 @@ class RigidSweep:
         plant: the robot, in its model.
         cast: horizontal ranges to walls, things, people and robots.
         ground: under them.
-        config: of the lidar.
+        config: configuration of the lidar.
     """
 
     def __init__(self, plant: RigidPlant, cast: Caster, ground: UnevenGround, config: LidarConfig) -> None:
@@ -185,7 +185,7 @@ class RigidEchoes:
 
     Args:
         plant: the robot, in its model.
-        height: of the sonars over the ground, m.
+        height: height of the sonars over the ground, m.
     """
 
     def __init__(self, plant: RigidPlant, height: float) -> None:

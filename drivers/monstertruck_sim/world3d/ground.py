@@ -40,10 +40,10 @@ def ground_heights(
     """Sum of the map's profile, rough patches, features and picture; None: level.
 
     Args:
-        config: of the world.
-        profile: of the map.
-        bounds: of the map.
-        starts: of all robots of the world, for they stand on the same ground.
+        config: configuration of the world.
+        profile: profile of the map.
+        bounds: bounds of the map.
+        starts: starts of all robots of the world, for they stand on the same ground.
 
     Raises:
         InputError: no such picture.

@@ -91,10 +91,10 @@ class DriveLine:
         shafts: for every driven shaft its wheels' spin joints; between them are open differentials: the shaft turns
             with the mean of its wheels and gives all the same torque.
         locked: groups of spin joints whose means turn equally (a rigid transfer case).
-        stiffness: of the wind-up between a shaft and the mean of its wheels, Nm/rad.
+        stiffness: stiffness of the wind-up between a shaft and the mean of its wheels, Nm/rad.
         damping: Nm s/rad.
         clutch: greatest torque of all wheels of a shaft together, Nm.
-        turns: of a spin joint a turn of its wheel, where it is not 1.
+        turns: turns of a spin joint a turn of its wheel, where it is not 1.
     """
 
     shafts: tuple[tuple[str, ...], ...]
@@ -126,7 +126,7 @@ class StaticScene:
     Args:
         walls: rectangles of solid map cells, (n, 4): least x, least y, greatest x, greatest y, m.
         wall_height: over the ground, m.
-        heights: of the ground; None = level at 0.
+        heights: heights of the ground; None = level at 0.
         blocks: on it.
         scenery: assets, and bodies and geometries, of another MJCF file.
         tags: on the walls.
@@ -152,7 +152,7 @@ def rectangles(solid: NDArray[np.bool_], resolution: float, origin: tuple[float,
     Args:
         solid: (rows, columns), row 0 lowest y.
         resolution: side of a cell, m.
-        origin: of the lower left corner, m.
+        origin: origin of the lower left corner, m.
         longest: side of a rectangle, cells: on uneven ground a wall follows it piece by piece.
     """
     left = solid.copy()
@@ -182,7 +182,7 @@ def mjcf(description: Description, drive: DriveLine, friction: float, scene: Sta
     """The whole model as text.
 
     Args:
-        description: of the robot; its first link moves freely.
+        description: description of the robot; its first link moves freely.
         drive: its drive line.
         friction: between tyres and everything.
         scene: around it.

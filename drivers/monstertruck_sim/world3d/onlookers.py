@@ -96,7 +96,7 @@ class CeilingView(RenderedView):
     """``ViewSource`` of a fixed camera in the world.
 
     Args:
-        world: of engine mujoco.
+        world: world of engine mujoco.
         config: place, lens and noise.
         board: board held in front of the camera, or None.
         seed: seed of noise and board poses.

@@ -24,7 +24,7 @@ class CameraPose:
     """From where a picture is taken.
 
     Args:
-        place: of the camera, m.
+        place: place of the camera, m.
         ahead: unit vector, the axis of the picture.
         up: unit vector, at a right angle to it.
         field_of_view: from the lower to the upper edge, rad.
@@ -57,7 +57,7 @@ class WorldRenderer:
 
     Args:
         model: MuJoCo's.
-        width: of the pictures, pixels.
+        width: width of the pictures, pixels.
         height: pixels.
 
     Raises:

@@ -68,9 +68,9 @@ def line_on_board(
 
     Args:
         view: with scans.
-        reader: of the board.
-        lens: of the camera.
-        mount: of the camera, ``NAMES``.
+        reader: reader of the board.
+        lens: lens of the camera.
+        mount: mount of the camera, ``NAMES``.
         lidar: where it is.
         known: the mount has been fitted.
     """
@@ -144,11 +144,11 @@ def plane_sigmas(view: BoardView, reader: BoardReader, lens: Lens, pose: BoardPo
     """Standard deviations by the noise of the corners: of the plane at a line's middle, m, and of its slope, rad.
 
     Args:
-        view: of the board.
+        view: view of the board.
         reader: that found it.
-        lens: of the camera.
-        pose: of the board.
-        ends: of the line, in the camera's axes, m, (2, 3).
+        lens: lens of the camera.
+        pose: pose of the board.
+        ends: ends of the line, in the camera's axes, m, (2, 3).
     """
     start = np.concatenate((np.ravel(cv2.Rodrigues(pose.axes)[0]), pose.place))
     _, slopes = cv2.projectPoints(reader.points[view.sighting.ids], start[:3], start[3:], lens.matrix, lens.distortion)
@@ -213,9 +213,9 @@ def fit_mount(
     """The camera's mount, and the lines it rests on.
 
     Args:
-        views: of the board, with scans.
+        views: views of the board, with scans.
         reader: that found them.
-        lens: of the camera.
+        lens: lens of the camera.
         mount: as configured.
         lidar: where it is.
         focal_error: standard deviation of the focal length, as a share: it shows as the board's size.

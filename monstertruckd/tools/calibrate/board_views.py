@@ -72,7 +72,7 @@ class BoardGuide:
     """Takes images, keeps views, and lists the missing ones.
 
     Args:
-        reader: of the board.
+        reader: reader of the board.
         lens: as configured; used only to judge tilts and distances.
         beams: whether the lidar also sees the board in a view; None without a lidar.
         patience: timeout without a new view (s).

@@ -185,7 +185,7 @@ def mount_of(
     """Fit the mount, given the lens and the lidar.
 
     Args:
-        views: of the board.
+        views: views of the board.
         reader: source of the views.
         found: the lens.
         mount: as configured, ``NAMES``.

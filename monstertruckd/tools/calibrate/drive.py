@@ -155,7 +155,7 @@ def turns_per_metre(values: Sequence[float], tape_error: float, metres: float, b
     """Turns of the motor per metre on this floor.
 
     Args:
-        values: of every run, 1/m.
+        values: values of every run, 1/m.
         tape_error: standard deviation of one reading of the tape, m.
         metres: length of a run.
         bend: maximum unseen crookedness of a run, as a fraction.

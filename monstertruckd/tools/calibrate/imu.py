@@ -118,7 +118,7 @@ def result_of(
 
     Args:
         resting: readings of the unit while the truck stands.
-        tilt: of the truck meanwhile.
+        tilt: tilt of the truck meanwhile.
         turns: between rests; none: the scale stays as it was.
         before: correction that the daemon runs with, which is in ``resting``, by the names of the estimates.
 

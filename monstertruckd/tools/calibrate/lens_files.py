@@ -33,7 +33,7 @@ def lens_from(text: str, file: Path, *, camera: str | None = None, size: tuple[i
     """Return the lens in a file's text.
 
     Args:
-        text: of the file.
+        text: text of the file.
         file: its name, for refusals.
         camera: name in a chain of cameras; None: the only one.
         size: width and height of the pictures (pixels), where the file does not state them.
@@ -56,8 +56,8 @@ def lens_text(lens: LensConfig, form: LensForm, name: str = "camera") -> str:
 
     Args:
         lens: what to write.
-        form: of the file.
-        name: of the camera.
+        form: format of the file.
+        name: name of the camera.
     """
     focal = (lens.focal_x, lens.focal_y, lens.centre_x, lens.centre_y)
     matrix = [lens.focal_x, 0.0, lens.centre_x, 0.0, lens.focal_y, lens.centre_y, 0.0, 0.0, 1.0]

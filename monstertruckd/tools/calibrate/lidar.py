@@ -240,7 +240,7 @@ def result_of(
         legs: driven.
         mount: as configured, m and rad.
         crab: standard deviation of the direction of travel, rad.
-        offset: of the clocks; None if not measured.
+        offset: offset of the clocks; None if not measured.
         level: pitch and roll, where measured.
 
     Raises:
@@ -343,7 +343,7 @@ def check_way_round(before: Scan, after: Scan, moved: tuple[float, float], mount
         after: and at the second one.
         moved: distance (m) and turn (rad) of the body.
         mount: as configured.
-        overlap: of the scans as they are.
+        overlap: overlap of the scans as they are.
 
     Raises:
         InputError: so it is.
@@ -413,7 +413,7 @@ def beam_tilt(heights: Sequence[float], walls: tuple[float, float]) -> tuple[flo
     """Pitch, nose down positive, and roll, right side down positive, of the beam's plane, rad.
 
     Args:
-        heights: of the beam at the lidar, on the wall ahead and on the one to the left, m.
+        heights: heights of the beam at the lidar, on the wall ahead and on the one to the left, m.
         walls: distances of these, m.
 
     Raises:
@@ -446,7 +446,7 @@ def fit_offset(series: Sequence[tuple[Array, Array, Array, Array]], coarse: floa
     """Least-squares fit of the offset.
 
     Args:
-        series: of each move, times (s) and yaws (rad) of the scans, times and yaws of odometry.
+        series: series of each move, times (s) and yaws (rad) of the scans, times and yaws of odometry.
         coarse: first guess, s; None for 0.
     """
 

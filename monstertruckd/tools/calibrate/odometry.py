@@ -189,8 +189,8 @@ class SquareModel:
     left and at the rear to the right.
 
     Args:
-        model: of the truck.
-        maps: of the servos, that the daemon runs with.
+        model: model of the truck.
+        maps: maps of the servos, that the daemon runs with.
         ahead: front bumper before the base, m.
     """
 

@@ -117,7 +117,7 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
 
     Args:
         arcs: driven.
-        radius: of the wheels, nominal, m.
+        radius: radius of the wheels, nominal, m.
         half_track: m.
 
     Raises:

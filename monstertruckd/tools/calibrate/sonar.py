@@ -216,10 +216,10 @@ def wall_range(
     """Range of a wall, m, and by how much its normal is past the cone's edge, rad; (n,) each.
 
     Args:
-        poses: of the robot, (n, 3).
-        place: of the sonar.
+        poses: poses of the robot, (n, 3).
+        place: place of the sonar.
         wall: distance from the origin (m), and by how much it is turned from the x axis to the right (rad).
-        half: of the cone, rad.
+        half: half angle of the cone, rad.
     """
     x, y, yaw = poses.T
     turned = yaw + wall[1]

@@ -152,7 +152,7 @@ def result_of(
         flat: on the level floor.
         nose: with the nose low.
         side: with the right side low.
-        heights: of the beam.
+        heights: heights of the beam.
         walls: distances of the wall ahead and of the one to the left, m.
         settings: that the daemon runs with.
         tape_error: standard deviation of a height, m.

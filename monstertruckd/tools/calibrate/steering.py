@@ -359,7 +359,7 @@ def _rough(
 
     Args:
         arcs: driven.
-        model: of the truck.
+        model: model of the truck.
         start: configured maps, with the directions found.
         again: remaining steps.
     """

@@ -116,7 +116,7 @@ def response(records: Iterable[MoveRecord], chassis: TruckChassis, iron: IronCon
     """Dead time and lag of the axles behind the commands.
 
     Args:
-        records: of weaves.
+        records: records of weaves.
         chassis: for the turns that commands mean.
         iron: magnetic calibration that the compass runs with.
 

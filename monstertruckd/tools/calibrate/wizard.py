@@ -52,7 +52,7 @@ class WizardContext:
         truck: link to it.
         panel: the operator.
         clock: time.
-        config: of the daemon, calibration included.
+        config: configuration of the daemon, calibration included.
         known: the truck's calibration so far, by wizard; expired results, and results of another part, are ignored.
     """
 
@@ -225,8 +225,8 @@ def missing(config: TruckConfig, results: Mapping[str, Result], expired: Collect
     """Return the runs of wizards that a robot still needs, in an order that lets each use the results before it.
 
     Args:
-        config: of the robot.
-        results: of the wizards so far.
+        config: configuration of the robot.
+        results: results of the wizards so far.
         expired: wizards with expired results.
     """
     found = []

@@ -21,7 +21,7 @@ class PageCalibrator:
     """Offers and runs the steps of ``calibrate all``.
 
     Args:
-        clock: of the station.
+        clock: clock of the station.
     """
 
     def __init__(self, clock: "Clock") -> None:

@@ -95,7 +95,7 @@ async def require_section(client: "TruckClient", section: str, lacks: str) -> An
     """Return a section of the robot's configuration, as JSON.
 
     Args:
-        client: of the robot.
+        client: client of the robot.
         section: its name.
         lacks: what the robot does not do without it, such as "does not explore".
 

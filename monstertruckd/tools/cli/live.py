@@ -82,9 +82,7 @@ async def _explain_silence(client: "TruckClient", clock: "Clock", topic: "Topic[
     if not await client.alive():
         remark(f"no robot {client.robot!r} seen at {client.endpoint}; waiting for {topic.name}")
     elif topic.writer is Writer.STAND:
-        remark(
-            f"robot {client.robot!r} records {topic.name} where `stand:` is set, and passes it on to nobody; waiting"
-        )
+        remark(f"robot {client.robot!r} only records {topic.name}, if `stand:` is set, and never publishes it; waiting")
     else:
         why = await not_ready(client)
         remark(f"robot {client.robot!r} is there but publishes no {topic.name} yet; waiting{why}")

@@ -242,7 +242,7 @@ def print_end(reason: Reason, text: str, values: Mapping[str, Any], *, json_outp
     Angles are shown in degrees as well. The robot's own text keeps to rad, as recorded runs are compared word by word.
 
     Args:
-        reason: of the end.
+        reason: reason of the end.
         text: the end in words.
         values: data of the JSON output.
         json_output: whether it is.

@@ -101,7 +101,7 @@ async def run_mission(
     """Start a mission and wait for its end, see ``run_task``.
 
     Args:
-        client: of the robot.
+        client: client of the robot.
         mission: None = resume the interrupted one.
         arm: arm the robot first.
         moved: see ``TruckClient.mission``.

@@ -110,7 +110,7 @@ class RobotLink:
     Args:
         robot: its name.
         endpoint: where it listens.
-        clock: of this computer.
+        clock: clock of this computer.
         say: gets lines for people.
     """
 

@@ -162,7 +162,7 @@ def summarised(end: TaskEnd[ExplorationState], truth: Array, folder: Path) -> Ex
     """Figures of a run whose log is in ``folder``, where its report is written; blocks for seconds.
 
     Args:
-        end: of the exploration.
+        end: end of the exploration.
         truth: shape (n, 6), as ``TruthLog.COLUMNS``.
         folder: with ``logs`` and the saved map in ``explored``.
     """

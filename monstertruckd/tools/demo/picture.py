@@ -24,7 +24,7 @@ class MapScreen:
     """Picture of the map with a line below it, redrawn in place; the last one stays.
 
     Args:
-        console: of a terminal.
+        console: console of a terminal.
     """
 
     def __init__(self, console: Console) -> None:

@@ -121,7 +121,7 @@ async def run_tryout(
         clock: time.
         robot: configuration of a simulated robot.
         folder: for logs, state and map.
-        port: of the page.
+        port: port of the page.
         say: gets a line for the terminal.
         browser: whether to open the page in a browser, where there is one.
         calibrator: the calibration wizards, for the page.

@@ -220,7 +220,7 @@ def inspect(system: Path, program: Program, config_file: Path | None, uid: int, 
         system: folder with its files; "/" is the real one.
         program: this one.
         config_file: named by the user; None = the one the service is started with.
-        uid: of the caller.
+        uid: user id of the caller.
         clock: time.
     """
     unit = text_of(below(system, UNIT)) or ""

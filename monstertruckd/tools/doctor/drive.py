@@ -53,8 +53,8 @@ async def signs(drives: Drives, config: TruckConfig, command: Callable[..., str]
 
     Args:
         drives: moves the robot as an operator; raises where the gate refuses.
-        config: of the daemon.
-        command: of this installation.
+        config: configuration of the daemon.
+        command: command of this installation.
     """
     chassis = config.chassis()
     if not isinstance(chassis, TruckChassis):
@@ -82,7 +82,7 @@ def movement(record: MoveRecord, chassis: TruckChassis, lidar: Array | None) -> 
 
     Args:
         record: with scans and IMU, where there are.
-        chassis: of the robot.
+        chassis: chassis of the robot.
         lidar: its mount, m and rad, or None.
     """
     distance, turn = by_wheels(record, chassis)

@@ -59,7 +59,7 @@ class LegFile(Generic[Outcome]):
     Args:
         path: the file; made where there is none.
         leg: any one of the drill.
-        adapter: of a leg's outcomes.
+        adapter: adapter of a leg's outcomes.
 
     Raises:
         InputError: it cannot be read or written, or is of another drill or program.
@@ -165,7 +165,7 @@ def run_legs(
     Args:
         legs: at least one.
         step: runs one of them; a function of a module.
-        adapter: of a leg's outcomes.
+        adapter: adapter of a leg's outcomes.
         jobs: processes; 1 = this one alone.
         resume: file of the outcomes: legs that are in it are not run again, the others are added.
         report: called with the outcomes of each leg.

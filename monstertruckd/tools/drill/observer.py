@@ -165,7 +165,7 @@ class _StepperWire(MotorWire):
 
     Args:
         tap: the controller's cable.
-        config: of the driver.
+        config: configuration of the driver.
         drivetrain: motor to wheel.
     """
 
@@ -395,14 +395,14 @@ class _Standstill:
         if self.must_stop and now > self.began + limit:
             yield "stop", f"{speed:.3f} m/s: must stand"
         if self.disarms and self.stood is not None:
-            yield "unarmed", f"{speed:.3f} m/s: set off again though nobody armed it"
+            yield "unarmed", f"{speed:.3f} m/s: moved again without being armed"
 
 
 class _Speeds:
     """True and commanded speeds stay within the limits; no command reverses the direction before standstill.
 
     Args:
-        chassis: of the body.
+        chassis: chassis of the body.
         backwards: reverse speed limit (m/s).
         forwards: forward speed limit (m/s).
     """
@@ -498,7 +498,7 @@ class _PulsedSteering:
     """Steering angles commanded by the latest pulses; straight ahead for a body without servos.
 
     Args:
-        config: of the robot.
+        config: configuration of the robot.
     """
 
     def __init__(self, config: SimulatedTruckConfig) -> None:
@@ -523,7 +523,7 @@ class _Pulses:
     """Commanded servo angles stay within the limits of servos and axles.
 
     Args:
-        config: of the truck, with a steering device.
+        config: configuration of the truck, with a steering device.
         steering: steering model of the pulses.
     """
 
@@ -550,8 +550,8 @@ class _Turning:
     A held shaft turns a robot with several motors, whatever its bytes command. ``_HeldShaft`` limits this time.
 
     Args:
-        steering: of the pulses.
-        world: of the shafts.
+        steering: steering of the pulses.
+        world: world of the shafts.
     """
 
     def __init__(self, steering: _PulsedSteering, world: World) -> None:
@@ -645,7 +645,7 @@ class _Ahead:
     """Forward driving: obstacles ahead within the truck's width, and obstacles on its arc.
 
     Args:
-        config: of the truck.
+        config: configuration of the truck.
         world: its obstacles are checked from the camera's position.
     """
 
@@ -712,7 +712,7 @@ class Observer:
     """Checks the invariants of one truck, and measures its reactions; ``begin`` and ``end_fault`` enclose one fault.
 
     Args:
-        config: of the truck, for its limits.
+        config: configuration of the truck, for its limits.
         world: the simulated world.
         ports: ports to tap: of the motors, and of steering, lidar and compass if present.
         clock: time.

@@ -47,7 +47,7 @@ class DrivingStation:
     """A station that sends drive requests, 20 a second, until it is made silent.
 
     Args:
-        bus: of the daemon.
+        bus: bus of the daemon.
         clock: time.
         speed: requested, m/s.
         front: angle of the bicycle's front axle that is requested, rad.
@@ -134,7 +134,7 @@ class Wanderer(DrivingStation):
     Nothing on a robot without range sensors stops it before an obstacle: its operator looks, and keeps it clear.
 
     Args:
-        bus: of the daemon.
+        bus: bus of the daemon.
         clock: time.
         config: limits of the robot.
         rng: randomness.
@@ -229,7 +229,7 @@ class GoalGiver:
     """An operator that gives the planner one goal after another, at random free places of the world.
 
     Args:
-        truck: whose planner drives.
+        truck: truck whose planner drives.
         rng: randomness.
     """
 

@@ -75,7 +75,7 @@ def unit_text(config: TruckConfig, config_file: Path, user: str, program: Progra
     """The unit.
 
     Args:
-        config: whose drives are stopped after a death.
+        config: configuration whose drives are stopped after a death.
         config_file: configuration file of the service.
         user: it runs as.
         program: command of the service.

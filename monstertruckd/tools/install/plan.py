@@ -82,7 +82,7 @@ def plan(config_file: Path | None, user: str | None, program: Program, root: Pat
         config_file: copied to /etc; None, or one that is there: the one the installed unit names, as it is.
         user: user of the service; None for the installed unit's user, else ``USER``.
         program: command of the service.
-        root: of the system that gets it.
+        root: root of the system that gets it.
 
     Raises:
         NotFoundError: no configuration was given and none is installed.
@@ -141,9 +141,9 @@ def _placed(files: Sequence[Path], maps: Sequence[Path], folder: Path) -> tuple[
     """Place of the configuration, and the files to copy there; relative places stay the same.
 
     Args:
-        files: of the configuration, its own first; files with absolute paths stay in place.
+        files: files of the configuration, its own first; files with absolute paths stay in place.
         maps: that it names.
-        folder: of installed configurations.
+        folder: folder of installed configurations.
 
     Raises:
         InputError: a map cannot be read.

@@ -105,7 +105,7 @@ def animate(
     """Write a log as an animated GIF.
 
     Args:
-        reader: of the log.
+        reader: reader of the log.
         output: the file.
         speed: ratio of log time to display time.
         width: pixels.
@@ -165,7 +165,7 @@ class _AnimationCanvas:
     Args:
         scenes: all of them, for the section that is shown.
         width: pixels.
-        geometry: of the truck.
+        geometry: geometry of the truck.
     """
 
     def __init__(self, scenes: list[AnimationFrame], width: int, geometry: Geometry) -> None:

@@ -43,7 +43,7 @@ def scans_of(path: Path, make: str, content: BagContent, given: dict[str, Any], 
     Args:
         path: the bag, for refusals.
         make: kind of log.
-        content: of it.
+        content: content of it.
         given: geometry; overrides the bag.
         topics: choice of scans and odometry where there are several.
 

@@ -134,7 +134,7 @@ def content_of(path: Path, messages: Iterator[RawMessage]) -> BagContent:
 
     Args:
         path: the log, for refusals.
-        messages: of the log, in any order.
+        messages: messages of the log, in any order.
 
     Raises:
         InputError: a message of these is damaged; names the topic.

@@ -50,7 +50,7 @@ class PathQuality:
         Args:
             trajectory: stamps (n,), ns, and poses (n, 3) of base in map.
             on_map: shape (n,), which of them belong to the map.
-            estimates: of the scans, as they were made.
+            estimates: estimates of the scans, as they were made.
             scans: all scans of the log.
         """
         stamps, poses = trajectory

@@ -37,7 +37,7 @@ class MountCheck:
         """Compare the motions of a log's path.
 
         Args:
-            scans: of the log, with odometry where it has any.
+            scans: scans of the log, with odometry where it has any.
             trajectory: stamps (n,), ns, and poses (n, 3) by the scans.
 
         Returns:

@@ -126,7 +126,7 @@ class OpenedLog:
             columns: names as they are in each topic's table, for those topics that have them; empty = all.
             start: s after the log's first message.
             end: as ``start``.
-            library: of the table.
+            library: library of the table.
 
         Raises:
             InputError: no topic, or ``at`` is not among them.

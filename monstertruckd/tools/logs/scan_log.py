@@ -75,7 +75,7 @@ def no_return(ranges: Array) -> float:
     """Range without a return: a maximum that recurs, or infinity.
 
     Args:
-        ranges: of any shape, at least one of them finite, m.
+        ranges: ranges of any shape, at least one of them finite, m.
     """
     finite = ranges[np.isfinite(ranges)]
     greatest = float(finite.max())

@@ -56,7 +56,7 @@ def read_scans(path: Path, geometry: LogGeometry | None = None, topics: tuple[st
 
     Args:
         path: the log; of ROS 2, its folder.
-        geometry: of a log that does not hold it; it overrides an npz log or a bag.
+        geometry: geometry of a log that does not hold it; it overrides an npz log or a bag.
         topics: of scans and odometry, for logs that have several; of a CARMEN log the word that its lines begin with.
 
     Raises:

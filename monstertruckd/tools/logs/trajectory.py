@@ -67,7 +67,7 @@ def write_trajectory(
     """Write poses of a log's scans; list lost ones in a second file (``poses.lost.txt``, TUM; empty if none is).
 
     Args:
-        path: of the file.
+        path: path of the file.
         stamps: shape (n,), ns, of the scans' first beams.
         poses: shape (n, 3), base in map at ``stamps``.
         log: where the scans are from.

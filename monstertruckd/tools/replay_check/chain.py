@@ -166,8 +166,8 @@ class Chain:
     """Takes the messages of a log in their order.
 
     Args:
-        config: of the robot; see ``replayable``.
-        clock: of the running replay.
+        config: configuration of the robot; see ``replayable``.
+        clock: clock of the running replay.
         unseen: ticks that were not recorded, see ``unseen_ticks``.
         log: data read from the log beforehand.
     """

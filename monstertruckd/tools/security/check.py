@@ -43,8 +43,8 @@ async def check(folder: Folder, endpoint: str, clock: Clock) -> list[Case]:
     """Try everything at ``endpoint``.
 
     Args:
-        folder: of the authority, whose certificates are made for the purpose and thrown away.
-        endpoint: of the robot, ``tls/...``.
+        folder: folder of the authority, whose certificates are made for the purpose and thrown away.
+        endpoint: endpoint of the robot, ``tls/...``.
         clock: time.
 
     Raises:
@@ -63,8 +63,8 @@ class _Attempt:
     """The cases at one endpoint.
 
     Args:
-        folder: of the authority.
-        endpoint: of the robot.
+        folder: folder of the authority.
+        endpoint: endpoint of the robot.
         clock: time.
         scratch: for certificates.
     """

@@ -120,7 +120,7 @@ class Folder:
     """An authority's folder.
 
     Args:
-        path: of it.
+        path: path of it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -151,7 +151,7 @@ class Folder:
 
         Args:
             robot: its name; None, here and below, keeps the value; at first truck.
-            addresses: of the robot, for stations; at first of this computer.
+            addresses: addresses of the robot, for stations; at first of this computer.
             place: where the robot keeps its files.
             now: real time, s.
             days: until the robot's certificate expires.

@@ -34,7 +34,7 @@ def make_router(
     Args:
         path: folder of the router's authority.
         robots: folders of the robots' authorities.
-        addresses: of the router, for robots and stations; robots dial the first one.
+        addresses: addresses of the router, for robots and stations; robots dial the first one.
         now: real time, s.
         place: folder of the router's files.
         port: where it listens.
@@ -71,7 +71,7 @@ def router_session(place: Path, port: int, fleet: dict[str, tuple[str, ...]]) ->
     """Zenoh's configuration of the router.
 
     Args:
-        place: of its files.
+        place: place of its files.
         port: where it listens.
         fleet: common names of the stations that each robot knows, by its name.
     """

@@ -181,7 +181,7 @@ def _linked(config: SimulatedTruckConfig, folder: Path) -> Iterator[None]:
         return
     link = config.machine
     if link.exists() and not link.is_symlink():
-        raise InputError(f"machine: {link} exists: expected the name of a link to be made to the emulated computer")
+        raise InputError(f"machine: {link} exists: expected a free name for the link to the emulated computer")
     with claimed(link):
         link.unlink(missing_ok=True)
         link.symlink_to(folder, target_is_directory=True)
@@ -197,7 +197,7 @@ class ServedRobot:
     Args:
         config: the robot.
         clock: time.
-        folder: of its emulated computer.
+        folder: folder of its emulated computer.
         scene: world.
         say: gets a line for the terminal.
         keeps_truth: whether what really happens is requested at the end; a day of it is 80 MB.

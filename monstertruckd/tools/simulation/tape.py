@@ -42,7 +42,7 @@ class EmulatedTape:
         elif words:
             raise InputError(f"expected {WORDS}")
         elif self._mark is None:
-            self._say(f"{_meter(now)}; `tape mark` first, and it measures a way from there, too")
+            self._say(f"{_meter(now)}; type `tape mark` first to measure a distance")
         else:
             self._say(measured(self._mark, now, *self._body))
 
@@ -53,8 +53,8 @@ def measured(mark: TruthState, now: TruthState, length: float, width: float) -> 
     Args:
         mark: when mark and string were laid.
         now: when it is measured.
-        length: of the body, m.
-        width: of the body, m.
+        length: length of the body, m.
+        width: width of the body, m.
     """
     (ahead, left), (_, side) = (_moved(mark, now, *place) for place in ((length / 2, 0.0), (0.0, width / 2)))
     turn = math.degrees(math.remainder(now.yaw - mark.yaw, math.tau))

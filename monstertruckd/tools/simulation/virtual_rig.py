@@ -35,8 +35,8 @@ class VirtualRig:
     """A whole robot in one process; everything random comes from the configuration's seed.
 
     Args:
-        config: of the simulated truck.
-        clock: of the running virtual loop.
+        config: configuration of the simulated truck.
+        clock: clock of the running virtual loop.
         tree: origins of the configuration's values.
         scene: world shared with other rigs of the same clock; None for its own.
     """

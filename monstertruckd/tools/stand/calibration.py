@@ -99,7 +99,7 @@ def check_places(
     Args:
         placed: camera, by all of its marks.
         seen: middles of its marks, pixels.
-        marks: by tag.
+        marks: marks by tag.
         ruler: standard deviation of a mark's place, m.
 
     Raises:
@@ -139,7 +139,7 @@ def join(
     Args:
         cameras: placed one by one.
         seen: middles of marks by camera, pixels.
-        marks: by tag.
+        marks: marks by tag.
         ruler: standard deviation of a mark's place, m.
     """
     names = list(cameras)
@@ -178,7 +178,7 @@ def calibrate(
     """Lenses, places, and the join.
 
     Args:
-        config: of the stand.
+        config: configuration of the stand.
         boards: pictures of the board by camera.
         floors: pictures of the table by camera.
 

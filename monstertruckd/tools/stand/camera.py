@@ -35,7 +35,7 @@ class PlacedCamera:
 
         Args:
             pixels: seen.
-            height: of the plane above the stand's plane, m.
+            height: height of the plane above the stand's plane, m.
         """
         return meet(self.lens.directions(pixels), self.axes, self.translation, height)
 
@@ -67,9 +67,9 @@ def meet(directions: Array, axes: Array, translation: Array, height: float = 0.0
 
     Args:
         directions: x and y at z = 1 of the camera, (n, 2).
-        axes: of the camera in the stand, as rows, (3, 3).
+        axes: axes of the camera in the stand, as rows, (3, 3).
         translation: the stand's origin as the camera has it, m.
-        height: of the plane, m.
+        height: height of the plane, m.
     """
     rays = np.column_stack((directions, np.ones(len(directions)))) @ axes
     centre = -axes.T @ translation

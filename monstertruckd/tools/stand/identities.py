@@ -50,7 +50,7 @@ class Identities:
     """Names to pairs of discs.
 
     Args:
-        robots: by name.
+        robots: robots by name.
     """
 
     def __init__(self, robots: Mapping[str, BlobRobot]) -> None:
@@ -67,7 +67,7 @@ class Identities:
         """Robots in one picture.
 
         Args:
-            stamp: of it, ns.
+            stamp: stamp of it, ns.
             camera: that took it.
             blobs: in it.
         """

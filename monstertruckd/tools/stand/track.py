@@ -25,7 +25,7 @@ class StandReader:
 
     Args:
         marks: tags that lie on the table.
-        colours: of robots' discs; empty: pictures may be grey.
+        colours: colours of robots' discs; empty: pictures may be grey.
         tagged: there are robots with tags; otherwise tags are read in one picture of ``EVERYWHERE``, for the marks.
         phase: number of the camera: in each picture a different camera looks for tags everywhere.
     """
@@ -60,14 +60,14 @@ class StandRun:
     """Tracks until its sources end, or it is cancelled.
 
     Args:
-        tracker: of robots and cameras.
+        tracker: tracker of robots and cameras.
         streams: pictures by camera; each call starts again.
         rate: pictures a second.
         clock: stamps a picture when it was read.
         put: gets every pose.
         say: gets faults of cameras.
         live: a source that ends is a fault, and tried again.
-        colours: of robots' discs; pictures have to be in colour for any.
+        colours: colours of robots' discs; pictures have to be in colour for any.
     """
 
     def __init__(

@@ -121,7 +121,7 @@ class StandTracker:
         """Poses at one instant.
 
         Args:
-            stamp: of it, ns.
+            stamp: stamp of it, ns.
             pictures: tags and discs in the cameras' pictures.
             taken: stamps of pictures that were taken before, ns: a robot is carried on by its speed.
         """

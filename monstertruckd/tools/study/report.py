@@ -36,8 +36,8 @@ def as_values(results: Sequence[Result], radius: float, half_track: float) -> di
     """Everything as plain values.
 
     Args:
-        results: of ``analyse``.
-        radius: of the wheels, nominal, m.
+        results: results of ``analyse``.
+        radius: radius of the wheels, nominal, m.
         half_track: m.
     """
     circles = [_circle(run, found, radius, half_track) for run, found in results if isinstance(found, Circle)]

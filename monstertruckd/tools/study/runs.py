@@ -32,10 +32,10 @@ def circle_plan(config: TruckConfig, ratio: float, reference: float, laps: float
     """A circle to the left: the right side at the reference rate, the left one slower by the ratio.
 
     Args:
-        config: of the robot, with its geometry.
-        ratio: of the sides' rates, above 1; inf = the left side is locked.
+        config: configuration of the robot, with its geometry.
+        ratio: ratio of the sides' rates, above 1; inf = the left side is locked.
         reference: rate of the faster side, rad/s.
-        laps: of the ideal robot; one that skids turns less.
+        laps: laps of the ideal robot; one that skids turns less.
 
     Raises:
         InputError: numbers that make no circle.
@@ -50,8 +50,8 @@ def straight_plan(config: TruckConfig, length: float, passes: int, reference: fl
     """Passes to and fro, each as long as the ideal robot needs.
 
     Args:
-        config: of the robot.
-        length: of a pass, m.
+        config: configuration of the robot.
+        length: length of a pass, m.
         passes: how many.
         reference: rate of all wheels, rad/s.
 

@@ -60,11 +60,11 @@ async def tune(
     Before each run the behaviour as configured, with its own gains, brings the robot along the wall.
 
     Args:
-        client: of the robot.
-        name: of a behaviour of kind ``wall_pd``.
+        client: client of the robot.
+        name: name of a behaviour of kind ``wall_pd``.
         distance: the nearer one, m; every second run wants 5 cm more.
         first: K_p of the first run.
-        seconds: of following that make a run.
+        seconds: seconds of following that make a run.
         pause: waits until the robot stands.
         report: called with every run.
 

@@ -55,7 +55,7 @@ class StandingWatch:
             stamp: stamp of the later scan, ns.
             rolled: motion by the wheels, shape (3,), m, m, rad.
             moved: motion by the scans, shape (3,), m, m, rad.
-            covariance: of the pose at the later scan, shape (3, 3).
+            covariance: covariance of the pose at the later scan, shape (3, 3).
         """
         velocity, before = rolled / (stamp - since) * SECOND, self._velocity
         self._velocity, speed = velocity, float(np.linalg.norm(velocity))

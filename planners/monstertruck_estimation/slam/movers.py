@@ -61,9 +61,9 @@ class MoverDetector:
         """Return ``scan`` without the points that move.
 
         Args:
-            stamp: of the scan, ns.
+            stamp: stamp of the scan, ns.
             delta: shape (3,), motion of base since the scan before by odometry; None without trusted odometry.
-            turn: of base since then by the match of the whole scan, rad.
+            turn: turn of base since then by the match of the whole scan, rad.
             scan: points in base.
         """
         if delta is None or not len(scan):

@@ -133,7 +133,7 @@ def prepare_input(inputs: ScanInput, longest: float, twist: Twist2 = (0.0, 0.0, 
     Args:
         inputs: the scan.
         longest: longer ranges are not used, m.
-        twist: of the base, m/s and rad/s, used without odometry.
+        twist: twist of the base, m/s and rad/s, used without odometry.
     """
     geometry = ScanGeometry(
         inputs.start_angle,

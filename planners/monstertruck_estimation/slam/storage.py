@@ -121,7 +121,7 @@ def save(folder: Path, patch: GridPatch, graph: SavedGraph | None, run: str = ""
     """Write a save of a map.
 
     Args:
-        folder: of the map.
+        folder: folder of the map.
         patch: the whole grid.
         graph: keyframes; None or empty = the grid alone.
         run: that made the map: what else it has saved here stays. Empty = a run of its own.
@@ -219,7 +219,7 @@ def _require_extent(path: Path, points: Array, poses: Array) -> None:
     Args:
         path: file that they are read from.
         points: in base, shape (n, 2).
-        poses: of the base in map for each point, shape (n, 3).
+        poses: poses of the base in map for each point, shape (n, 3).
 
     Raises:
         InputError: a grid of them would have more than ``MOST_CELLS``.

@@ -79,7 +79,7 @@ def fit_lens(views: Sequence[BoardSighting], reader: BoardReader, size: tuple[in
     """A lens from sightings of a board.
 
     Args:
-        views: of the board.
+        views: views of the board.
         reader: that found them.
         size: width and height of the pictures, pixels.
 

@@ -49,7 +49,7 @@ class TagReader:
         corners: how they are found: as crossings of lines along the edges, which bears tags of few pixels a cell and
             dirt, or to a tenth of a pixel as crossings of the edges of the picture itself, for tags that are measured.
         phase: which ones of the pictures are looked at as a whole: cameras that are read side by side take turns.
-        family: of the tags.
+        family: family of the tags.
     """
 
     def __init__(

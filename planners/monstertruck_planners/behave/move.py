@@ -188,7 +188,7 @@ class Move:
             # 0.3: time for which the gate must command the move's direction, because servos respond late, s
             if since is None or t - since < 0.3:
                 if t > 4.0:  # seconds
-                    return self._ended(state, Reason.NOT_OBEYED, "the wheels are not steered to the move")
+                    return self._ended(state, Reason.NOT_OBEYED, "the wheels do not reach the move's angles")
                 # 0.02: speed while the wheels steer, as a fraction of the move's speed: above the standstill threshold
                 return self._going(state, math.copysign(0.02 * self._amounts.speed, self._distance))
             state = replace(

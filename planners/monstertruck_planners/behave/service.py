@@ -70,7 +70,7 @@ class BehaviourService:
     """Runs one of the configured behaviours at a time.
 
     Args:
-        configs: by name.
+        configs: configurations by name.
         clock: time.
         bus: the topics that behaviours read.
         drive: ``plan/drive``, shared with the other planners.

@@ -74,7 +74,7 @@ class LocalPlanner(Protocol):
             route: poses of the reference point.
             obstacles: in a window around the truck.
             pose: x, y, yaw of the reference point, in the frame of both.
-            state: of the cycle before, ``LocalPlannerState()`` at first.
+            state: state of the cycle before, ``LocalPlannerState()`` at first.
 
         Raises:
             InputError: a pose that is none.

@@ -96,7 +96,7 @@ class LocalPlannerCore:
 
     Args:
         vehicle: steered vehicle.
-        config: of the local planner.
+        config: configuration of the local planner.
         search: costs and effort of the local search; the margin is that of ``config``.
     """
 
@@ -191,7 +191,7 @@ class LocalPlannerCore:
 
         Args:
             obstacles: in the window.
-            pose: of the truck.
+            pose: pose of the truck.
             band: the route in the window.
             failed: searches in sequence without a result.
             final: whether the band ends with the route; where it does not, other headings are accepted.

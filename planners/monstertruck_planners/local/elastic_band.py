@@ -134,10 +134,10 @@ def _refine(
     Args:
         field: obstacles.
         cover: footprint.
-        parameters: of the band.
+        parameters: parameters of the band.
         band: shape (MAX_BUBBLES, 6): x, y, yaw, radius, direction, sideslip; changed in place.
         fixed: shape (MAX_BUBBLES,): bubbles that do not move.
-        count: of bubbles.
+        count: count of bubbles.
 
     Returns:
         Number of bubbles, and whether the band is connected.
@@ -347,7 +347,7 @@ def relax_band(
         path: poses of the reference point, fewer than ``MAX_BUBBLES``.
         obstacles: in the window.
         cover: footprint, see ``cover_footprint``.
-        parameters: of the forces.
+        parameters: parameters of the forces.
     """
     count = len(path.poses)
     band, fixed = np.zeros((MAX_BUBBLES, 6)), np.zeros(MAX_BUBBLES, np.bool_)

@@ -83,7 +83,7 @@ class PeopleTracker:
         """Take a scan.
 
         Args:
-            stamp: of the scan (ns).
+            stamp: stamp of the scan (ns).
             points: returns in the frame of the map, in the order of the beams, shape (n, 2), m.
             mapped: whether the map explains each point, shape (n,).
             sensor: place of the lidar, shape (2,), m.

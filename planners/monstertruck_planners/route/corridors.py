@@ -69,13 +69,13 @@ def close_narrow_gaps(
 
     Args:
         field: the fine grid.
-        footprint: of the vehicle.
+        footprint: footprint of the vehicle.
         margin: to keep, m.
         cell_cost: of the coarse cells, 0 = closed, see ``heuristic.cell_costs``; changed in place.
         factor: fine cells per coarse one, each way.
         wide: cells further than this from obstacles are taken to be open, m.
         step: see ``CostToGo``.
-        row: of the cell where the path begins.
+        row: row of the cell where the path begins.
         column: the same.
         radius: cells this near to the path are checked, cells.
         checked: cells already checked; changed in place.

@@ -80,7 +80,7 @@ def _drive_off(
 
     Args:
         field: the grid.
-        footprint: of the vehicle.
+        footprint: footprint of the vehicle.
         pose: where it begins, shape (3,).
         segment: its sign, curvature and sideslip count.
         level: clearance of the pose, in steps of LEVEL.
@@ -112,9 +112,9 @@ def _to_room(
 
     Args:
         field: the grid.
-        footprint: of the vehicle.
+        footprint: footprint of the vehicle.
         start: pose of the path, shape (3,).
-        segments: of the path, shape (n, 3).
+        segments: segments of the path, shape (n, 3).
         after: nearer to the start than this it may have it and fall again, m.
         wanted: clearance, in steps of LEVEL.
 
@@ -186,7 +186,7 @@ def departures(
         vehicle: the vehicle.
         start: pose of the reference point, shape (3,).
         config: margin, and cost of a metre backward.
-        budget: of the route; includes this work.
+        budget: budget of the route; includes this work.
         reserve: share of it that is kept; of the rest half is kept for the route.
 
     Returns:
@@ -313,7 +313,7 @@ def plan_between(
         goal: the same.
         search: route between two poses that keep the margin; ``statistics["exhausted"]`` is not 0 if no budget would
             help it.
-        budget: of the search, for the departure too.
+        budget: budget of the search, for the departure too.
         reserve: share of it that is kept, see ``departures``.
         departs: else there are no departures, and the start has to keep the margin.
     """
@@ -385,7 +385,7 @@ def leaving(
     Args:
         route_map: obstacles.
         vehicle: what is driven.
-        path: of the reference point.
+        path: path of the reference point.
         margin: to obstacles, m.
         free: whether a path keeps the margin.
     """

@@ -98,7 +98,7 @@ def fill_cell_costs(
     """Cost of a straight step into each coarse cell.
 
     Args:
-        distance: of the fine grid with its ring, m.
+        distance: distance of the fine grid with its ring, m.
         layer: its extra costs.
         rule: see above.
         box: coarse cells that are written.

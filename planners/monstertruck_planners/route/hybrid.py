@@ -176,7 +176,7 @@ def expand(
 
     Args:
         field: the grid.
-        footprint: of the vehicle.
+        footprint: footprint of the vehicle.
         layer: extra costs.
         to_go: cost-to-go.
         table: see ``reeds_shepp_table``.
@@ -339,7 +339,7 @@ class SearchRun:
         problem: search problem.
         model: limits and costs of the vehicle, with primitives of the resolution.
         to_go: cost-to-go.
-        resolution: of the search.
+        resolution: resolution of the search.
         goal_range: expansions to the goal are tried from this near, m.
     """
 

@@ -447,7 +447,7 @@ class ReedsShepp:
         cusp_cost: of a change of direction, m, at least 0.
         crab_cost: factor on a translation's cost, at least 1.
         steering: mode of arcs and lines, see ``MotionPath``.
-        reference: of the motions, see ``MotionPath``.
+        reference: reference of the motions, see ``MotionPath``.
 
     Raises:
         InputError: a number out of these bounds.

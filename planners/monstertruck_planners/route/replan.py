@@ -42,7 +42,7 @@ def plan_through(
         InputError: there is no waypoint.
     """
     if not waypoints:
-        raise InputError("route over waypoints: expected one at least")
+        raise InputError("route over waypoints: expected at least one waypoint")
     share = 1.0 / len(waypoints)
     config = planner.config
     leg_config = config.model_copy(
@@ -120,8 +120,8 @@ def replan(
         planner: planner of both routes.
         route_map: latest map.
         previous: the route so far.
-        pose: of the reference point.
-        goal: of the reference point.
+        pose: pose of the reference point.
+        goal: goal of the reference point.
         now: see ``plan``.
         policy: when a route is kept.
         via: poses of the reference point to be passed before the goal.
@@ -175,10 +175,10 @@ def remaining_route(
     left for the route beyond it: the path touches nothing, and keeps the margin from where it first has it.
 
     Args:
-        planner: of the path.
+        planner: planner of the path.
         route_map: the latest map.
         path: the route so far.
-        pose: of the reference point.
+        pose: pose of the reference point.
         goal: where the path has to end.
         reach: greatest distance of the pose from the path, m.
         fall: maximum fall of the clearance on a departure, m; None: the path has to keep the margin all the way.

@@ -77,7 +77,7 @@ def shortcut(
 
     Args:
         field: the grid.
-        footprint: of the vehicle.
+        footprint: footprint of the vehicle.
         layer: extra costs.
         model: limits and costs.
         path: changed in place.
@@ -170,7 +170,7 @@ def choose_headings(
 
     Args:
         field: the grid.
-        footprint: of the vehicle.
+        footprint: footprint of the vehicle.
         layer: extra costs.
         model: limits and costs.
         places: shape (n, 3), poses in the order driven; at the last one the heading is kept.

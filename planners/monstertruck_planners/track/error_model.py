@@ -44,10 +44,10 @@ def discretise(geometry: FourWheelSteering, steering: Steering, speed: float, la
     """The model over one period with inputs and reference held, exactly.
 
     Args:
-        geometry: of the truck.
+        geometry: geometry of the truck.
         steering: way of steering; its inputs are one or two.
         speed: forward, m/s.
-        lag: of the axles, s.
+        lag: lag of the axles, s.
         period: s.
     """
     basis = BASES[steering]

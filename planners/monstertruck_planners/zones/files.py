@@ -51,7 +51,7 @@ def configured(config: ZonesConfig, max_speed: float) -> tuple[list[Zone], list[
     """Zones of a configuration, and remarks on its mask images.
 
     Args:
-        config: of the zones.
+        config: configuration of the zones.
         max_speed: to which percents of a speed mask refer (m/s).
 
     Raises:

@@ -97,7 +97,7 @@ class ZoneLayer:
 
         Args:
             footprint: outline.
-            pose: of the base in map.
+            pose: pose of the base in map.
             margin: distance from the outline that counts as inside (m).
         """
         close = self.near(pose[:2], footprint.circumscribed_radius + margin)

@@ -152,8 +152,8 @@ class RemoteActor:
     """One kind of steps, taken by a plan server that calls for them; the latest caller replaces the one before.
 
     Args:
-        name: of the steps, for the caller.
-        codec: of their inputs and outputs.
+        name: name of the steps, for the caller.
+        codec: codec of their inputs and outputs.
         clock: time.
         deadline: seconds for a step.
         start_timeout: seconds to wait for a caller.
@@ -280,7 +280,7 @@ class RemoteWorkQueue:
     """The remote actors of a daemon by name.
 
     Args:
-        codec: of all steps' inputs and outputs.
+        codec: codec of all steps' inputs and outputs.
     """
 
     def __init__(self, codec: StepCodec) -> None:
@@ -317,7 +317,7 @@ async def serve(
         clock: time.
         connect: opens a client of the robot; its calls may take twice ``POLL``.
         steps: what can be computed here: ``module:factory`` by name.
-        codec: of inputs and outputs.
+        codec: codec of inputs and outputs.
     """
     while True:
         try:

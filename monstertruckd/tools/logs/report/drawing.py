@@ -128,11 +128,11 @@ def plot(
     """A captioned plot with grid, labels and legend.
 
     Args:
-        number: of the plot on the page, for the cursor.
+        number: number of the plot on the page, for the cursor.
         title: text.
-        unit: of the axis.
+        unit: unit of the axis.
         lines: label and trace of every line.
-        axis: of the values.
+        axis: axis of the values.
         span: first and last instant, ns.
     """
     start, end = span

@@ -81,7 +81,7 @@ class WallSwitchingConfig(WallConfig):
 
 
 class WallLineConfig(BehaviourConfig):
-    """Method 3, our own: a line fitted to the echoes in odom; the values are ours."""
+    """Method 3: a line fitted to the echoes in odom, with default values of our own."""
 
     kind: Literal["wall_line"] = "wall_line"
     rate: Annotated[float, Field(ge=10, le=50)] = 20.0

@@ -35,7 +35,7 @@ BROKEN = "robot 'truck' is there but publishes no sensor/scan yet; waiting; not 
         (
             topics.STAND_POSE,
             True,
-            "robot 'truck' records stand/pose where `stand:` is set, and passes it on to nobody; waiting",
+            "robot 'truck' only records stand/pose, if `stand:` is set, and never publishes it; waiting",
         ),
     ],
 )
