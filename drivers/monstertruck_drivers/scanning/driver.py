@@ -20,7 +20,7 @@ class ScannerDriver(Generic[C]):
         clock: time.
         out: where scans go.
         events: where readiness, faults and changes of its clock are reported.
-        name: of the service.
+        name: name of the service.
     """
 
     def __init__(
