@@ -147,7 +147,8 @@ def _become(request: ForkRequest) -> None:
     """Turn a fork of the server into what a fresh process of the parent would be."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGCHLD,))
-    Path("/proc/self/comm").write_text(request.name[:15], encoding="utf-8")  # the kernel's limit; for ps and top
+    with suppress(OSError):  # only ps and top show it
+        Path("/proc/self/comm").write_text(request.name[:15], encoding="utf-8")  # 15: the kernel's limit
     os.environ.clear()
     os.environ.update(request.environment)
     sys.path[:] = request.path
