@@ -8,9 +8,9 @@ import pytest
 
 from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
-from monstertruck_schemas.mission import Mission
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import MissionOrder
+from monstertruckd.station.pilot import read_mission
 from monstertruckd.tools.cli.mission import load
 from monstertruckd.tools.cli.runs import run_mission
 from tests.daemon.goal_kit import Trip, travel
@@ -34,8 +34,8 @@ def overlay(start: tuple[float, float, float], dock: dict | None = None, **more)
 
 
 def docked(start: tuple[float, float, float], steps: list[dict], dock: dict | None = None, **changes):
-    """Do steps in ``configs/dock.yaml``; returns the end, the reports of the gate and the truth."""
-    mission = Mission.model_validate_json(json.dumps({"version": 2, "name": "dock", "steps": steps}))
+    """Do steps as the page's buttons send them in ``configs/dock.yaml``; returns end, gate's reports and truth."""
+    mission = read_mission(json.dumps({"version": 2, "name": "dock", "steps": steps}))
     ends, gate = [], []
 
     async def story(trip: Trip) -> None:
@@ -78,7 +78,7 @@ def test_the_truck_turns_its_rear_to_the_dock(slam: dict | None):
 
 
 def test_it_leaves_the_dock_slowly():
-    end, gate, truth = docked((2.5, 0.805, -math.pi / 2), [{"do": "undock"}])
+    end, gate, truth = docked((2.5, 0.805, -math.pi / 2), [{"do": "undock", "dock": "charger"}])
     assert end.reason is Reason.MISSION_DONE, end.text
     assert not truth[:, 5].any(), "collided"
     assert math.dist(truth[-1, 1:3], (DOCK["x"], DOCK["y"] + 0.7)) < 0.05, "not at the staging pose"

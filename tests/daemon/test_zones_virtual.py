@@ -69,6 +69,19 @@ def test_a_zone_that_is_drawn_on_the_way_is_driven_round_and_one_that_is_off_is_
     assert not any(layer(LATE).keepout(BODY, pose) for pose in poses)
 
 
+def test_a_zone_that_is_drawn_over_the_goal_ends_it():
+    async def story(trip: Trip) -> None:
+        await trip.goal(4.0, 3.95, 0.0)
+        await trip.arm()
+        await trip.clock.sleep(2.0)
+        await order(trip, "late", "add", area={"kind": "keepout", "corners": [[3.8, 3.5], [4.3, 3.5], [4.0, 4.5]]})
+        end = await trip.end(limit=3.0)
+        assert (end.outcome, end.recoveries) == (Reason.KEEPOUT, 0)
+        assert "zone late" in end.text
+
+    travel(story, zones={})
+
+
 def test_a_robot_that_starts_in_a_zone_leaves_it_slowly_or_is_not_armed():
     async def leaves(trip: Trip) -> None:
         await trip.goal(3.0, 3.95, 0.0)

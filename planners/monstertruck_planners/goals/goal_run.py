@@ -109,6 +109,8 @@ class Observations:
     """Whether the emergency stop is latched."""
     placeless: str = ""
     """Why the pose is invalid; empty if it is valid."""
+    zone: str = ""
+    """Name of the keepout zone that the robot would reach into at the goal; empty if there is none."""
     held: str = ""
     """Description of the reason why the truck is not armed."""
 
@@ -201,8 +203,9 @@ def tick(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
         return _end(run, Reason.ESTOPPED, Reason.ESTOPPED.text)
     if phase is GoalPhase.PAUSED:
         return run, ()
-    if observed.placeless:
-        return _end(run, Reason.POSE_LOST, observed.placeless)
+    if observed.placeless or observed.zone:
+        reason = Reason.POSE_LOST if observed.placeless else Reason.KEEPOUT
+        return _end(run, reason, observed.placeless or f"the goal lies in the keepout zone {observed.zone}")
     if observed.armed or phase is GoalPhase.PLANNING:
         run = replace(run, elapsed=run.elapsed + passed, unarmed=0.0)
     else:

@@ -293,6 +293,8 @@ class GoalService:
 
     def _observe(self, now: int) -> Observations:
         odometry, gate, followed = self._odometry(now), self._in.gate.latest, self._paths.followed
+        goal, zones = None if self._goal is None else self._goal.goal, self._zone_layer()
+        zone = None if goal is None else zones.keepout(self._setup.footprint, goal, self._setup.zone_margin)
         answer = None
         if self._planning is not None and self._planning.done():
             answer, self._planning = self._planning.result(), None
@@ -303,6 +305,7 @@ class GoalService:
             armed=gate is not None and gate.mode.active and odometry is not None,
             estopped=_estopped(gate),
             placeless=placeless(None if self._in.slam is None else self._in.slam.latest),
+            zone=zone or "",
             at_rest=odometry is not None and abs(odometry.twist.vx) < AT_REST,
             pose=None if odometry is None else pose_of(odometry),
             answer=answer,

@@ -156,6 +156,14 @@ def test_an_obstacle_on_the_way_is_planned_round_while_the_truck_drives_on():
     assert (reported(actions), Plan() in actions, Halt() in actions) == ([Reason.PATH_BLOCKED], True, False)
 
 
+def test_a_keepout_zone_over_the_goal_ends_the_drive_at_once():
+    run = SteppedRun()
+    run.step(answer=WAY)
+    actions = run.step(zone="stairs")
+    assert (run.run.outcome, Halt() in actions) == (Reason.KEEPOUT, True)
+    assert "zone stairs" in run.run.text
+
+
 def test_it_is_not_stuck_while_it_lets_people_pass():
     run = SteppedRun()
     run.step(answer=WAY)
