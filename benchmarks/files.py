@@ -65,9 +65,13 @@ def paths() -> dict[str, list[Example]]:
     raced = np.column_stack((np.arange(4), POINTS, np.zeros((4, 2)), SPEEDS, np.zeros(4)))
     with_speeds = np.column_stack((POINTS, SPEEDS)).tolist()
     saved, local, logged, listed = io.StringIO(), io.StringIO(), io.StringIO(), io.StringIO()
+    for file in (saved, local):
+        file.write("# 6a0b1c5e-3b1f-4f0e-9f50-d51a2c1d6d0e\n# da39a3ee5e6b4b0d3255bfef95601890afd80709\n")
     np.savetxt(saved, raced, "%.7f", "; ", header=RACELINE[2:])
-    head = "x_ref_m; y_ref_m; width_right_m; width_left_m; x_normvec_m; y_normvec_m; alpha_m; vx_racetraj_mps"
-    shifted = np.column_stack((POINTS - (0.0, 0.5), np.ones((4, 2)), np.zeros(4), np.ones(4), np.full(4, 0.5), SPEEDS))
+    head = "x_ref_m; y_ref_m; width_right_m; width_left_m; x_normvec_m; y_normvec_m; alpha_m; s_racetraj_m; "
+    head += "psi_racetraj_rad; kappa_racetraj_radpm; vx_racetraj_mps; ax_racetraj_mps2"
+    beside = (np.ones((4, 2)), np.zeros(4), np.ones(4), np.full(4, 0.5), np.arange(4.0), np.zeros((4, 2)))
+    shifted = np.column_stack((POINTS - (0.0, 0.5), *beside, SPEEDS, np.zeros(4)))
     np.savetxt(local, shifted, "%.7f", "; ", header=head)
     logged.write("#\n#\n" + RACELINE + "\n")
     pd.DataFrame(raced).to_csv(logged, sep=";", index=False, header=False, float_format="%.6f")
@@ -193,7 +197,30 @@ def lenses() -> dict[str, list[Example]]:
         "  T_cam_imu:\n  - [1.0, 0.0, 0.0, 0.0]\n"
     )
     chain = [461.629, 460.152, 362.680, 246.049, -0.27695497, 0.06712482, 0.00087538, 0.00011556, 0.0]
-    stereo = kalibr + kalibr.replace("cam0", "cam1").replace("461.629", "457.587")
+    drone = (
+        "cam0:\n  cam_overlaps: []\n  camera_model: pinhole\n"
+        "  distortion_coeffs: [0.04674621, -0.05938970, -0.00057779, -0.00004768]\n  distortion_model: radtan\n"
+        "  intrinsics: [389.6823, 391.3312, 309.0632, 260.3161]\n"
+        "  resolution: [640, 480]\n  rostopic: /usb_cam/image_raw\n"
+    )
+    drone_cam = [389.6823, 391.3312, 309.0632, 260.3161, 0.04674621, -0.0593897, -0.00057779, -0.00004768, 0.0]
+    astra = (
+        "526.6908296825479, 0, 312.3333507245396, 0, 525.7542623070541, 246.2279496394374, 0, 0, 1",
+        "0.01864117263397289, -0.0807953154457166, 0.0006701578887838996, -0.001800282263098739, 0",
+    )
+    astra_cam = [526.6908296825479, 525.7542623070541, 312.3333507245396, 246.2279496394374, 0.01864117263397289]
+    astra_cam += [-0.0807953154457166, 0.0006701578887838996, -0.001800282263098739, 0]
+    sample = (
+        '%YAML:1.0\n---\ncalibration_time: "Thu Jan 30 14:43:57 2020"\nimage_width: 1920\nimage_height: 1080\n'
+        "board_width: 4\nboard_height: 11\nflags: 0\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n"
+        "   dt: d\n   data: [ 1.3704890781669139e+03, 0., 9.4620086455694741e+02, 0.,\n"
+        "       1.3711542706267094e+03, 5.4099755744500317e+02, 0., 0., 1. ]\n"
+        "distortion_coefficients: !!opencv-matrix\n   rows: 5\n   cols: 1\n   dt: d\n"
+        "   data: [ 9.5598544598107946e-02, 1.5574125902392638e-01,\n       6.2864630028885743e-04,\n"
+        "       -4.7488130423597530e-03, -8.3628840603895049e-01 ]\n"
+    )
+    sample_cam = [1370.4890781669139, 1371.1542706267094, 946.20086455694741, 540.99755744500317, 0.095598544598107946]
+    sample_cam += [0.15574125902392638, 6.2864630028885743e-04, -4.7488130423597530e-03, -0.83628840603895049]
     echoed = (
         "height: 480\nwidth: 640\ndistortion_model: plumb_bob\nd: [0.1, 0.0, 0.0, 0.0, 0.0]\n"
         "k: [500.0, 0.0, 320.0, 0.0, 501.0, 240.0, 0.0, 0.0, 1.0]\n---\n"
@@ -228,15 +255,17 @@ def lenses() -> dict[str, list[Example]]:
         "ros camera_info": [
             ("usb_cam", ros(*usb), numbers, usb_cam),
             ("mekabot, no model named", ros(*meka, ""), numbers, mekabot),
+            ("camera_calibration, Astra", ros(*astra), numbers, astra_cam),
             ("ros2 topic echo", echoed, numbers, plain),
         ],
         "kalibr": [
-            ("camera chain, one camera", kalibr, numbers, chain),
+            ("kalibr's wiki, camera chain", kalibr, numbers, chain),
             ("kalibr_calibrate_cameras, EuRoC", vins, numbers, euroc),
-            ("camera chain, second of two", stereo, lambda text: numbers(text, camera="cam1"), [457.587, *chain[1:]]),
+            ("kalibr_calibrate_cameras, a drone", drone, numbers, drone_cam),
         ],
         "opencv": [
             ("a webcam's file, !!opencv-matrix", webcam, numbers, my_webcam),
+            ("OpenCV's calibration sample", sample, numbers, sample_cam),
             ("OpenCV, cameraMatrix and distCoeffs", stored(("cameraMatrix", "distCoeffs")), sized, plain),
             ("OpenCV, stereo sample M1 and D1", stored(("M1", "D1")), sized, plain),
         ],

@@ -1,4 +1,4 @@
-"""Drives by ``pyzeros``: twists at 20 Hz, each with a speed of its own by which it is known again.
+"""Drives by ``pyzeros``: twists at 20 Hz, each with a speed of its own, which identifies it.
 
     python benchmarks/ros2_parts/pyzeros_driver.py PORT COUNT
 
@@ -18,13 +18,14 @@ FIRST = 0.05
 STEP = 1e-6
 
 
-def session(port: int) -> zenoh.Session:
-    """A session that dials the face."""
+def session(port: int, timeout: int = 10_000) -> zenoh.Session:
+    """A session that dials the face; ``timeout`` is that of service calls, ms."""
     config = {
         "mode": "client",
         "connect": {"endpoints": [f"tcp/127.0.0.1:{port}"]},
         "scouting": {"multicast": {"enabled": False}},
         "timestamping": {"enabled": True},
+        "queries_default_timeout": timeout,
     }
     return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
 

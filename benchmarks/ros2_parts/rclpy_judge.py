@@ -1,136 +1,284 @@
-"""Judges a face by a node of real ``rclpy``; needs a Python with ROS 2's wheels or a sourced ROS 2.
+"""Judges a face by nodes of real ``rclpy``; needs a Python with ROS 2's wheels, or a sourced ROS 2.
 
-    python benchmarks/ros2_parts/rclpy_judge.py SECONDS OUTPUT
+    python -m benchmarks.ros2_parts.rclpy_judge read SECONDS OUTPUT | late | drive | twists COUNT | hostile SECONDS
 
-Reads topics, arms by the service, drives by Twist and by TwistStamped, sends a goal, and ends with an emergency stop.
+``read`` pickles what every topic brought, by topic. The others print JSON on their last line: ``late`` the time until a
+new node has map, fixed transforms and description; ``drive`` what an armed robot did by twists, by a goal pose and by
+the actions of Nav2; ``twists`` and ``hostile`` print ``ready``, wait for a line, and print times of sending.
 """
 
+import importlib
 import json
 import math
+import os
+import pickle
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import rclpy
+from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
-from nav_msgs.msg import OccupancyGrid, Odometry
+from nav2_msgs.action import FollowPath, NavigateThroughPoses, NavigateToPose
+from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as RosPath
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from sensor_msgs.msg import BatteryState, Imu, JointState, LaserScan
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-TOPICS = {
-    "/scan": (LaserScan, qos_profile_sensor_data),
-    "/odom": (Odometry, 10),
-    "/pose": (PoseWithCovarianceStamped, 10),
-    "/battery_state": (BatteryState, 10),
-    "/compass": (Imu, qos_profile_sensor_data),
-    "/joint_states": (JointState, 10),
-    "/map": (OccupancyGrid, LATCHED),
-    "/plan": (RosPath, LATCHED),
-    "/robot_description": (String, LATCHED),
-}
+from benchmarks.ros2_parts.all_topics import BEST_EFFORT, LATCHED, TOPICS
+
+LATCHING = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+PROFILES = dict.fromkeys(BEST_EFFORT, qos_profile_sensor_data) | dict.fromkeys(LATCHED, LATCHING)
+FIRST, STEP = 0.05, 1e-6
+"""Speed of the first of timed twists, and between two, by which each is known again, m/s."""
 
 
-def plain(value: object) -> object:
+def interface(name: str) -> Any:
+    """Class of an interface."""
+    package, group, own = name.split("/")
+    return getattr(importlib.import_module(f"{package}.{group}"), own)
+
+
+def plain(value: Any) -> Any:
     """A message as dictionaries and lists."""
     if hasattr(value, "get_fields_and_field_types"):
         return {name: plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
-    if isinstance(value, list):
-        return [plain(one) for one in value]
-    return list(value) if hasattr(value, "typecode") or hasattr(value, "tolist") else value
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return [plain(one) for one in value] if isinstance(value, list) else value
+
+
+def position(message: Any) -> tuple[float, float]:
+    """Return x and y, m."""
+    place = message.pose.pose.position
+    return place.x, place.y
 
 
 class Judge:
-    """One node."""
+    """One node, in a participant of its own: each has one interface for a topic."""
+
+    def __init__(self, name: str = "judge") -> None:
+        context = Context()
+        context.init()
+        self.node = rclpy.create_node(name, context=context)
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self.node)
+
+    def follow(self, topic: str, kind: Any, qos: Any = 10) -> list[Any]:
+        """Messages of a topic, as they come."""
+        found: list[Any] = []
+        self.node.create_subscription(kind, topic, found.append, qos)
+        return found
+
+    def spin(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+        """Take messages for a while."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and not until():
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def done(self, future: Any, seconds: float) -> Any:
+        """Result of a future."""
+        self._executor.spin_until_future_complete(future, timeout_sec=seconds)
+        return future.result()
+
+    def now(self) -> Any:
+        """Stamp of this moment."""
+        return self.node.get_clock().now().to_msg()
+
+
+def read(seconds: float, output: Path) -> None:
+    """Store what every topic brought."""
+    judge = Judge()
+    found = {topic: judge.follow(topic, interface(kind), PROFILES.get(topic, 100)) for topic, kind in TOPICS.items()}
+    judge.spin(seconds)
+    output.write_bytes(pickle.dumps({topic: [plain(one) for one in rows] for topic, rows in found.items()}))
+
+
+def late() -> float:
+    """Milliseconds from the first subscription until the latched topics are there."""
+    judge = Judge("late")
+    begin = time.monotonic()
+    wanted = ("/map", "/tf_static", "/robot_description")
+    found = [judge.follow(topic, interface(TOPICS[topic]), LATCHING) for topic in wanted]
+    judge.spin(5.0, lambda: all(found))
+    return 1e3 * (time.monotonic() - begin) if all(found) else math.inf
+
+
+def twist(kind: Any, speed: float, stamp: Any = None) -> Any:
+    """A twist forward, stamped if its kind is."""
+    message = kind()
+    if kind is TwistStamped:
+        message.header.frame_id = "base_link"
+        message.header.stamp = stamp
+        message.twist.linear.x = speed
+    else:
+        message.linear.x = speed
+    return message
+
+
+def begin_at_a_line() -> None:
+    """Wait until the benchmark says so."""
+    print("ready", flush=True)
+    sys.stdin.readline()
+
+
+def twists(count: int) -> list[tuple[float, int]]:
+    """Drive at 20 Hz; returns speeds and times of sending."""
+    judge, sent = Judge("driver"), []
+    publisher = judge.node.create_publisher(Twist, "/cmd_vel", 1)
+    judge.spin(2.0)
+    publisher.publish(twist(Twist, 0.0))  # opens the session
+    begin_at_a_line()
+    for number in range(count):
+        speed = FIRST + number * STEP
+        message = twist(Twist, speed)
+        sent.append((speed, time.time_ns()))
+        publisher.publish(message)
+        judge.spin(0.05)
+    judge.spin(1.0)
+    return sent
+
+
+def hostile(seconds: float) -> int:
+    """Send stamped twists of half a minute ago, and beside another publisher twists; returns their number."""
+    judges, sent = {kind: Judge(f"hostile_{kind.__name__.lower()}") for kind in (TwistStamped, Twist)}, 0
+    begin_at_a_line()
+    for kind, judge in judges.items():
+        publisher = judge.node.create_publisher(kind, "/cmd_vel", 1)
+        judge.spin(1.0)
+        end = time.monotonic() + seconds / 2.0
+        while time.monotonic() < end:
+            stamp = judge.now()
+            stamp.sec -= 30
+            publisher.publish(twist(kind, 0.2, stamp))
+            sent += 1
+    return sent
+
+
+class Drive:
+    """Orders of a node to an armed robot."""
 
     def __init__(self) -> None:
-        rclpy.init()
-        self.node = rclpy.create_node("judge")
-        self.found: dict[str, list[Any]] = {topic: [] for topic in TOPICS}
-        for topic, (kind, qos) in TOPICS.items():
-            self.node.create_subscription(kind, topic, self.found[topic].append, qos)
-
-    def spin(self, seconds: float) -> None:
-        """Take messages for a while."""
-        until = time.monotonic() + seconds
-        while time.monotonic() < until:
-            rclpy.spin_once(self.node, timeout_sec=0.02)
+        self.judge = Judge()
+        self.odometry = self.judge.follow("/odom", Odometry)
+        self.poses = self.judge.follow("/pose", PoseWithCovarianceStamped)
+        self.judge.spin(3.0)
 
     def call(self, name: str) -> tuple[bool, str]:
         """Call a service of the robot."""
-        client = self.node.create_client(Trigger, f"/truck/{name}")
-        if not client.wait_for_service(5.0):
+        client = self.judge.node.create_client(Trigger, f"/truck/{name}")
+        if not client.wait_for_service(10.0):
             return False, "no such service"
-        future = client.call_async(Trigger.Request())
-        rclpy.spin_until_future_complete(self.node, future, timeout_sec=10.0)
-        return future.result().success, future.result().message
+        answer = self.judge.done(client.call_async(Trigger.Request()), 20.0)
+        return answer.success, answer.message
 
-    def place(self, topic: str) -> tuple[float, float]:
-        """Newest x and y of a topic, m."""
-        position = self.found[topic][-1].pose.pose.position
-        return position.x, position.y
-
-    def driven(self, stamped: bool) -> float:
-        """Drive forward at 0.1 m/s for 3 s; returns the distance by odometry, m."""
-        kind = TwistStamped if stamped else Twist
-        publisher = self.node.create_publisher(kind, "/cmd_vel", 1)
-        self.spin(1.0)
-        begin = self.place("/odom")
+    def twisted(self, kind: Any) -> float:
+        """Drive at 0.1 m/s for 3 s; returns the distance by odometry, m."""
+        publisher = self.judge.node.create_publisher(kind, "/cmd_vel", 1)
+        self.judge.spin(1.0)
+        begin = position(self.odometry[-1])
         for _ in range(60):
-            message = kind()
-            if stamped:
-                message.header.stamp = self.node.get_clock().now().to_msg()
-                message.header.frame_id = "base_link"
-            (message.twist if stamped else message).linear.x = 0.1
-            publisher.publish(message)
-            self.spin(0.05)
-        self.spin(1.0)
-        self.node.destroy_publisher(publisher)
-        self.spin(0.5)
-        return math.dist(begin, self.place("/odom"))
+            publisher.publish(twist(kind, 0.1, self.judge.now()))
+            self.judge.spin(0.05)
+        self.judge.spin(1.0)
+        self.judge.node.destroy_publisher(publisher)
+        self.judge.spin(0.5)
+        return math.dist(begin, position(self.odometry[-1]))
 
-    def reached(self, ahead: float, seconds: float) -> float:
-        """Send a goal straight ahead; returns the distance from it at the end, m."""
-        publisher = self.node.create_publisher(PoseStamped, "/goal_pose", 1)
-        self.spin(1.0)
-        newest = self.found["/pose"][-1].pose.pose
+    def ahead(self, *distances: float) -> list[PoseStamped]:
+        """Poses so far ahead of the robot, m."""
+        newest = self.poses[-1].pose.pose
         yaw = 2.0 * math.atan2(newest.orientation.z, newest.orientation.w)
-        goal = PoseStamped()
-        goal.header.frame_id = "map"
-        goal.header.stamp = self.node.get_clock().now().to_msg()
-        goal.pose.position.x = newest.position.x + ahead * math.cos(yaw)
-        goal.pose.position.y = newest.position.y + ahead * math.sin(yaw)
-        goal.pose.orientation = newest.orientation
+        rows = []
+        for distance in distances:
+            row = PoseStamped()
+            row.header.frame_id = "map"
+            row.header.stamp = self.judge.now()
+            row.pose.position.x = newest.position.x + distance * math.cos(yaw)
+            row.pose.position.y = newest.position.y + distance * math.sin(yaw)
+            row.pose.orientation = newest.orientation
+            rows.append(row)
+        return rows
+
+    def goal_pose(self, seconds: float) -> float:
+        """Send a goal 0.5 m ahead; returns the distance from it at the end, m."""
+        publisher = self.judge.node.create_publisher(PoseStamped, "/goal_pose", 1)
+        self.judge.spin(1.0)
+        (goal,) = self.ahead(0.5)
         publisher.publish(goal)
         target = goal.pose.position.x, goal.pose.position.y
-        until = time.monotonic() + seconds
-        while time.monotonic() < until and math.dist(target, self.place("/pose")) > 0.05:
-            self.spin(0.2)
-        self.spin(1.0)
-        return math.dist(target, self.place("/pose"))
+        self.judge.spin(seconds, lambda: math.dist(target, position(self.poses[-1])) < 0.05)
+        self.judge.spin(1.0)
+        return math.dist(target, position(self.poses[-1]))
+
+    def action(self, kind: Any, name: str, goal: Any, cancel_after: float | None = None) -> tuple[int, str, int]:
+        """Carry out an action; returns its status, its text, and the number of feedbacks."""
+        self.call("arm")
+        feedbacks: list[Any] = []
+        client = ActionClient(self.judge.node, kind, name)
+        assert client.wait_for_server(10.0)
+        handle = self.judge.done(client.send_goal_async(goal, feedbacks.append), 20.0)
+        assert handle.accepted
+        result = handle.get_result_async()
+        if cancel_after is not None:
+            self.judge.spin(cancel_after)
+            self.judge.done(handle.cancel_goal_async(), 10.0)
+        answer = self.judge.done(result, 120.0)
+        return answer.status, answer.result.error_msg, len(feedbacks)
+
+    def actions(self) -> dict[str, tuple[int, str, int]]:
+        """Goals driven, cancelled, refused; poses driven through; a path followed backward."""
+        near, far, away = self.ahead(0.5, 0.9, 500.0)
+        to_pose = NavigateToPose, "navigate_to_pose"
+        found = {
+            "driven": self.action(*to_pose, NavigateToPose.Goal(pose=near)),
+            "cancelled": self.action(*to_pose, NavigateToPose.Goal(pose=far), 1.5),
+            "refused": self.action(*to_pose, NavigateToPose.Goal(pose=away)),
+        }
+        through = NavigateThroughPoses.Goal(poses=[near, far])
+        found["through"] = self.action(NavigateThroughPoses, "navigate_through_poses", through)
+        path = RosPath(header=near.header, poses=self.ahead(*(-0.05 * step for step in range(10))))
+        found["followed"] = self.action(FollowPath, "follow_path", FollowPath.Goal(path=path))
+        return found
 
 
-def main(seconds: float, output: Path) -> None:
-    """Judge, and store what came."""
-    judge = Judge()
-    judge.spin(seconds)
-    read = {topic: [plain(message) for message in rows] for topic, rows in judge.found.items()}
-    armed = judge.call("arm")
-    figures: dict[str, object] = {"armed": armed}
-    figures["twist_m"] = judge.driven(stamped=False)
-    judge.call("arm")
-    figures["stamped_m"] = judge.driven(stamped=True)
-    judge.call("arm")
-    figures["goal_m"] = judge.reached(0.6, 40.0)
-    figures["estop"] = judge.call("estop")
-    figures["refused"] = judge.call("arm")
-    figures["reset"] = judge.call("reset")
-    output.write_text(json.dumps({"topics": read, "figures": figures}, default=list))
+def drive() -> dict[str, object]:
+    """What an armed robot did."""
+    order = Drive()
+    figures: dict[str, object] = {"armed": order.call("arm"), "twist_m": order.twisted(Twist)}
+    order.call("arm")
+    figures["stamped_m"] = order.twisted(TwistStamped)
+    order.call("arm")
+    figures["goal_m"] = order.goal_pose(60.0)
+    figures["actions"] = actions = order.actions()
+    ends = [status for status, _, _ in actions.values()]
+    wanted = [GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED]
+    figures["actions_right"] = ends == [*wanted, *wanted[:1], *wanted[:1]]
+    figures["estop"] = order.call("estop")
+    figures["refused"] = order.call("arm")
+    figures["reset"] = order.call("reset")
+    return figures
+
+
+def main(what: str, *words: str) -> None:
+    """Carry out one part."""
+    if what == "read":
+        read(float(words[0]), Path(words[1]))
+        return
+    parts: dict[str, Callable[[], object]] = {
+        "late": late,
+        "drive": drive,
+        "twists": lambda: twists(int(words[0])),
+        "hostile": lambda: hostile(float(words[0])),
+    }
+    print(json.dumps(parts[what]()), flush=True)
+    os._exit(0)  # threads of the middleware may not end
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]), Path(sys.argv[2]))
+    main(*sys.argv[1:])

@@ -1,6 +1,6 @@
 """Reads a face by ``zenoh-ros2-sdk``, with interfaces as ``rosbags`` has them, and stores what came.
 
-python benchmarks/ros2_parts/sdk_reader.py PORT SECONDS OUTPUT
+python -m benchmarks.ros2_parts.sdk_reader PORT SECONDS OUTPUT
 """
 
 import os
@@ -12,31 +12,19 @@ from tempfile import TemporaryDirectory
 
 from rosbags.typesys import Stores, get_typestore
 
-TOPICS = {
-    "/scan": "sensor_msgs/msg/LaserScan",
-    "/odom": "nav_msgs/msg/Odometry",
-    "/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "/battery_state": "sensor_msgs/msg/BatteryState",
-    "/compass": "sensor_msgs/msg/Imu",
-    "/joint_states": "sensor_msgs/msg/JointState",
-    "/tf": "tf2_msgs/msg/TFMessage",
-    "/tf_static": "tf2_msgs/msg/TFMessage",
-    "/map": "nav_msgs/msg/OccupancyGrid",
-    "/plan": "nav_msgs/msg/Path",
-    "/robot_description": "std_msgs/msg/String",
-    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
-    "/gate": "visualization_msgs/msg/MarkerArray",
-    "/footprint": "geometry_msgs/msg/PolygonStamped",
-}
-LATCHED = {"/tf_static", "/map", "/plan", "/robot_description"}
+from benchmarks.ros2_parts.all_topics import LATCHED, TOPICS
+
+UPDATE = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data\n"
+FURTHER = {"map_msgs/msg/OccupancyGridUpdate": UPDATE}
+"""Definitions that ``rosbags`` lacks."""
 
 
 def write_definitions(folder: Path) -> None:
     """Write the ``.msg`` files of ROS 2 Jazzy, as ``rosbags`` has them."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    for name in store.fielddefs:
+    texts = {name: store.generate_msgdef(name, ros_version=2)[0] for name in store.fielddefs} | FURTHER
+    for name, text in texts.items():
         package, _, own = name.split("/")
-        text, _ = store.generate_msgdef(name, ros_version=2)
         file = folder / package / "msg" / f"{own}.msg"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text.split("=" * 80)[0])

@@ -231,16 +231,17 @@ def _known(value: float | None) -> float:
 def battery(message: Battery, names: RosNames) -> RosValues:
     """``sensor_msgs/msg/BatteryState``; unknown values are NaN."""
     capacity, share = _known(message.capacity_ah), _known(message.charge)
+    charging, discharging = 1, 2
     return {
         "header": names.header(message),
         "voltage": _known(message.voltage),
         "temperature": math.nan,
-        "current": math.nan,
+        "current": _known(message.current),
         "charge": capacity * share,
         "capacity": math.nan,
         "design_capacity": capacity,
         "percentage": share,
-        "power_supply_status": 2,  # discharging
+        "power_supply_status": charging if (message.current or 0.0) > 0.0 else discharging,
         "present": True,
     }
 

@@ -7,6 +7,7 @@ other editions are marked, such as ``@kilted``: the name on the wire is the same
 """
 
 import hashlib
+import importlib
 import json
 import re
 from collections.abc import Iterable, Iterator
@@ -153,6 +154,28 @@ def action_edition(action: str, distribution: str) -> str:
 def wire_name(name: str) -> str:
     """Name of an interface without the mark of a distribution."""
     return re.sub("@[a-z]+", "", name)
+
+
+_OF_ACTIONS: Final = {
+    "_SendGoal": "SendGoalService",
+    "_GetResult": "GetResultService",
+    "_FeedbackMessage": "FeedbackMessage",
+}
+"""Attributes of an action's ``Impl`` by the ends of names: packages of Python do not export what ROS 2 derives."""
+
+
+def installed_interface(name: str) -> Any:
+    """Class that ROS 2 generated for an interface, or None if its package, or the interface in it, is not installed."""
+    package, group, own = wire_name(name).split("/")
+    try:
+        module = importlib.import_module(f"{package}.{group}")
+    except ModuleNotFoundError:
+        return None
+    for end, part in _OF_ACTIONS.items() if group == "action" else ():
+        if own.endswith(end):
+            action = getattr(module, own.removesuffix(end), None)
+            return None if action is None else getattr(action.Impl, part)
+    return getattr(module, own, None)
 
 
 def hash_of(name: str, known: dict[str, tuple[RosField, ...]]) -> str:

@@ -9,7 +9,6 @@ out. ``rclpy`` reports neither the publisher of a message nor the client of a re
 """
 
 import asyncio
-import importlib
 import os
 import threading
 from collections.abc import Mapping, Sequence
@@ -27,7 +26,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from monstertruck_runtime.errors import BusyError, InputError
 from monstertruck_runtime.threads import in_daemon_thread, in_thread
 from monstertruckd.ros2.cdr import decode, encode
-from monstertruckd.ros2.interfaces import DISTRIBUTIONS, wire_name
+from monstertruckd.ros2.interfaces import DISTRIBUTIONS, installed_interface, wire_name
 from monstertruckd.ros2.node import Answer, Publish, RosArrival, RosSender, Take
 from monstertruckd.ros2.rmw import RELIABLE, RosQos
 
@@ -38,15 +37,6 @@ ANSWER_TIMEOUT: Final = 3600.0
 THREADS: Final = 64
 """Maximum number of requests that are answered at once, and one thread for messages: a result of an action occupies one
 until the action ends."""
-
-
-def rclpy_interface(name: str) -> Any:
-    """Class of an interface, or None if its package, or the interface in it, is not installed."""
-    package, group, own = wire_name(name).split("/")
-    try:
-        return getattr(importlib.import_module(f"{package}.{group}"), own, None)
-    except ModuleNotFoundError:
-        return None
 
 
 def distribution_here() -> str:
@@ -170,7 +160,7 @@ class RclpyNode:
         return sender is CLIENTS or sender.node in names
 
     def _interface(self, name: str) -> Any:
-        found = rclpy_interface(name)
+        found = installed_interface(name)
         if found is None:
             self.missing.add(wire_name(name))
         return found

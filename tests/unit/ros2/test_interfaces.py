@@ -1,11 +1,13 @@
 """Type hashes: those of rosidl, and those of independent programs."""
 
+import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from monstertruckd.ros2.interfaces import FILE, hash_of, interfaces, parsed, type_hash
+from monstertruckd.ros2.interfaces import FILE, hash_of, installed_interface, interfaces, parsed, type_hash
 
 HASHES = Path(__file__).parents[2] / "data" / "ros2" / "hashes.txt"
 ROSIDL = dict(line.split() for line in HASHES.read_text().splitlines() if not line.startswith("#"))
@@ -57,3 +59,16 @@ def test_a_services_hash_is_that_of_the_design_of_rmw_zenoh():
 def test_a_line_that_is_no_field_is_refused():
     with pytest.raises(ValueError, match="expected TYPE NAME"):
         parsed("=== std_msgs/msg/Wrong\nfloat64 x = 3\n")
+
+
+def test_services_and_feedback_of_an_installed_action_are_those_of_its_implementation(monkeypatch):
+    parts = SimpleNamespace(SendGoalService="send", GetResultService="result", FeedbackMessage="feedback")
+    module = ModuleType("gone_msgs.action")
+    module.Go = SimpleNamespace(Impl=parts)
+    monkeypatch.setitem(sys.modules, "gone_msgs", ModuleType("gone_msgs"))
+    monkeypatch.setitem(sys.modules, "gone_msgs.action", module)
+    ends = ("_SendGoal", "_GetResult", "_FeedbackMessage")
+    assert [installed_interface(f"gone_msgs/action/Go{end}") for end in ends] == ["send", "result", "feedback"]
+    assert installed_interface("gone_msgs/action/Go@kilted_SendGoal") == "send"
+    assert installed_interface("gone_msgs/action/Stay_SendGoal") is None
+    assert installed_interface("absent_msgs/msg/Any") is None

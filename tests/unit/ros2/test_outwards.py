@@ -13,7 +13,7 @@ from monstertruck_schemas import topics as t
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.body import LensConfig
 from monstertruck_schemas.plan import ExplorationPhase, ExplorationState, GoalPhase, GoalState
-from monstertruck_schemas.sensor import DriveFeedback, DriveMode, SteeringFeedback
+from monstertruck_schemas.sensor import Battery, BatteryLevel, DriveFeedback, DriveMode, SteeringFeedback
 from monstertruck_schemas.state import Grid, Ground, Peer, Peers
 from monstertruck_schemas.zones import Zone, ZoneMask, Zones
 from monstertruckd.config.load import load_truck
@@ -121,6 +121,15 @@ def test_a_tile_is_placed_on_the_map_and_what_lies_beside_it_is_left_out():
     assert [update[name] for name in ("x", "y", "width", "height")] == [2, 0, 2, 2]
     assert update["data"].tolist() == [3, 4, 6, 7]
     assert convert.grid_update(grid(9.0, 0.0, 2, 2), whole, convert.RosNames()) is None
+
+
+@pytest.mark.parametrize(("current", "status"), [(None, 2), (-1.5, 2), (0.8, 1)])
+def test_a_battery_has_its_current_and_whether_it_is_charged(current, status):
+    header = {"stamp": 1, "received": 1, "seq": 1}
+    battery = Battery(**header, raw_voltage=11.1, cells=3, level=BatteryLevel.NORMAL, current=current)
+    values = convert.battery(battery, RosNames())
+    assert values["power_supply_status"] == status
+    assert values["current"] == pytest.approx(math.nan if current is None else current, nan_ok=True)
 
 
 def test_a_map_is_published_again_only_when_it_has_changed():

@@ -30,6 +30,11 @@ def test_the_container_file_runs_as_a_user_without_rights():
     assert TEXT.index("USER 1000") > TEXT.rindex("RUN ")
 
 
+def test_the_image_leaves_out_the_environment_and_history_of_the_clone():
+    left_out = (ROOT / ".dockerignore").read_text(encoding="utf-8").split()
+    assert {".git", ".venv", "**/__pycache__", "runs"} <= set(left_out)
+
+
 @pytest.mark.skipif(shutil.which("hadolint") is None, reason="needs hadolint")
 def test_the_container_file_passes_its_linter():
     done = subprocess.run(["hadolint", "--ignore", "DL3008", FILE], capture_output=True, text=True, check=False)
