@@ -362,15 +362,15 @@ async def beside_a_stand_in(clock: WallClock, face: Face, seconds: float, folder
     """All figures of a face that need no devices."""
     async with stand_in(clock) as scene, face.serving(scene.robot.endpoint) as serving:
         figures = await read_all(face, scene, serving.pid, seconds, folder)
-        told(figures)
+        show(figures)
         figures["late_joiner_ms"] = round(await late(face), 1)
         figures |= await timed(face, scene)
         figures |= await hostile(face, scene)
-    told(figures)
+    show(figures)
     return figures
 
 
-def told(figures: dict[str, Any]) -> None:
+def show(figures: dict[str, Any]) -> None:
     """Print figures as they are known."""
     print(json.dumps(figures, default=str), file=sys.stderr, flush=True)
 
@@ -426,11 +426,11 @@ async def with_a_robot(clock: WallClock, faces: list[Face], folder: Path) -> dic
                 await client.order(Order.RESET)
             async with face.serving(endpoint):
                 figures = await held(face, client)
-                told(figures)
+                show(figures)
                 figures |= await driven(face, client)
             ends = {name: status for name, (status, *_) in figures["actions"].items()}
             figures["goals"] = {name: ends.get(name) for name in ENDS}
-            told(figures)
+            show(figures)
             found[face.kind] = figures
     return found
 

@@ -19,7 +19,7 @@ TEXT = FILE.read_text(encoding="utf-8")
 def test_the_container_file_installs_extras_and_the_uv_that_there_are():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     wanted = re.findall(r"--extra (\S+)", TEXT)
-    assert set(bootstrap.EXTRAS["try"]) <= set(wanted) <= set(extras)
+    assert {*bootstrap.EXTRAS["try"], *bootstrap.EXTRAS["demo"]} <= set(wanted) <= set(extras)
     assert re.findall(r"uv==(\S+)", TEXT) == [bootstrap.UV_VERSION]
 
 
