@@ -5,6 +5,7 @@ import math
 import pytest
 
 from monstertruck_planners.behave.dock.config import DockConfig, HousingConfig
+from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.plan import BehaviourState, DockTarget
@@ -146,3 +147,67 @@ def test_the_dock_is_where_the_scan_has_seen_it():
     area = check_of(rig.gate, DockCheck).view.dock
     assert rig.speed == pytest.approx(0.05)
     assert area.docked[0] == pytest.approx(1.0 - rig.place[0] + 4 * 0.02 * 0.05)
+
+
+def near(rig, ticks=3):
+    """Whether the gate takes the robot for near its dock."""
+    rig.armed()
+    rig.driver = {"speed": 0.05 * rig.way, **PLANNER}
+    rig.tick(ticks)
+    return check_of(rig.gate, DockCheck).view.dock is not None
+
+
+@pytest.mark.parametrize(
+    ("change", "inside"),
+    [
+        ({"place": [0.26, 0.0]}, True),
+        ({"place": [0.24, 0.0]}, False),
+        ({"place": [1.015, 0.0]}, True),
+        ({"place": [1.025, 0.0]}, False),
+        *(({"place": [0.5, side * 0.145]}, True) for side in (1, -1)),
+        *(({"place": [0.5, side * 0.155]}, False) for side in (1, -1)),
+        *(({"yaw": side * 0.29}, True) for side in (1, -1)),
+        *(({"yaw": side * 0.31}, False) for side in (1, -1)),
+        *(({"place": [0.6, 0.0], "reported": 1.0 + side * 0.29}, True) for side in (1, -1)),
+        *(({"place": [0.6, 0.0], "reported": 1.0 + side * 0.31}, False) for side in (1, -1)),
+    ],
+)
+def test_the_robot_is_near_its_dock_within_these_bounds(change, inside):
+    rig = Docking()
+    for name, value in change.items():
+        setattr(rig, name, value)
+    assert near(rig) is inside
+
+
+@pytest.mark.parametrize(
+    ("place", "yaw", "inside"),
+    [(0.26 - 0.4, math.pi, True), (0.24 - 0.4, math.pi, False), (0.5, 0.0, True), (0.5, 0.31, False), (0.5, 2.9, True)],
+)
+def test_a_robot_that_docks_in_reverse_may_turn_about_beyond_staging(place, yaw, inside):
+    rig = Docking(way=-1, turning=0.4)
+    rig.place, rig.yaw = [place, 0.0], yaw
+    assert near(rig) is inside
+
+
+@pytest.mark.parametrize("topic", [topics.BEHAVIOUR, topics.ODOMETRY, topics.POSE])
+@pytest.mark.parametrize("old", [False, True])
+def test_a_report_odometry_or_pose_that_is_old_shows_no_dock(topic, old):
+    rig = Docking()
+    assert near(rig)
+    limit = 1.0 if topic is topics.BEHAVIOUR else topic.fresh_for()
+    age, observe = round((limit + (0.05 if old else -0.05)) * SECOND), rig.gate.observe
+
+    def aged(message, of):
+        observe(message.model_copy(update={"received": message.received - age}) if of is topic else message, of)
+
+    rig.gate.observe = aged
+    rig.tick(2)
+    assert (check_of(rig.gate, DockCheck).view.dock is None) is old
+
+
+def test_a_behaviour_that_has_ended_or_another_planner_shows_no_dock():
+    rig = Docking()
+    assert near(rig)
+    rig.driver = {"speed": 0.05, **PLANNER, "source": "tracker"}
+    rig.tick(50)
+    assert check_of(rig.gate, DockCheck).view.dock is None
