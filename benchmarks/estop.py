@@ -55,6 +55,7 @@ from monstertruck_drivers.epos import objects as od
 from monstertruck_drivers.epos.protocol import Control, FrameError, Opcode, decode_body, join
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import SECOND, Clock, run_wall
+from monstertruck_runtime.errors import TruckError
 from monstertruck_runtime.mailbox import latest
 from monstertruck_runtime.yaml_files import yaml_text
 from monstertruck_schemas import topics
@@ -79,6 +80,8 @@ COST_US = {"nonce": 20.0, "orders": 20.0, "stops": 30.0, "rubbish": 20.0, "calls
 """Goals of the daemon's processor time for each message of a flood, us: 10 000 a second are a fifth of a core then."""
 COST_SECONDS = 5.0
 """Seconds over which the processor time of a flood is counted."""
+MOST_FAILED = 3
+"""Trials of one flood in which a computer too busy for its sensors keeps the truck standing; it ends with the last."""
 QUIET = 0.03
 """Cores that others may be busy with on a computer that counts as quiet."""
 
@@ -271,6 +274,9 @@ async def press(
 
     A truck that a computer too busy for its sensors has disarmed meanwhile is armed again. With a flood of stops it
     stands when the emergency stop comes.
+
+    Raises:
+        TruckError, TimeoutError: the computer is too busy for the truck to drive.
     """
     with client.subscribe(topics.ODOMETRY, latest()) as odometry, client.subscribe(topics.GATE, latest()) as gate:
         async with asyncio.timeout(ORDER_TIMEOUT):
@@ -318,7 +324,8 @@ async def trials(clock: Clock, folder: Path, kind: str, count: int) -> dict[str,
         assert simulator.stdout is not None
         stops = Stops(simulator.stdout)
         reading = asyncio.create_task(stops.run())
-        await press(client, stops, True, 0.0)  # everything is warm then
+        with suppress(TruckError, TimeoutError):
+            await press(client, stops, True, 0.0)  # everything is warm then
         async with contextlib.AsyncExitStack() as flooded:
             running, stopping, rate = None, None, 0.0
             if kind != "none":
@@ -329,15 +336,24 @@ async def trials(clock: Clock, folder: Path, kind: str, count: int) -> dict[str,
                     await running.switch()
                     await asyncio.sleep(1.0)
             delays = rng.uniform(0, 0.02, count).tolist()
-            found = [await press(client, stops, n % 2 == 1, more, stopping) for n, more in enumerate(delays)]
+            found: list[float | None] = []
+            failed = 0
+            for n, more in enumerate(delays):
+                try:
+                    found.append(await press(client, stops, n % 2 == 1, more, stopping))
+                except (TruckError, TimeoutError):
+                    failed += 1
+                    if failed == MOST_FAILED:
+                        break
             if running is not None:
                 rate = await running.end()
         reading.cancel()
     known = np.array([1e3 * seconds for seconds in found if seconds is not None])
     p50, p99, most = np.percentile(known, (50, 99, 100)).tolist() if len(known) else (0.0, 0.0, 0.0)
     return {
-        "trials": count,
-        "missed": count - len(known),
+        "trials": len(found),
+        "not_driven": failed,
+        "missed": len(found) - len(known),
         "p50_ms": round(p50, 1),
         "p99_ms": round(p99, 1),
         "max_ms": round(most, 1),
@@ -431,8 +447,8 @@ def main() -> int:
     if options.page:
         return from_the_page(count)
     figures: dict[str, dict[str, Any]] = {}
-    print("| flood | rate, 1/s | trials | missed | p50 ms | p99 ms | greatest ms | others, cores |")
-    print("|---|---:|---:|---:|---:|---:|---:|---:|")
+    print("| flood | rate, 1/s | trials | not driven | missed | p50 ms | p99 ms | greatest ms | others, cores |")
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
     for kind in options.flood or (QUICK if options.quick else FLOODS):
         others = OtherLoad()
         with TemporaryDirectory(prefix="estop-") as folder:
@@ -440,13 +456,13 @@ def main() -> int:
         done["others_cores"] = round(others.cores(), 2)
         figures[kind] = done
         print(
-            f"| {kind} | {done['rate']} | {done['trials']} | {done['missed']} | {done['p50_ms']} | {done['p99_ms']} | "
-            f"{done['max_ms']} | {done['others_cores']} |",
+            f"| {kind} | {done['rate']} | {done['trials']} | {done['not_driven']} | {done['missed']} | {done['p50_ms']} | "
+            f"{done['p99_ms']} | {done['max_ms']} | {done['others_cores']} |",
             flush=True,
         )
     if any(done["others_cores"] > QUIET for done in figures.values()):
         print(f"others were busy with more than {QUIET} cores: these are no figures of a quiet computer")
-    met = all(done["p99_ms"] <= GOAL_MS and done["missed"] == 0 for done in figures.values())
+    met = all(done["p99_ms"] <= GOAL_MS and done["missed"] == done["not_driven"] == 0 for done in figures.values())
     met = met and all(done["rate"] > 0 for kind, done in figures.items() if kind != "none")
     goals = {"p99_ms": GOAL_MS, "missed": 0, "trials": 300, "others_cores": QUIET}
     print(json.dumps({"bench": "estop", "figures": figures, "goals": goals, "met": met}))
