@@ -455,11 +455,8 @@ def main() -> int:
             done = run_wall(lambda clock, kind=kind, folder=folder: trials(clock, Path(folder), kind, count))
         done["others_cores"] = round(others.cores(), 2)
         figures[kind] = done
-        print(
-            f"| {kind} | {done['rate']} | {done['trials']} | {done['not_driven']} | {done['missed']} | {done['p50_ms']} | "
-            f"{done['p99_ms']} | {done['max_ms']} | {done['others_cores']} |",
-            flush=True,
-        )
+        columns = ("rate", "trials", "not_driven", "missed", "p50_ms", "p99_ms", "max_ms", "others_cores")
+        print(f"| {kind} | {' | '.join(str(done[name]) for name in columns)} |", flush=True)
     if any(done["others_cores"] > QUIET for done in figures.values()):
         print(f"others were busy with more than {QUIET} cores: these are no figures of a quiet computer")
     met = all(done["p99_ms"] <= GOAL_MS and done["missed"] == done["not_driven"] == 0 for done in figures.values())
