@@ -56,6 +56,20 @@ def spare_log(output: Path) -> None:
                 raise InputError(f"{output}: is a log, which is not overwritten; name another file")
 
 
+def joined(records: Iterable[McapRecord]) -> Iterator[tuple[McapMessage, Channel, Schema | None]]:
+    """Yield the messages among MCAP records, each with its channel and its schema."""
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    for record in records:
+        if isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+        elif isinstance(record, McapMessage):
+            channel = channels[record.channel_id]
+            yield record, channel, schemas.get(channel.schema_id)
+
+
 @dataclass(frozen=True, slots=True)
 class LogMessage:
     """Message of a log."""
@@ -119,24 +133,15 @@ class LogReader:
         return self._messages(self.records(past_damage=False))
 
     def _messages(self, records: Iterator[McapRecord]) -> Iterator[LogMessage]:
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        for record in records:
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, McapMessage):
-                channel = channels[record.channel_id]
-                schema = schemas.get(channel.schema_id)
-                yield LogMessage(
-                    channel.topic,
-                    record.log_time - self.log_offset,
-                    record.publish_time,
-                    record.sequence,
-                    record.data,
-                    schema.name if schema else "",
-                )
+        for record, channel, schema in joined(records):
+            yield LogMessage(
+                channel.topic,
+                record.log_time - self.log_offset,
+                record.publish_time,
+                record.sequence,
+                record.data,
+                schema.name if schema else "",
+            )
 
     def records(self, *, past_damage: bool = True) -> Iterator[McapRecord]:
         """Yield every intact MCAP record before the index, with chunks opened; channels precede their messages.

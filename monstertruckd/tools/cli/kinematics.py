@@ -69,23 +69,15 @@ def figure(path: Path, across: str, up: str) -> Iterator[Any]:
         NotInstalledError: matplotlib is not installed.
         InputError: the file cannot be written.
     """
-    from monstertruck_runtime.errors import InputError
-    from monstertruck_runtime.extras import not_installed
+    from monstertruckd.tools.figures import new_figure, write_figure
 
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise not_installed("--png: matplotlib", "plot") from error
-    drawing = Figure(figsize=(7.0, 5.0), layout="constrained")
+    drawing = new_figure(7.0, 5.0)
     axes = drawing.add_subplot()
     axes.set_xlabel(across)
     axes.set_ylabel(up)
     axes.grid(visible=True, alpha=0.3)
     yield axes
-    try:
-        drawing.savefig(path, dpi=120, format="png")
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from error
+    write_figure(drawing, path, "png")
     remark(f"wrote {path}")
 
 

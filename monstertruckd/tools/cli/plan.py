@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruck_runtime.errors import InputError
 from monstertruckd.tools.cli.options import ViaOption, complete_planner, parse_pose
 from monstertruckd.tools.cli.output import JsonOption, finish, print_json, remark
 
@@ -149,20 +148,20 @@ def _draw(file: Path, world: "WorldMap", vehicle: "Vehicle", result: "RouteResul
     """Map, route and footprints.
 
     Raises:
+        NotInstalledError: matplotlib is not installed.
         InputError: the file cannot be written.
     """
-    import matplotlib as mpl
     import numpy as np
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-    from matplotlib.patches import Rectangle
 
     from monstertruck_planners.collision import Footprint
     from monstertruck_planners.route.motion import moved
+    from monstertruckd.tools.figures import new_figure, write_figure
 
     width, height = world.size
-    figure, axis = plt.subplots(figsize=(9, min(max(9 * height / width, 3), 14)))
+    figure = new_figure(9, min(max(9 * height / width, 3), 14))
+    from matplotlib.patches import Rectangle
+
+    axis = figure.add_subplot()
     shades = np.select([world.cells < 0, world.cells >= 50], [0.75, 0.15], 1.0)
     x, y = world.origin
     axis.imshow(shades, origin="lower", cmap="gray", vmin=0, vmax=1, extent=(x, x + width, y, y + height))
@@ -191,10 +190,4 @@ def _draw(file: Path, world: "WorldMap", vehicle: "Vehicle", result: "RouteResul
     else:
         axis.set_title(f"{name}: {result.reason.text}")
     axis.set(xlabel="x, m", ylabel="y, m")
-    figure.tight_layout()
-    try:
-        figure.savefig(file, dpi=110)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot draw: {error}") from error
-    finally:
-        plt.close(figure)
+    write_figure(figure, file)

@@ -35,7 +35,7 @@ def wall_command(
 
     if plot is not None:
         with needs_extra("plot"):
-            from monstertruckd.tools.tune.runs import require_drawable
+            from monstertruckd.tools.figures import require_drawable
 
             require_drawable(plot)
     runs: list[TuningRun] = []

@@ -11,12 +11,12 @@ from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
-from mcap.records import Channel, McapRecord, Schema
-from mcap.records import Message as McapMessage
+from mcap.records import McapRecord
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.outside import reading
+from monstertruckd.recorder.reader import joined
 
 METADATA: Final = "metadata.yaml"
 """File that makes a folder a bag of ROS 2."""
@@ -115,18 +115,9 @@ def homogeneous(translation: Any, rotation: Any) -> Array:
 
 def mcap_messages(records: Iterator[McapRecord]) -> Iterator[RawMessage]:
     """Yield the messages among MCAP records."""
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    for record in records:
-        if isinstance(record, Schema):
-            schemas[record.id] = record
-        elif isinstance(record, Channel):
-            channels[record.id] = record
-        elif isinstance(record, McapMessage):
-            channel = channels[record.channel_id]
-            schema = schemas.get(channel.schema_id)
-            name, definition = ("", b"") if schema is None else (schema.name, schema.data)
-            yield RawMessage(channel.topic, name, channel.message_encoding, record.log_time, record.data, definition)
+    for record, channel, schema in joined(records):
+        name, definition = ("", b"") if schema is None else (schema.name, schema.data)
+        yield RawMessage(channel.topic, name, channel.message_encoding, record.log_time, record.data, definition)
 
 
 def content_of(path: Path, messages: Iterator[RawMessage]) -> BagContent:

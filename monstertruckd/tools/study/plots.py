@@ -6,8 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.extras import not_installed
+from monstertruckd.tools.figures import new_figure, write_figure
 from monstertruckd.tools.study.analysis import Circle, centre_track, velocities
 from monstertruckd.tools.study.log import Run
 from monstertruckd.tools.study.report import Result
@@ -74,10 +73,6 @@ def draw(results: Sequence[Result], folder: Path) -> list[Path]:
         NotInstalledError: matplotlib is not installed.
         InputError: a file cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure  # noqa: PLC0415  # optional
-    except ImportError as error:
-        raise not_installed("figures: matplotlib", "plot") from error
     written = []
     for number, title, ratio, what in FIGURES:
         chosen = [(run, found) for run, found in results if _belongs(run, ratio)]
@@ -85,7 +80,7 @@ def draw(results: Sequence[Result], folder: Path) -> list[Path]:
             chosen = chosen[:1]
         if not chosen:
             continue
-        drawing = Figure(figsize=(6.0, 4.5), layout="constrained")
+        drawing = new_figure(6.0, 4.5)
         axes = drawing.add_subplot()
         for run, found in chosen:
             what(axes, run, found)
@@ -94,11 +89,7 @@ def draw(results: Sequence[Result], folder: Path) -> list[Path]:
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize="x-small")
         path = folder / f"figure_{number:02d}.png"
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            drawing.savefig(path, dpi=90, format="png")
-        except OSError as error:
-            raise InputError(f"{path}: {error.strerror}") from error
+        write_figure(drawing, path)
         written.append(path)
     return written
 

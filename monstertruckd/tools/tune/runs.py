@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from monstertruck_runtime.drives import taken_back
-from monstertruck_runtime.errors import InputError, NoAnswerError, RequestRefusedError, TruckError
+from monstertruck_runtime.errors import NoAnswerError, RequestRefusedError, TruckError
 from monstertruck_runtime.mailbox import Mailbox, fifo
 from monstertruck_runtime.presence import while_it_runs
 from monstertruck_runtime.requests import Operator
-from monstertruck_runtime.small_files import require_place
 from monstertruck_schemas.plan import BehaviourState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.topics import BEHAVIOUR
+from monstertruckd.tools.figures import new_figure, write_figure
 from monstertruckd.tools.tune.recipe import RunVerdict, WallGains, judged, recipe
 
 FOLLOWING: Final = "follow"
@@ -165,35 +165,15 @@ async def _followed(states: Mailbox[BehaviourState], number: int, over: Callable
     raise NoAnswerError("the link to the robot was closed")
 
 
-def require_drawable(path: Path) -> None:
-    """Refuse a picture that cannot be written, before the minutes whose result it is to show.
-
-    Raises:
-        InputError: it has no ending of a picture.
-        OSError: nothing can be written there.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - of this command only
-
-    known = FigureCanvasAgg.get_supported_filetypes()
-    if path.suffix[1:].lower() not in known:
-        raise InputError(f"{path}: expected a name that ends with .png or another of {', '.join(sorted(known))}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    require_place(path)
-
-
 def draw(runs: Sequence[TuningRun], path: Path) -> None:
     """Write the distance errors of all runs, in their order.
 
     Raises:
         InputError: the file cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 - of this command only
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     columns = 4
     rows = math.ceil(len(runs) / columns)
-    figure = Figure(figsize=(3.2 * columns, 2.4 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(3.2 * columns, 2.4 * rows)
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat
     for place, (number, run) in zip(axes, enumerate(runs, 1), strict=False):
         times, errors = zip(*run.samples, strict=True)
@@ -202,8 +182,4 @@ def draw(runs: Sequence[TuningRun], path: Path) -> None:
         place.set_title(f"{number}. " + run.text.replace(": ", "\n"), fontsize=8)
     figure.supxlabel("time since the step, s")
     figure.supylabel("distance error, mm")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=100)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: {error}") from error
+    write_figure(figure, path)
