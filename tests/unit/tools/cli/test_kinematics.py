@@ -96,8 +96,11 @@ def test_pictures(tmp_path, command):
     options = {"fit": ["--model", "symmetric"], "mobility": ["truck", "0.2", "0.3", "-0.1"]}.get(command, [])
     run(command, *options, "--png", picture)
     assert picture.read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(InputError, match="no such folder"):
-        run(command, *options, "--png", tmp_path / "no such folder" / "picture.png")
+    below = tmp_path / "made" / "picture.png"
+    run(command, *options, "--png", below)
+    assert below.is_file(), "its folder is made"
+    with pytest.raises(InputError, match="cannot be drawn"):
+        run(command, *options, "--png", picture / "picture.png")
 
 
 def test_fit_of_the_paper():
