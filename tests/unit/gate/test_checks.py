@@ -40,7 +40,7 @@ class Saying(Check):
 
 def own_rig(monkeypatch, check, **config):
     """A rig whose gate has a check of a third party."""
-    monkeypatch.setattr(Catalog, "implementation", lambda _self, _config: check)
+    monkeypatch.setattr(Catalog, "build", lambda _self, _config, *arguments: check(*arguments))
     rig = Rig(**config)
     rig.gate = make_gate(own={"mine": CheckConfig(kind="mine")}, **config)
     return rig
