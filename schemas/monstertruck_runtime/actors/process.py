@@ -192,12 +192,20 @@ class WorkerProcess:
 
         The connection ends with its last user: a thread may still wait for it.
         """
+        if self._killed:
+            return
         self._killed = True
-        with socket.socket(fileno=os.dup(self._connection.fileno())) as connection, suppress(OSError):
-            connection.shutdown(socket.SHUT_RDWR)  # the server does not fork for a closed connection
+        with socket.socket(fileno=os.dup(self._connection.fileno())) as connection:
+            closed = server.closed(connection.fileno())
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)  # the server does not fork for a closed connection
         with self._reading:
             self._pid = self._pid or self._reported(0.0)
             if self._pid is not None and self._code is None:
+                self._code = self._reported(0.0)
+            # Another process may have the number of one that has ended.
+            ended = self._code is not None or (closed and self._server.lost)
+            if self._pid is not None and not ended:
                 with suppress(ProcessLookupError):
                     os.kill(self._pid, signal.SIGKILL)
                 self._code = self._reported(_END_TIMEOUT)

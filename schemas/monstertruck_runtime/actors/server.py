@@ -87,7 +87,7 @@ class _Server:
         gc.freeze()  # a collection in a fork would copy the shared pages
 
     def _fork(self, request: ForkRequest, connection: int, end: int, folder: int) -> None:
-        if _closed(connection):
+        if closed(connection):
             for descriptor in (connection, end, folder):
                 os.close(descriptor)
             return
@@ -123,19 +123,19 @@ class _Server:
             os.close(end)
 
 
+def closed(connection: int) -> bool:
+    """Whether the other side has closed a connection, given by its file descriptor."""
+    poll = select.poll()
+    poll.register(connection, select.POLLHUP)
+    return bool(poll.poll(0))
+
+
 def main() -> int:
     """Serve one parent; returns the exit code."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     _Server(socket.socket(fileno=int(sys.argv[1]))).run()
     return 0
-
-
-def _closed(connection: int) -> bool:
-    """Whether the parent has given up the worker meanwhile."""
-    poll = select.poll()
-    poll.register(connection, select.POLLHUP)
-    return bool(poll.poll(0))
 
 
 def _made(target: str) -> Any:

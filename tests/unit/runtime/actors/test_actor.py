@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -148,6 +149,23 @@ async def test_a_frozen_server_is_replaced_when_it_does_not_confirm_an_end(monke
         assert server.lost
         await ended(pid)
         assert await worker.step(None) == 1
+
+
+@pytest.mark.parametrize("server_too", [False, True])
+def test_an_ended_worker_gets_no_signal(server_too: bool, monkeypatch: pytest.MonkeyPatch):
+    """Another process may have its number by then."""
+    worker = WorkerProcess("any", "tests.worker_kit:Counter")
+    worker.receive()
+    assert worker.pid is not None
+    if server_too:
+        process_module._current.server().kill()
+    worker.send({"die": 3})
+    for end in (worker._connection, worker._end):
+        select.select((end,), (), (), 30.0)
+    signals: list[object] = []
+    monkeypatch.setattr(os, "kill", lambda *words: signals.append(words))
+    worker.kill()
+    assert signals == []
 
 
 def test_a_worker_given_up_during_the_imports_of_the_server_is_not_forked(fresh_server: None):
