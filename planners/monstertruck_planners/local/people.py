@@ -19,7 +19,7 @@ from monstertruck_planners.collision import Footprint
 from monstertruck_planners.local.config import PeopleConfig
 from monstertruck_runtime.clock import SECOND
 
-GAP: Final = 0.3
+LEGS_APART: Final = 0.3
 """Greatest distance of neighbouring returns of one person (m): two legs."""
 MEMORY: Final = 0.8
 """Time over which a velocity is measured (s)."""
@@ -118,7 +118,7 @@ class PeopleTracker:
 def _groups(points: Array, mapped: NDArray[np.bool_], sensor: Array) -> Iterator[NDArray[np.intp]]:
     """Yield the indices of each group of points that may be a person."""
     new = np.flatnonzero(~mapped)
-    cuts = np.flatnonzero(np.hypot(*np.diff(points[new], axis=0).T) > GAP) + 1
+    cuts = np.flatnonzero(np.hypot(*np.diff(points[new], axis=0).T) > LEGS_APART) + 1
     ranges = np.hypot(*(points - sensor).T)
     for group in np.split(new, cuts):
         # 0.8: greatest width of a person with a load, m
@@ -135,7 +135,7 @@ def _nearest(tracks: Sequence[_PersonTrack], stamp: int, place: tuple[float, flo
     """Return the track whose predicted place is nearest, within the gap of a person's returns."""
     near = [(math.dist(track.place(stamp), place), i) for i, track in enumerate(tracks)]
     far, i = min(near, default=(math.inf, 0))
-    return tracks[i] if far < GAP else None
+    return tracks[i] if far < LEGS_APART else None
 
 
 def meets(
