@@ -1,6 +1,6 @@
 """What a face needs of ROS 2: publishers, subscriptions and services of one node, by whatever middleware."""
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -65,3 +65,22 @@ class RosNode(Protocol):
 
     def present(self, sender: RosSender) -> bool:
         """Whether the graph still has this node."""
+
+
+def sole_publisher(
+    found: Iterable[tuple[str, str, bytes]], namespace: str, own: Collection[str]
+) -> tuple[RosSender | None, bytes]:
+    """Publisher of a topic and its identity; None unless exactly one is not this program's.
+
+    Args:
+        found: namespace, name of the node and identity of all publishers.
+        namespace: of this program's nodes.
+        own: their names.
+    """
+    others = [row for row in found if row[0] != namespace or row[1] not in own]
+    undiscovered = "_NODE_NAME_UNKNOWN_"  # of rmw: the publisher is known before its node is
+    if len(others) != 1 or others[0][1] == undiscovered:
+        return None, b""
+    ((space, name, identity),) = others
+    node = f"{space.rstrip('/')}/{name}"
+    return RosSender(node, node), identity

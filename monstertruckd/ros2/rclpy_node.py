@@ -3,8 +3,8 @@
 Messages pass as the bytes that the face encodes and decodes itself. Interfaces whose package is not installed are left
 out. ``rclpy`` reports neither the publisher of a message nor the client of a request:
 
-- A message is attributed to the publisher of its topic if there is exactly one, and to an unknown publisher
-  otherwise.
+- A message is attributed to the publisher of its topic if there is exactly one besides this node, and to an unknown
+  publisher otherwise.
 - All clients of services are one sender.
 """
 
@@ -12,7 +12,7 @@ import asyncio
 import os
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final, Self
 
@@ -27,7 +27,7 @@ from monstertruck_runtime.errors import BusyError, InputError
 from monstertruck_runtime.threads import in_daemon_thread, in_thread
 from monstertruckd.ros2.cdr import decode, encode
 from monstertruckd.ros2.interfaces import DISTRIBUTIONS, installed_interface, wire_name
-from monstertruckd.ros2.node import Answer, Publish, RosArrival, RosSender, Take
+from monstertruckd.ros2.node import Answer, Publish, RosArrival, RosSender, Take, sole_publisher
 from monstertruckd.ros2.rmw import RELIABLE, RosQos
 
 CLIENTS: Final = RosSender("/service_clients", "clients")
@@ -188,20 +188,25 @@ class RclpyNode:
             sender, gid = self._publisher_of(topic)
             number, stamp = info["publication_sequence_number"], info["source_timestamp"]
             arrival = RosArrival(message, sender, gid, int(number or 0), int(stamp))
-            self._loop.call_soon_threadsafe(take, arrival)
+            if sender is None and qos.latched:  # sent once, perhaps before the graph has its publisher
+                self._loop.call_soon_threadsafe(self._loop.call_later, 1.0, self._discovered, topic, take, arrival)
+            else:
+                self._loop.call_soon_threadsafe(take, arrival)
 
         # A queue of 1: only the latest of the waiting messages is used.
         profile = _profile(RosQos(depth=1, reliable=qos.latched, latched=qos.latched))
         self._node_for(topic, interface).create_subscription(kind, topic, receive, profile, raw=True)
 
+    def _discovered(self, topic: str, take: Take, arrival: RosArrival) -> None:
+        sender, gid = self._publisher_of(topic)
+        take(replace(arrival, sender=sender, publisher=gid))
+
     def _publisher_of(self, topic: str) -> tuple[RosSender | None, bytes]:
-        """The publisher of a topic, if it is the only one."""
-        found = self._node.get_publishers_info_by_topic(self.qualified(topic))
-        if len(found) != 1:
-            return None, b""
-        gid = bytes(found[0].endpoint_gid)
-        node = f"{found[0].node_namespace.rstrip('/')}/{found[0].node_name}"
-        return RosSender(node, node), gid
+        """The publisher of a topic, if it is the only one besides this node."""
+        own = {participant.node.get_name() for participant in self._participants}
+        rows = self._node.get_publishers_info_by_topic(self.qualified(topic))
+        named = [(row.node_namespace, row.node_name, bytes(row.endpoint_gid)) for row in rows]
+        return sole_publisher(named, self._namespace, own)
 
     def serve(self, service: str, interface: str, answer: Answer) -> None:
         """Offer a service; see ``RosNode``."""

@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import os
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from pathlib import Path
@@ -18,7 +19,7 @@ from monstertruck_schemas.req import Role
 from monstertruck_schemas.state import GateMode
 from monstertruckd.ros2.rmw import LATCHED, RELIABLE
 from monstertruckd.ros2.zenoh_node import ZenohNode, session_settings
-from tests.daemon.wall_kit import end, free_endpoint, robot
+from tests.daemon.wall_kit import ROOT, end, free_endpoint, kept_armed, robot
 
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
 
@@ -72,16 +73,52 @@ class Nav2:
         self._cmd_vel({"linear": {"x": 0.2}, "angular": {"z": turn}})
 
 
+OVERLAY = {
+    "slam": {"mode": "ros2"},
+    "planner": {"mode": "ros2"},
+    "path": None,
+    "tracker": None,
+    "map": None,
+    "gate": {"remote_trackers": ["ros2:nav2"]},
+}
+"""A robot that Nav2, slam_toolbox and robot_localization plan, map and localise for."""
+ROS2_PYTHON = os.environ.get("ROS2_PYTHON")
+"""Python with ``rclpy`` and what ``benchmarks/ros2_parts/build_messages.py`` needs."""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(ROS2_PYTHON is None, reason="needs ROS2_PYTHON, an interpreter with rclpy")
+async def test_a_node_of_rclpy_maps_localises_and_drives_the_robot(tmp_path: Path):
+    path = ":".join(str(ROOT / part) for part in ("", "drivers", "planners", "schemas"))
+    environment = os.environ | {"ROS_DOMAIN_ID": "78", "PYTHONPATH": path}
+    async with robot(tmp_path, OVERLAY) as made:
+        await made.start_simulator()
+        await made.start_daemon()
+        words = ("-m", "monstertruckd", "ros2", "--robot", f"truck@{made.endpoint}", "--face", "rclpy")
+        async with made.client() as client, kept_armed(client):
+            gates = client.subscribe(topics.GATE, fifo(10_000))
+            healths = client.subscribe(topics.SLAM, fifo(10_000))
+            maps = client.subscribe(topics.MAP, fifo(100))
+            face = await asyncio.create_subprocess_exec(ROS2_PYTHON, *words, env=environment)
+            node = await asyncio.create_subprocess_exec(ROS2_PYTHON, RCLPY_NAV2, env=environment)
+            try:
+                async with asyncio.timeout(120):
+                    assert await node.wait() == 0
+                    known = await maps.next()
+            finally:
+                await end(node)
+                await end(face)
+            holders = {(state.holder, state.role) for state in gates.drain() if state.holder is not None}
+            assert holders == {("ros2:nav2", Role.TRACKER)}
+            assert (known.width, known.height, known.frame) == (400, 300, "map")
+            assert LocalisationStatus.LOCALISED in {health.standing for health in healths.drain()}
+
+
+RCLPY_NAV2 = ROOT / "benchmarks" / "ros2_parts" / "rclpy_nav2.py"
+
+
 async def test_a_node_localises_and_drives_the_robot_as_its_planner_and_mapper(tmp_path: Path):
-    overlay = {
-        "slam": {"mode": "ros2"},
-        "planner": {"mode": "ros2"},
-        "path": None,
-        "tracker": None,
-        "map": None,
-        "gate": {"remote_trackers": ["ros2:nav2"]},
-    }
-    async with robot(tmp_path, overlay) as made:
+    async with robot(tmp_path, OVERLAY) as made:
         await made.start_simulator()
         await made.start_daemon()
         ros = free_endpoint()

@@ -5,6 +5,7 @@ import struct
 import pytest
 
 from monstertruck_runtime.errors import InputError
+from monstertruckd.ros2.node import sole_publisher
 from monstertruckd.ros2.rmw import (
     LATCHED,
     RELIABLE,
@@ -100,3 +101,19 @@ def test_an_attachment_has_33_bytes_and_is_read_back():
 def test_other_attachments_are_refused(data):
     with pytest.raises(InputError, match="attachment"):
         Attachment.parse(data)
+
+
+@pytest.mark.parametrize(
+    ("found", "node"),
+    [
+        ([("/", "truck", b"a"), ("/", "slam_toolbox", b"b")], "/slam_toolbox"),
+        ([("/t2", "truck", b"a")], "/t2/truck"),
+        ([("/", "amcl", b"a"), ("/", "slam_toolbox", b"b")], None),
+        ([("/", "truck", b"a")], None),
+        ([("_NODE_NAMESPACE_UNKNOWN_", "_NODE_NAME_UNKNOWN_", b"a")], None),
+    ],
+)
+def test_a_topic_has_a_known_publisher_if_it_has_one_besides_this_program(found, node):
+    sender, identity = sole_publisher(found, "/", {"truck"})
+    assert (sender.node if sender else None) == node
+    assert identity == (found[-1][2] if node else b"")
