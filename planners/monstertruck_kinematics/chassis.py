@@ -325,7 +325,7 @@ class FamilyChassis(Chassis):
 
     Args:
         family: the drive.
-        per_speed: of the family's inputs for 1 m/s at a wheel: 1 for speeds, 1/radius for rates.
+        per_speed: input that gives 1 m/s at a wheel: 1 for speeds, 1/radius for rates.
         origin: x of the family's reference point in base, m.
     """
 

@@ -61,7 +61,7 @@ class Summary:
 
     @property
     def distance(self) -> float:
-        """Metres really driven."""
+        """True distance travelled (m)."""
         return float(np.hypot(*np.diff(self._driven()[:, 1:3], axis=0).T).sum())
 
     @property

@@ -113,5 +113,5 @@ def _go_back(before: list[_Before], run: Run) -> str:
         _put_back(before, run)
         run(RESTART)
     except TruckError as error:
-        return f"nor does the version before run: {error}"
+        return f"the previous version does not run either: {error}"
     return "the version before runs again"

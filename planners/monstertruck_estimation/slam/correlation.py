@@ -257,7 +257,7 @@ def _rotated(points: Array, guess: Array, turns: Array, x0: float, y0: float) ->
 
 @njit(cache=True)
 def _bound(level: Pyramid, offsets: Blocks, ix: int, iy: int, least: float) -> float:
-    """Bound of the scores of a block; of one that cannot reach ``least``, some number below."""
+    """Upper bound of a block's scores; if it cannot reach ``least``, any number below ``least``."""
     rows, columns = level.shape
     count = offsets.shape[0]
     total, missed = np.int64(0), np.int64(0)

@@ -60,7 +60,7 @@ class Fit:
     pose: Array
     """Shape (3,): the scan's frame in the cloud's, m and rad."""
     information: Array
-    """Shape (3, 3): of ``pose`` by the pairs alone (x, y in the cloud's frame, yaw)."""
+    """Information matrix of ``pose`` from the pairs alone (x, y in the cloud's frame, yaw), shape (3, 3)."""
     overlap: float
     """Share of the scan's points that found a fitting partner."""
     residual: float

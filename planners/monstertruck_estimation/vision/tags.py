@@ -44,7 +44,7 @@ class TagReader:
     """Reads the tags of one camera's pictures.
 
     Args:
-        everywhere: pictures from one look at the whole picture to the next; 1 = always. The first one is one, too.
+        everywhere: every how many pictures the whole picture is searched, beginning with the first.
         still: tags that do not move: they are read in whole pictures only.
         corners: how they are found: as crossings of lines along the edges, which bears tags of few pixels a cell and
             dirt, or to a tenth of a pixel as crossings of the edges of the picture itself, for tags that are measured.

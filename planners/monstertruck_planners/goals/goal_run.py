@@ -261,7 +261,7 @@ def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
     if observed.outcome in ENDED and observed.at_rest:
         return _plan(run, config) if backing or run.partial else _arrived(run, observed, config)
     if observed.outcome is not None and observed.outcome in LEFT:
-        report = Report(observed.outcome, Severity.WARNING, f"goal {run.number}: plans anew")
+        report = Report(observed.outcome, Severity.WARNING, f"goal {run.number}: plans again")
         return _with(_plan(run, config), report)
     if observed.along > run.best + config.progress or observed.yields:
         run = replace(run, best=max(run.best, observed.along), moved=observed.now)
@@ -277,7 +277,7 @@ def _drive(run: GoalRun, observed: Observations, config: PlannerConfig) -> Step:
         run = replace(run, blocks=run.blocks + 1, blocked_scans=0)
         if run.blocks > BLOCKS:
             return _recover(run, reason, text, config)
-        report = Report(reason, Severity.WARNING, f"goal {run.number}: {text}; plans anew")
+        report = Report(reason, Severity.WARNING, f"goal {run.number}: {text}; plans again")
         return _with(_plan(run, config), report)
     if observed.now - run.moved > config.stuck:
         return _recover(run, Reason.STUCK, f"no progress for {config.stuck:g} s", config)
@@ -315,7 +315,7 @@ def _arrived(run: GoalRun, observed: Observations, config: PlannerConfig) -> Ste
     if run.misses >= MISSES:
         return _end(run, Reason.GOAL_MISSED, off)
     run = replace(run, misses=run.misses + 1, error=min(run.error, error))
-    report = Report(Reason.GOAL_MISSED, Severity.WARNING, f"goal {run.number}: {off}; plans anew")
+    report = Report(Reason.GOAL_MISSED, Severity.WARNING, f"goal {run.number}: {off}; plans again")
     return _with(_plan(run, config, afresh=True), report)
 
 

@@ -114,7 +114,7 @@ def test_without_ready_the_version_before_runs_again(interrupted: bool, computer
 
 def test_it_says_so_when_neither_version_runs(computer: Computer):
     computer.fails = ["/opt"]
-    with pytest.raises(CommandFailedError, match="nor does the version before run: systemctl: Job"):
+    with pytest.raises(CommandFailedError, match="the previous version does not run either: systemctl: Job"):
         computer.upgrade(config=TRUCK)
 
 
