@@ -206,7 +206,7 @@ class Mapper:
         match = self._matched(scan, *motion)
         still = self._still(scan, stamp, motion[0], match)
         if still is not scan:
-            instead = self._matched(still, *motion)
+            instead = self._matched(still, *motion, 1.0 - len(still) / len(scan))
             guess, covariance = _moved(self._pose, self._covariance, *motion)
             # Of wheels that are wrong, walls seem to move: then the rest fits elsewhere.
             if fits(instead) and (fits(match) or off_guess(instead.pose, guess, covariance) <= GATE_LOW_OVERLAP):
@@ -225,14 +225,14 @@ class Mapper:
         turn = between(self._pose, match.pose)[2] if fits(match) else delta[2]
         return self._movers.still(stamp, by_wheels, float(turn), scan)
 
-    def _matched(self, scan: Scan, delta: Array, noise: Array) -> ScanMatch:
-        """Match ``scan`` after a motion ``delta`` with covariance ``noise``."""
+    def _matched(self, scan: Scan, delta: Array, noise: Array, moving: float = 0.0) -> ScanMatch:
+        """Match ``scan``, without the share ``moving`` of its points, after a motion ``delta`` with ``noise``."""
         guess, covariance = _moved(self._pose, self._covariance, delta, noise)
         if self._submap is None:
             return rejected(guess, covariance, MatchStatus.EMPTY)
         match = self._front.match(scan, delta, guess, covariance, self._submap)
         if self._motion.by_wheels(delta):
-            match = without_weak_direction(match, guess, covariance)
+            match = without_weak_direction(replace(match, moving=moving), guess, covariance)
         suspect, after_gap = self._loss.suspects(match, guess, covariance), self._loss.after_gap and match.accepted
         if self._loss.after_gap and self._led(match, delta, guess, covariance):
             return match

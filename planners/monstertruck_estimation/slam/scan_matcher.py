@@ -59,6 +59,8 @@ class ScanMatch:
     verdict: MatchStatus
     information: Array | None = None
     """Inverse covariance by the scan alone, without the guess, shape (3, 3); None if the match is rejected."""
+    moving: float = 0.0
+    """Share of the scan's points that were left out because they move, 0..1."""
 
     @property
     def accepted(self) -> bool:
@@ -67,10 +69,14 @@ class ScanMatch:
 
     @property
     def degenerate(self) -> bool:
-        """Whether the scan does not constrain the position along ``direction``."""
+        """Whether the scan does not constrain the position along ``direction``, or only people may do so.
+
+        People are round and constrain all directions alike: where as many points as were left out move unnoticed, they
+        explain a ratio of the eigenvalues up to their share.
+        """
         # A match is degenerate (a corridor) below this ratio of the eigenvalues of the information on the position.
         degenerate_ratio = 0.03
-        return self.degeneracy < degenerate_ratio
+        return self.degeneracy < max(degenerate_ratio, self.moving)
 
 
 class ScanMatcher(Protocol):

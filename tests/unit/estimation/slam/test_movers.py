@@ -6,7 +6,7 @@ from monstertruck_estimation.slam.movers import MoverDetector, narrow
 from monstertruck_estimation.slam.scans import prepare
 from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
-from monstertruck_schemas.health import OdometryUse
+from monstertruck_schemas.health import UNCERTAIN_DEVIATION, OdometryUse
 from tests.unit.estimation.slam.kit import CORRIDOR, LIDAR, ROOM, box, ranges
 
 STEP = 0.05
@@ -92,6 +92,7 @@ def test_a_crowd_that_begins_to_walk_takes_little_of_the_robot_and_none_of_its_w
     """In a bare corridor, where only people tell how far the robot drove, all of them the same, and wrong."""
     truth, rng, mapper = straight(120), np.random.default_rng(0), Mapper()
     walls = [*CORRIDOR, *box(-1.4, 0.7, -1.0, 1.0)]
+    degenerate = []
     crowd = [(1.3, -0.6), (2.0, 0.5), (2.9, -0.3), (0.2, 0.7), (-0.8, -0.6)]
     for k, pose in enumerate(truth):
         people = [wall for x, y in crowd for wall in person(x + 0.045 * max(k - 30, 0), y)]
@@ -99,5 +100,8 @@ def test_a_crowd_that_begins_to_walk_takes_little_of_the_robot_and_none_of_its_w
         step = mapper.step(scan, k * TENTH, pose * (1.01, 1.0, 1.0))
         assert step is not None
         assert mapper.odometry is OdometryUse.USED
+        degenerate.append(step.match.degenerate)
     # They have walked 4 m.
-    assert abs(between(truth[-1], step.pose)[0]) < 0.8
+    assert abs(between(truth[-1], step.pose)[0]) < 0.2
+    assert np.mean(degenerate[45:]) > 0.9
+    assert step.covariance[0, 0] > UNCERTAIN_DEVIATION**2

@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -196,6 +197,13 @@ def test_a_corridor_is_reported_and_leaves_the_way_along_it_to_the_wheels():
     assert match.direction == pytest.approx(0.0, abs=0.1)
     assert match.pose == pytest.approx((0.9, 0.1, 0.0), abs=0.02)
     assert match.covariance[0, 0] > 10 * match.covariance[1, 1]
+
+
+@pytest.mark.parametrize(("moving", "degenerate"), [(0.0, False), (0.05, False), (0.2, True)])
+def test_people_may_explain_what_constrains_the_weak_direction(moving, degenerate):
+    fit = Fit(np.zeros(3), np.diag((1e3, 1e4, 1e4)), 0.9, 0.01, 100, 0.0)
+    match = gated(fit, np.zeros(3), np.eye(3))
+    assert dataclasses.replace(match, moving=moving).degenerate is degenerate
 
 
 def test_a_foreign_scan_is_rejected_and_the_guess_stands():
