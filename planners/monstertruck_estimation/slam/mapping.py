@@ -163,7 +163,9 @@ class Mapper:
         self._since_key = _moved(*self._since_key, delta, noise)
         if self._submap is not None:
             gap = self._loss.after_gap or self._loss.sparse
-            led = gap and self._led(match, delta, *_moved(self._pose, self._covariance, delta, noise))
+            guess, covariance = _moved(self._pose, self._covariance, delta, noise)
+            led = gap and self._led(match, delta, guess, covariance)
+            led = led or self._extends(scan, match, guess, covariance)
             driven = math.hypot(delta[0], delta[1]) / self.config.key_distance
             driven_by = (driven, self._key_share(delta)) if self._motion.by_wheels(delta) else (0.0, 0.0)
             self._loss.take(match, driven_by, led=led)
@@ -251,6 +253,13 @@ class Mapper:
     def _led(self, match: ScanMatch, delta: Array, guess: Array, covariance: Array) -> bool:
         """Whether ``match`` is where the wheels led: at ``guess`` with its ``covariance``."""
         return match.accepted and self._motion.by_wheels(delta) and led_there(match, guess, covariance)
+
+    def _extends(self, scan: Scan, match: ScanMatch, guess: Array, covariance: Array) -> bool:
+        """Whether ``match`` is where the motion led, and what does not fit lies where the map has seen nothing."""
+        if self._loss.after_gap or not match.accepted or match.degenerate or not self._loss.misfits(match):
+            return False
+        here = led_there(match, guess, covariance)
+        return here and not contradicts(self.map, scan, match.pose, SUSPECT_CONTRADICTION)
 
     def finish(self) -> bool:
         """Search for open submaps and remaining loop closures, register all keyframes jointly: seconds of work.

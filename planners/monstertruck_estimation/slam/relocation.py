@@ -105,21 +105,25 @@ class LossDetector:
             match: the match.
             moved: distance, and motion, since the previous scan by wheels that agree with the scans, as multiples of
                 the distance and motion between keyframes; 0 without such wheels.
-            led: the match is where the wheels led over a gap, or between sparse scans: it fits, however little of its
-                view is known.
+            led: the match is where the motion led, by wheels over a gap or between sparse scans, or the rest of its
+                view is new: it fits, however little of its view is known.
         """
         self._path += moved[0]
         self._spacing += (moved[1] - self._spacing) * PERIOD_GAIN
         if led:
             self.restart()
             return
-        doubt = self._misfits or self.after_gap
-        least = max(LOW_OVERLAP, self._usual - OVERLAP_DROP) if doubt else LOW_OVERLAP
-        if not match.accepted or match.overlap < least or (self.after_gap and match.degenerate):
+        if self.misfits(match):
             self._misfits += 1
             return
         self._usual += (match.overlap - self._usual) * (OVERLAP_GAIN if self._usual else 1.0)
         self.restart()
+
+    def misfits(self, match: ScanMatch) -> bool:
+        """Whether ``match`` overlaps too little; after a misfit or a gap, clearly less than usual."""
+        doubt = self._misfits or self.after_gap
+        least = max(LOW_OVERLAP, self._usual - OVERLAP_DROP) if doubt else LOW_OVERLAP
+        return not match.accepted or match.overlap < least or (self.after_gap and match.degenerate)
 
     def restart(self) -> None:
         """Treat the latest scan as fitting, because it is part of the map."""

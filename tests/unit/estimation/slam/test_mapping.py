@@ -2,16 +2,18 @@ import dataclasses
 import functools
 import itertools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from monstertruck_estimation.slam.config import MapperConfig
+from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.kiss import KissMatcher
-from monstertruck_estimation.slam.mapping import Mapper, MappingEvent
-from monstertruck_estimation.slam.scans import ScanGeometry, prepare
+from monstertruck_estimation.slam.mapping import Mapper, MappingEstimator, MappingEvent
+from monstertruck_estimation.slam.scans import ScanGeometry, prepare, prepare_input
 from monstertruck_kinematics.se2 import between, compose
-from monstertruck_schemas.health import OdometryUse
+from monstertruck_schemas.health import LocalisationStatus, OdometryUse
+from monstertruckd.tools.logs.scans import read_scans
 from tests.unit.estimation.slam.kit import (
     BEAMS,
     CORRIDOR,
@@ -25,6 +27,8 @@ from tests.unit.estimation.slam.kit import (
     rounds,
     scan,
 )
+
+RECORDING = Path(__file__).resolve().parents[3] / "data" / "urg04lx_exp2.dat.gz"
 
 # A ring of corridors too long for the lidar to see across, with something to see everywhere.
 BLOCKS = (
@@ -161,6 +165,15 @@ def test_a_robot_that_stands_in_a_corridor_knows_its_place_and_one_that_drives_d
     assert deviation[99] < 0.03
     assert deviation[-1] > 0.1
     assert errors([step.pose for step in steps], truth).max() < 0.05
+
+
+def test_by_scans_alone_the_map_grows_through_a_door_into_a_new_room():
+    """A recorded drive at 1.5 m/s: half of the view is new."""
+    estimator = MappingEstimator(MapperConfig(), GridConfig())
+    steps = [
+        estimator.step(prepare_input(row, 30.0, estimator.twist), row) for row in read_scans(RECORDING).scans[340:430]
+    ]
+    assert LocalisationStatus.LOST not in {step.status for step in steps}
 
 
 def test_kiss_serves_as_front_end():
