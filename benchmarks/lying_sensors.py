@@ -129,7 +129,7 @@ CASES |= {
     for name in ("repeated", "noisy", "late", "doubled")
 }
 HOME: Final = {Drive.LAP: "loop", Drive.SLAM: "loop", Drive.GOAL: "rooms"}
-"""The world of those that do not drive in every one."""
+"""World of each kind of drive that does not run in every world."""
 
 
 @dataclass(frozen=True, slots=True)

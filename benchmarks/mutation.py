@@ -12,7 +12,7 @@ part, those that reach a line with the same names first. A mutant with which one
 them, take more than three times their time and 10 s is judged once more with ``PATIENCE`` times as long, and counted
 apart if that is not enough either. Mutants are judged in the order drawn, so those
 of a run that ended early (``--minutes``) are a sample as well. Results are kept, so an interrupted run goes on;
-``--again`` judges survivors anew.
+``--again`` judges survivors again.
 ``mutation_parts/equivalents.py`` lists mutants that no test can find, each with its reason; they do not count.
 The score is killed of killed and survived, with its 95 % interval (Wilson).
 """
@@ -160,7 +160,7 @@ json.dump({"lines": lines, "seconds": reported.seconds, "failed": reported.faile
 
 
 def baseline_of(folders: Iterable[str], scratch: Path) -> Baseline:
-    """What the tests of some folders reach; those of files that are as they were are not run again."""
+    """Return the lines that the tests of some folders reach; unchanged test files are not run again."""
     files = [path for folder in sorted(folders) for path in sorted((ROOT / folder).rglob("test_*.py"))]
     kept = {path: BASELINES / f"{_digest_of(path)}.json" for path in files}
     todo = [path for path in files if not kept[path].exists()]
@@ -343,7 +343,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=max((os.cpu_count() or 2) - 1, 1))
     parser.add_argument("--file", nargs="*", default=[""], help="only sources whose name contains one of these")
     parser.add_argument("--results", type=Path, default=OUTPUT, help="JSON lines, kept from run to run")
-    parser.add_argument("--again", action="store_true", help="judge earlier survivors anew, as after new tests")
+    parser.add_argument("--again", action="store_true", help="judge earlier survivors again, as after new tests")
     parser.add_argument("--minutes", type=float, default=math.inf, help="end after this time with what is judged")
     parser.add_argument("--most", type=float, default=math.inf, help="seconds of tests for each: a lower bound")
     parser.add_argument("--operators", choices=(*SETS, "both"), default="both", help="which set of them")

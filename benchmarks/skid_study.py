@@ -185,7 +185,7 @@ def seen(run: Run, stand: Any) -> Run:
 
 
 def by_stand() -> int:
-    """The paper's table by the stand and by the world's truth; 0 = all goals are met."""
+    """Compare the paper's table as the stand measures it with the simulated truth; return 0 if all goals are met."""
     with TemporaryDirectory() as logs:
         config = with_overlay(robot(PAPER_LIKE, 1, Path(logs)), {"sim": {"world": {"noise": False}}})
         drive(config, paper_plans(config))

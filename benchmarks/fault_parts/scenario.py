@@ -143,13 +143,13 @@ class Reaction:
     detected_after_s: float | None = None
     """A service is reported lost, or the gate stops."""
     stop_bytes_after_s: float | None = None
-    """On the drive controller's wire."""
+    """Until the stop bytes are on the drive controller's wire."""
     stop_bytes_after_sample_s: float | None = None
-    """From the arrival of the last good sample of the device."""
+    """The same, from the arrival of the last good sample of the device."""
     standstill_after_s: float | None = None
-    """Of the world's truth."""
+    """Until the simulated truck stands still."""
     metres: float = 0.0
-    """Truly travelled, to standstill or to the end of the fault."""
+    """Distance truly travelled, to standstill or to the end of the fault."""
     reason: Reason | None = None
     """First reason for which the gate stopped the truck."""
     seen: tuple[Reason, ...] = ()

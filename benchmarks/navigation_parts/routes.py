@@ -1,4 +1,4 @@
-"""Routes: the queries of a folder, with front steering and with both axles, against ompl's BIT*.
+"""Route planning compared with ompl's BIT*: the queries of a folder, with front steering and with both axles.
 
 Lengths count against the shortest known one of each query, times to the first route against BIT*'s median over some
 seeds in the same run, and a strict judge looks at every route.

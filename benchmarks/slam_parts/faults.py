@@ -43,7 +43,7 @@ SHARES = (0.2, 0.85)
 WATCHED, WRONG = 30.0, 0.5
 """Seconds after a cut in which wrong poses count, and how far off these are, m."""
 UNREPORTED, ERROR, SCAN = 3.0, 0.06, 50.0
-"""Goals of ``kidnap``: s, m, and ms a scan."""
+"""Goals of ``kidnap``: s, m, and ms per scan."""
 FAULTS = ("mirrored", "stuck", "nan", "x0.5", "x2")
 NAN = (0.4, 20.0)
 """Share of a log's time at which its odometry fails, and for how long, s."""

@@ -122,7 +122,7 @@ def ordered_modules(unpacked: Path, wanted: tuple[str, ...]) -> list[Path]:
 
 
 def initramfs(unpacked: Path, folder: Path, command: str) -> Path:
-    """Pack busybox, modules and the first program."""
+    """Pack busybox, kernel modules and the init program; return the initramfs."""
     root = folder / "initramfs"
     shutil.rmtree(root, ignore_errors=True)
     for name in ("bin", "proc", "sys", "dev", "root", "modules"):

@@ -29,7 +29,7 @@ WORLD, KIND, SEED, PICTURES = "rooms", "information", 3, 6
 
 @dataclass(frozen=True)
 class Moment:
-    """What is known, the decisions so far, and what it goes to look at."""
+    """The known map, the number of decisions so far, and the chosen viewpoint."""
 
     grid: GridPatch
     count: int
@@ -37,7 +37,7 @@ class Moment:
 
 
 class Watched(Rover):
-    """Keeps what is known and where it goes, decision by decision."""
+    """Rover that keeps a moment for every decision."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -72,7 +72,7 @@ def main() -> None:
 
 
 def draw(ax: Axes, arena: Arena, moment: Moment, track: np.ndarray) -> None:
-    """What is known at a moment, the way so far, the truck and what it goes to look at."""
+    """Draw a moment: the known map, the path so far, the truck and its viewpoint."""
     grid, (rows, columns) = moment.grid, moment.grid.cells.shape
     left, low = grid.origin
     known = np.where(grid.cells < 0, 0.75, np.where(grid.cells >= OCCUPIED, 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""Takes the pictures of the station's page, from a short recorded drive and from what a whole robot adds to it.
+"""Takes the pictures of the station's page, from a short recorded drive and the messages that a whole robot adds to it.
 
     python -m docs.pictures.station [--all FOLDER]
 
@@ -41,7 +41,7 @@ SIZES = {"desk": (1440, 900), "tablet": (820, 1180), "phone": (390, 844), "lands
 THEMES = ("light", "dark")
 NAME = "truck"
 SLOW = 0.03
-"""Rate at which the drive is played; no value becomes old."""
+"""Playback rate of the drive; no value becomes stale."""
 View = Callable[[Page, ReplayFeed], Awaitable[None]]
 
 
@@ -164,7 +164,7 @@ HEARS = """
 
 
 def play_slowly(feed: ReplayFeed, at: float | None) -> None:
-    """Play on, from a time (s), at a rate at which the drive lasts as long as the pictures take."""
+    """Continue playing, from a time (s), so slowly that the drive lasts until all pictures are taken."""
     feed.control(at, playing=True, rate=None)
     feed._rate = SLOW  # noqa: SLF001 - slower than a person is let play it
 
@@ -302,7 +302,7 @@ VIEWS: dict[str, View] = {
     "point": point,
     "fleet": fleet,
 }
-"""Every view, in an order in which each begins where the one before ends."""
+"""Every view, ordered so that each begins where the one before ends."""
 STEPS = ("path", "zone", "mission", "point", "fleet")
 """Views that each begin where the one before ends."""
 SHOWN: dict[tuple[str, str], tuple[str, ...]] = {
@@ -343,7 +343,7 @@ async def main(folder: Path | None) -> None:
 
 
 async def views(browser: Browser, url: str, feed: ReplayFeed, size: str, theme: str, folder: Path | None) -> None:
-    """The views of one size and theme: those of the documentation, or all, to a folder."""
+    """Save the views of one size and theme to a folder: only the ones in the documentation, or all."""
     wanted = tuple(VIEWS) if folder else SHOWN.get((size, theme), ())
     if not wanted:
         return

@@ -36,7 +36,7 @@ from monstertruck_schemas.topics import CMD_DRIVES, DRIVES, Topic, Writer
 
 
 class Duty(StrEnum):
-    """Purpose for which the truck needs a device."""
+    """Purpose of a device on the truck."""
 
     ACTUATOR = "actuator"
     """Carries out the gate's commands; outlives the gate, and a bug in its driver ends the daemon."""
@@ -316,7 +316,7 @@ class DeviceKind(Plugin):
         return {"device": self.doc, "port": where.name, **facts}
 
     async def _facts(self, where: Any, clock: Clock, settings: Schema) -> dict[str, Any]:
-        """What identifies a device, by name, as JSON can write it."""
+        """Identity of a device: values by name, ready for JSON."""
         asking = self.called(self.identity, where, clock, settings)
         with self.refusing(self.identity):
             found = await asking
@@ -369,14 +369,14 @@ class DeviceCatalog(Catalog[DeviceKind]):
         if role.duty is Duty.ACTUATOR and role not in OUR_ROLES:
             return f"role {role.name}: actuators are this repository's alone"
         if self._roles.get(role.name, role) != role:
-            return f"role {role.name}: there is another one of that name"
+            return f"role {role.name}: another role has this name"
         if role.elements is not None and role.elements not in row.settings_class().model_fields:
             return f"role {role.name}: elements: {row.settings} has no field {role.elements}"
         written = (*role.writes.values(), *row.also.values())
         if not_its := [t.name for t in written if t.writer is not Writer.DRIVER]:
             return f"role {role.name}: drivers do not write {', '.join(not_its)}"
         if unknown := [t.name for t in written if topics.BY_NAME.get(t.name) != t]:
-            return f"role {role.name}: {', '.join(unknown)} is no entry point of monstertruck.topics"
+            return f"role {role.name}: no entry point {', '.join(unknown)} in monstertruck.topics"
         return None
 
     @property

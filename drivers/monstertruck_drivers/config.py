@@ -1,4 +1,4 @@
-"""Which devices a robot has, where they hang, and how they are set: the sections ``devices`` and ``monitors``.
+"""Which devices a robot has, their ports and their settings: the sections ``devices`` and ``monitors``.
 
 Both have a key for every role of the catalog, and take the settings of every kind that fills the role.
 """

@@ -92,7 +92,7 @@ class Bus:
         self._retained: dict[str, tuple[Topic[Any], Any]] = {}
         self._drops = 0
         self.degraded: frozenset[str] = frozenset()
-        """Topics whose messages rest on a calibration that has expired, and say so."""
+        """Topics that depend on an expired calibration; their messages carry ``degraded``."""
         self._events = LocalPublisher(self, EVENT)
 
     def publisher(self, topic: Topic[M], writer: Writer) -> Publisher[M]:

@@ -218,7 +218,7 @@ class CalibrationWatch:
         wrong, file = await self._offload(self.odometer.load), self.odometer.file
         if wrong and file is not None:
             where = await self._offload(lambda: put_aside(file))
-            text = f"{wrong}: the distance driven restarts at 0, which delays the end of calibrations; {where}"
+            text = f"{wrong}: the distance driven restarts at 0, so calibrations expire later; {where}"
             self._events(Reason.FILE_DAMAGED, Severity.WARNING, self.name, text)
         proposal = self.proposal
         if proposal is not None and (wrong := await self._offload(proposal.load)):

@@ -43,7 +43,7 @@ S = TypeVar("S", bound=Schema)
 T = TypeVar("T", bound=TruckConfig)
 
 PLACEHOLDER = "{robot}"
-"""Placeholder in values for the robot's name."""
+"""Placeholder for the robot's name in values."""
 HEAD: Final = (
     "Settings changed while the robot ran (monstertruckd set --save); they replace those of the configuration."
 )
@@ -705,7 +705,7 @@ def _located(tree: Tree, key: tuple[str, ...], name: str) -> Path:
 
 
 def _give_ports(data: dict[str, Any]) -> None:
-    """Set the ports of an emulated robot's devices that name none to those that `simulate` makes."""
+    """Give every device of an emulated robot that names no port the port that `simulate` makes for it."""
     devices = data.get("devices")
     if data.get("sim") is None or not isinstance(devices, dict):
         return

@@ -203,7 +203,7 @@ class TruckConfig(Schema):
 
     @property
     def all_behaviours(self) -> dict[str, BehaviourConfig]:
-        """The configured behaviours, and those of the docks."""
+        """The configured behaviours, and the ones that docks add."""
         if not self.docks:
             return dict(self.behaviours)
         given = {name: self.behaviours.get(name, kind()) for name, kind in DOCKING.items()}
@@ -266,12 +266,12 @@ class TruckConfig(Schema):
 
     def weakened(self) -> tuple[str, ...]:
         """Settings less safe than their defaults, each with its value and the default."""
-        opened = (f"zenoh.insecure: anybody who reaches {end} may drive" for end in self.zenoh.open_endpoints)
+        opened = (f"zenoh.insecure: anyone who can reach {end} may drive" for end in self.zenoh.open_endpoints)
         sees = self.devices.lidar is not None or self.devices.sonar is not None
         blind = () if sees or self.gate.scan.critical else (BLIND,)
         devices = weakened_devices(self.devices, self.monitors)
         housings = (
-            f"docks.{name}.housing: lidar returns in it are no obstacle while the robot docks"
+            f"docks.{name}.housing: lidar returns in it are ignored while the robot docks"
             for name, dock in self.docks.items()
             if dock.housing is not None
         )
@@ -322,7 +322,7 @@ class TruckConfig(Schema):
         self._check_slam()
         measuring = [place for place, _ in packs(self.devices, self.monitors)]
         if len(measuring) > 1:
-            raise ValueError(f"{' and '.join(measuring)} both measure the battery; set the other one null")
+            raise ValueError(f"{' and '.join(measuring)} both measure the battery; set one of them null")
         return self
 
     def _check_docks(self) -> None:

@@ -61,7 +61,7 @@ class WizardOption(NamedTuple):
     low: float | None = None
     high: float | None = None
     scale: float = 1.0
-    """Factor from the option's unit to the field's."""
+    """Factor from the unit of the option to the unit of the field."""
     choices: tuple[str, ...] = ()
 
 
@@ -213,7 +213,7 @@ _ROWS: Final = (
         fits=_truck_with("steering", "compass", "drive"),
         options=(
             WizardOption("rough", False, "Directions and a first centre: before the compass is calibrated."),
-            WizardOption("strings", 3, "Straight runs along a string; 0 = there is none.", 0, 20),
+            WizardOption("strings", 3, "Straight runs along a string; 0 = no string.", 0, 20),
             WizardOption("string_error", 3.5, STRING, 0.5, 50, scale=1e-3),
         ),
     ),
@@ -262,7 +262,7 @@ _ROWS: Final = (
     ),
     WizardKind(
         name="lidar",
-        doc="""Where the lidar sits on the body, and its clock against odometry's: quarter circles and straights.
+        doc="""Where the lidar sits on the body, and its clock offset to odometry: quarter circles and straights.
 
         Asks with heights `centre`, `ahead` and `left` (cm), and `clear`.
         """,
@@ -326,7 +326,7 @@ _ROWS: Final = (
         fits=lambda config: config.body.kind == "skid_steer" and config.stand != "none",
         options=(
             WizardOption(
-                "by", "stand", "What says where the robot is: stand, or pose (in its map).", choices=("stand", "pose")
+                "by", "stand", "Reference for the robot's pose: stand, or pose (in its map).", choices=("stand", "pose")
             ),
             WizardOption("rounds", 2, "Times that each arc is driven to and fro.", 1, 20),
         ),

@@ -1,16 +1,17 @@
 """Dock check: lets the robot come near a dock, slowly, while a behaviour docks or undocks.
 
-The gate knows the docks of the configuration: places, housings and staging distances. Where exactly a dock is, the
-behaviour says in ``plan/behaviour``; the gate believes it only within these bounds:
+The gate knows the docks of the configuration: places, housings and staging distances. The behaviour reports the exact
+pose of a dock in ``plan/behaviour``; the gate accepts it only within these bounds:
 
 - the behaviour runs, holds the drive, and its report is fresh;
-- the dock is within 0.3 m and 0.3 rad of its place on the map, on which the robot knows its own;
-- the robot stands on the axis of the dock: at most ``docking.across`` beside it, ``docking.turn`` off it, no farther
-  than the staging pose, and no more than ``docking.beyond`` past the docked pose. A robot that docks in reverse also
-  looks at the dock, and backs off to turn about: either end may face the dock, as far as ``turning`` beyond staging.
+- the robot is localised on the map, and the dock is within 0.3 m and 0.3 rad of its place there;
+- the robot stands on the axis of the dock: at most ``docking.across`` to either side, ``docking.turn`` off it, not
+  further out than the staging pose, and no more than ``docking.beyond`` past the docked pose. A robot that docks in
+  reverse also looks at the dock, and backs off to turn about: either end may face the dock, as far as ``turning``
+  beyond staging.
 
-Within them the pace is at most ``docking.speed``, lidar returns inside the housing do not count as obstacles, and the
-corridor of a robot within these bounds counts as seen ground. All other rules stay in force, and contact is detected as
+Within them the pace is at most ``docking.speed``, lidar returns inside the housing are ignored, and the corridor of a
+robot within these bounds counts as seen ground. All other rules stay in force, and contact is detected as
 for an operator on unseen ground.
 """
 

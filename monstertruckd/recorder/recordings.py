@@ -103,7 +103,7 @@ class Recordings:
         name = payload.get("name")
         found = next(((path, row) for path, row in self._files() if row.name == name), None)
         if found is None:
-            raise NotFoundError(f"recording {str(name)[:120]!r}: there is none of this name")
+            raise NotFoundError(f"recording {str(name)[:120]!r}: no such recording")
         return found
 
     async def _list(self, _: dict[str, Any]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 ``interfaces.txt`` lists them in the language of ``.msg``, ``.srv`` and ``.action`` files, without constants and
 defaults: neither is part of a hash. The hash of a type is RIHS01: SHA-256 of its type description as JSON (REP 2016).
 Iron, Jazzy, Kilted and Lyrical have the same hash for every interface here except for some actions of Nav2. Their
-other editions are marked, such as ``@kilted``: the name on the wire is the same, the fields are that distribution's.
+other editions are marked, such as ``@kilted``: same name on the wire, fields of that distribution.
 """
 
 import hashlib
@@ -140,13 +140,13 @@ def _needed(name: str, known: dict[str, tuple[RosField, ...]]) -> set[str]:
 
 
 DISTRIBUTIONS: Final = ("humble", "jazzy", "kilted", "lyrical")
-"""Distributions of ROS 2 by age; an edition without a mark is Jazzy's."""
+"""Distributions of ROS 2 by age; an edition without a mark belongs to Jazzy."""
 
 
 def action_edition(action: str, distribution: str) -> str:
     """Return the edition of an action in a distribution, e.g. ``nav2_msgs/action/FollowPath@lyrical``."""
     newest = DISTRIBUTIONS.index(distribution)
-    marks = DISTRIBUTIONS[min(newest, 1) : newest + 1]  # 1: none of the later ones has Humble's
+    marks = DISTRIBUTIONS[min(newest, 1) : newest + 1]  # 1: no later one has Humble's editions
     found = (f"{action}@{mark}" for mark in reversed(marks))
     return next((edition for edition in found if f"{edition}_Goal" in interfaces()), action)
 

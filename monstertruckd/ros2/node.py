@@ -1,4 +1,4 @@
-"""What a face needs of ROS 2: publishers, subscriptions and services of one node, by whatever middleware."""
+"""Interface of a face to ROS 2: publishers, subscriptions and services of one node, by whatever middleware."""
 
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -45,13 +45,13 @@ class RosNode(Protocol):
     """One node of the ROS 2 graph. All callbacks are called on the event loop."""
 
     distributions: Sequence[str]
-    """Those of ``interfaces.DISTRIBUTIONS`` whose nodes it meets."""
+    """Members of ``interfaces.DISTRIBUTIONS`` whose nodes it meets."""
 
     def publisher(self, topic: str, interface: str, qos: RosQos) -> Publish:
         """Offer a topic; ``topic`` is absolute, or relative to the node's namespace."""
 
     def subscribe(self, topic: str, interface: str, take: Take, qos: RosQos = RELIABLE) -> None:
-        """Receive a topic: the newest message of every publisher, also an earlier one if ``qos`` is latched."""
+        """Receive a topic: the latest message of every publisher, also an earlier one if ``qos`` is latched."""
 
     def serve(self, service: str, interface: str, answer: Answer) -> None:
         """Offer a service; requests are answered in parallel."""
@@ -70,7 +70,7 @@ class RosNode(Protocol):
 def sole_publisher(
     found: Iterable[tuple[str, str, bytes]], namespace: str, own: Collection[str]
 ) -> tuple[RosSender | None, bytes]:
-    """Publisher of a topic and its identity; None unless exactly one is not this program's.
+    """Publisher of a topic and its identity; None unless exactly one belongs to another program.
 
     Args:
         found: namespace, name of the node and identity of all publishers.

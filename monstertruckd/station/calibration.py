@@ -26,7 +26,7 @@ class Measured:
     rows: Sequence[dict[str, Any]]
     """Estimates: name, unit, meaning, value, low, high, grade, and those ``before`` with their interval."""
     measured: str
-    """What was done, in a sentence."""
+    """Summary of the measurement, in a sentence."""
     save: Callable[[], Awaitable[str]]
     """Saves it; returns where, for people."""
 
@@ -35,7 +35,7 @@ class Calibrator(Protocol):
     """The wizards, which the station does not know."""
 
     async def offered(self, truck: TruckClient) -> list[dict[str, Any]]:
-        """Return what fits the robot, in the order in which it is best done: id, name, doc, options, whether due."""
+        """Return the wizards for this robot, in the recommended order: id, name, doc, options, whether due."""
 
     async def measure(self, truck: TruckClient, step: str, options: Mapping[str, Any], panel: "PagePanel") -> Measured:
         """Run one of them, with other options than its defaults.
@@ -58,7 +58,7 @@ class PagePanel:
         self.bar: dict[str, Any] | None = None
         """Progress of the step under way."""
         self.question: dict[str, Any] | None = None
-        """What the operator is asked."""
+        """Question to the operator."""
         self._answer: asyncio.Future[float | bool] | None = None
 
     def say(self, text: str) -> None:
@@ -77,7 +77,7 @@ class PagePanel:
         return float(await self._ask(kind="number", name=step.name, text=step.question, low=step.low, high=step.high))
 
     async def confirm(self, step: Any) -> bool:
-        """Ask for yes or no; of what is no ``fact``, no ends the wizard."""
+        """Ask for yes or no; unless it is a ``fact``, no ends the wizard."""
         return bool(await self._ask(kind="confirm", name=step.name, text=step.question, fact=step.fact))
 
     async def _ask(self, **question: Any) -> float | bool:

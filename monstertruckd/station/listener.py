@@ -91,7 +91,7 @@ class WebListener:
                 self._begin(self._greet(taken, address, network))
             else:
                 taken.close()
-                self._refused(address, f"{MOST_OF_NETWORK} connections of {network} are being set up: no further one")
+                self._refused(address, f"{MOST_OF_NETWORK} connections from {network} are being set up: refused")
 
     async def _greet(self, taken: socket.socket, address: str, network: str) -> None:
         longest = None if self._tls is None else HANDSHAKE_LIMIT

@@ -59,7 +59,7 @@ def _plain_type(annotation: Any) -> Any:
 
 
 def require_numbers(names: Iterable[str]) -> None:
-    """Check what a browser asks for.
+    """Check the request of a browser.
 
     Raises:
         InputError: a name is not among ``numbers``.
@@ -78,7 +78,7 @@ def value_in(message: Message, path: str) -> float | None:
 
 
 class Subscriptions:
-    """Newest messages of the topics that are plotted; a topic is subscribed to when it is first asked for.
+    """Latest messages of the plotted topics; a topic is subscribed to when it is first asked for.
 
     Args:
         subscribe: opens a mailbox of a topic.
@@ -90,7 +90,7 @@ class Subscriptions:
         self._boxes: dict[str, Mailbox[Any]] = {}
 
     def newest(self, topic: str) -> Message | None:
-        """Return the newest message of a topic."""
+        """Return the latest message of a topic."""
         if topic not in self._boxes:
             self._boxes[topic] = self._stack.enter_context(self._subscribe(topics.BY_NAME[topic], latest()))
         message: Message | None = self._boxes[topic].latest
@@ -98,10 +98,10 @@ class Subscriptions:
 
 
 class Sampler:
-    """Sends browsers the values of what they plot.
+    """Sends browsers the values that they plot.
 
     Args:
-        newest: returns the newest message of a topic.
+        newest: returns the latest message of a topic.
     """
 
     def __init__(self, newest: Callable[[str], Message | None]) -> None:
@@ -109,7 +109,7 @@ class Sampler:
         self._taken: dict[str, Message] = {}
 
     def sample(self, viewers: Iterable[Viewer]) -> None:
-        """Send what is new since the last call: one value for each plotted number, None where none came."""
+        """Send the values since the last call: one for each plotted number, None if no message came."""
         plotting = [viewer for viewer in viewers if viewer.plotted]
         wanted = {name.partition(":")[0] for viewer in plotting for name in viewer.plotted}
         found = ((topic, self._newest(topic)) for topic in sorted(wanted))

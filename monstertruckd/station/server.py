@@ -128,7 +128,7 @@ class Place:
 
     @property
     def names(self) -> frozenset[str]:
-        """Accepted values of the Host header: a page of another name that resolves here is refused."""
+        """Accepted values of the Host header; requests under other names that resolve here are refused."""
         own = f"[{self.host}]" if ":" in self.host else self.host
         names = {name.lower() for name in (own, *self.aliases, "localhost", "127.0.0.1", "[::1]")}
         usual = names if self.port == USUAL_PORTS[self.scheme] else ()

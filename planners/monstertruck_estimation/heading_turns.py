@@ -34,7 +34,7 @@ class ContraryTurn:
 
     @property
     def text(self) -> str:
-        """For a log."""
+        """Text for the log."""
         return f"the compass turned {self.headings:+.2f} rad while the robot turned {self.robot:+.2f}: a wrong sign?"
 
 

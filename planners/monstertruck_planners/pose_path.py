@@ -1,4 +1,4 @@
-"""A path as poses in the order in which they are driven: routes, elastic bands, what planners answer."""
+"""A path as poses in the order in which they are driven: routes, elastic bands, planners' answers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class PosePath:
         speeds: shape (n,), greatest speed, m/s; None if the path sets none.
 
     Raises:
-        InputError: shapes or numbers that are no path.
+        InputError: shapes or numbers do not describe a path.
     """
 
     poses: Array
@@ -49,7 +49,7 @@ class PosePath:
 
     @classmethod
     def of(cls, message: Path) -> "PosePath":
-        """Return the path in a message; see ``check_path`` for what a tracker demands besides.
+        """Return the path in a message; ``check_path`` has the further demands of a tracker.
 
         Raises:
             InputError: it is none.

@@ -111,20 +111,20 @@ class LocalisationStatus(StrEnum):
     DEGENERATE = "degenerate"
     """Scans fit, but do not determine one direction, in which the pose is odometry."""
     UNCERTAIN = "uncertain"
-    """The pose in map is known worse than ``UNCERTAIN_DEVIATION``; its covariance says how well."""
+    """The pose in map is less certain than ``UNCERTAIN_DEVIATION``; see its covariance."""
     LOST = "lost"
     """Scans have not fitted for a while: the pose is odometry."""
     SEARCHING = "searching"
     """The position on the saved map is being searched for; the pose is meaningless."""
     OUTSIDE = "outside"
-    """Scans fit no place of the saved map: the robot is outside it. The search continues."""
+    """Scans match no place on the saved map: the robot is outside it. The search continues."""
 
 
 UNCERTAIN_DEVIATION: Final = 0.1
 """Standard deviation of the position in map beyond which it is uncertain, m: as far as robots keep from
 obstacles."""
 PLACELESS: Final = frozenset({LocalisationStatus.SEARCHING, LocalisationStatus.OUTSIDE})
-"""States in which the pose in map means nothing."""
+"""States whose pose in map is meaningless."""
 MATCHED: Final = frozenset(LocalisationStatus) - PLACELESS - {LocalisationStatus.LOST}
 """States in which the robot is on the map."""
 NO_PLACE: Final = PLACELESS | {LocalisationStatus.LOST}
@@ -190,7 +190,7 @@ class OdometryHealth(Message):
     left_out: Annotated[int, Field(ge=0)] = 0
     """Readings that could not be used: late, twice, out of order, impossible or no number."""
     waiting: Annotated[int, Field(ge=0)] = 0
-    """Readings that wait to be taken in once more, after a late one or the onset of trouble."""
+    """Readings queued to be fused again, after a late reading or the onset of a doubt."""
 
 
 class LinkMedium(StrEnum):

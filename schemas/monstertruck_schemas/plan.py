@@ -164,7 +164,7 @@ class GoalState(Message):
     remaining: Annotated[float, Field(ge=0)] = 0.0
     """Remaining length of the current path (m)."""
     elapsed: Annotated[float, Field(ge=0)] = 0.0
-    """Seconds spent on it, pauses left out."""
+    """Seconds spent on it, excluding pauses."""
     routes: Annotated[int, Field(ge=0)] = 0
     """Number of routes so far, including the current one."""
     recoveries: Annotated[int, Field(ge=0)] = 0
@@ -312,7 +312,7 @@ class MissionState(Message):
     resumable: bool = False
     """Whether an interrupted mission can be resumed."""
     step: Annotated[int, Field(ge=0)] = 0
-    """The present one, counted from 1 without those within others; 0 = none."""
+    """Number of the current step, from 1, nested steps not counted; 0 if none runs."""
     steps: Annotated[int, Field(ge=0)] = 0
     node: str = ""
     """Position of the current step among those within others, such as 2.1"""

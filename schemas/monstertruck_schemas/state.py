@@ -217,7 +217,7 @@ class Consistency(Message):
     unshown: UnshownMotion | None = None
     """Motion of the body that the wheels do not show, or None."""
     standing: StandingBody | None = None
-    """Evidence that the body stands although its wheels roll, or None."""
+    """Evidence that the body stands still although its wheels turn, or None."""
 
 
 class GateMode(StrEnum):

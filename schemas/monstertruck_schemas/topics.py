@@ -113,7 +113,7 @@ class Topic(Generic[M]):
     retained: bool = False
     """Late joiners get the latest message at once."""
     foxglove: str | None = None
-    """Well-known protobuf schema it travels as; None = JSON with JSON Schema."""
+    """Well-known protobuf schema on the wire; None for JSON with JSON Schema."""
     place: str | None = None
     """Key below ``mt/`` with ``{robot}``, for messages about a robot from elsewhere; None if below its own name."""
 

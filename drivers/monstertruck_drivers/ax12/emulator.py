@@ -145,7 +145,7 @@ class Ax12Bus(FaultyDevice):
     # Interface to the simulated world
 
     def angle(self, ident: int, time_ns: int) -> float:
-        """Shaft of a unit, rad, counter-clockwise positive, 0 at position 0; see ``angles``."""
+        """Shaft angle of a unit, rad, counter-clockwise positive, 0 at position 0; see ``angles``."""
         return float(self.angles(ident, np.array([time_ns]))[0])
 
     def angles(self, ident: int, times_ns: NDArray[np.int64]) -> NDArray[np.float64]:

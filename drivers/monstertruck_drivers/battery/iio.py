@@ -92,9 +92,9 @@ def find(root: Path, name: str) -> Converter:
     fitting = [converter for converter in known if name in ("", converter.name)]
     names = ", ".join(converter.name for converter in known) or "none"
     if not fitting:
-        raise DeviceLostError(f"{root}: no converter {name or 'at all'}; there: {names}")
+        raise DeviceLostError(f"{root}: no converter {name or 'at all'}; found: {names}")
     if len(fitting) > 1:
-        raise DeviceMismatchError(f"{root}: expected one converter {name}, there: {names}; say which by its name")
+        raise DeviceMismatchError(f"{root}: expected one converter {name}, found: {names}; select one by its name")
     return fitting[0]
 
 

@@ -295,7 +295,7 @@ class _DriveSession:
             return
         if mark is not None:
             self._driver.odometer.restart()
-            self._report(Reason.DEVICE_RESTARTED, Severity.WARNING, "the controller restarted: position goes on")
+            self._report(Reason.DEVICE_RESTARTED, Severity.WARNING, "the controller restarted: position continues")
             if self._reported not in OFF or self._setpoint().goal is not State.SWITCH_ON_DISABLED:
                 raise DeviceRestartedError("the controller restarted")
 

@@ -132,7 +132,7 @@ def segment_request(toggle: bool) -> Frame:
 
 @dataclass(frozen=True, slots=True)
 class ObjectSegment:
-    """One piece of a long object."""
+    """One segment of a long object."""
 
     data: bytes
     toggle: bool

@@ -37,9 +37,9 @@ class StepperConfig(Schema):
     answer_timeout: Annotated[float, Field(gt=0, le=0.2)] = 0.05
     """Timeout of an answer (s)"""
     command_timeout: Seconds = 0.25
-    """Age of the latest command at which the motors ramp down to rest (s)"""
+    """Maximum age of the latest command (s); then the motors ramp down to rest"""
     quick_stop_after: Seconds = 1.0
-    """Age of the latest command at which the motors quick-stop (s)"""
+    """Maximum age of the latest command (s); then the motors quick-stop"""
     watchdog: Annotated[float, Field(ge=0.05, le=2.0)] = 0.3
     """Time without a run request after which the controller itself stops the motors (s)"""
 

@@ -171,7 +171,7 @@ def topology_of(sysfs: Sysfs, name: str) -> str:
 
 
 def at_present(sysfs: Sysfs, name: str) -> str:
-    """Return the current kernel name of a place given by topology.
+    """Return the current kernel name of the port at a topology path.
 
     Returns ``name`` itself if it is not a name by topology, or absent. Of the two root hubs of a USB 3 controller, the
     hub with a device at the place is used, otherwise the USB 2 hub.

@@ -24,7 +24,7 @@ from monstertruck_runtime.errors import DeviceMismatchError, DeviceTimeoutError,
 ATTEMPTS: Final = 3
 """Tries of the requests of a session's beginning."""
 SETTINGS_TIMEOUT: Final = 0.5
-"""Timeout of an answer of some 500 bytes, or after which the controller restarts its applications (s)."""
+"""Timeout of long answers (some 500 bytes) and of those that precede a restart of the applications (s)."""
 
 
 class VescSession:

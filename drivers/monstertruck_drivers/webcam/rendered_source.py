@@ -1,4 +1,4 @@
-"""Pictures of the emulated camera over its port, and the camera at a path, whichever is there."""
+"""Frame sources: the emulated camera over its port, and the real or emulated camera at a path."""
 
 from pathlib import Path
 from typing import Final, Self

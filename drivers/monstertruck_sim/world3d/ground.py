@@ -1,4 +1,4 @@
-"""The ground of a world: its heights on a grid, what stands on it, and geometries from other MJCF files."""
+"""The ground of a world: its heights on a grid, objects on it, and geometries from other MJCF files."""
 
 from collections.abc import Sequence
 from math import ceil, cos, radians, sin, tan
@@ -51,7 +51,7 @@ def ground_heights(
     shaped = any(not isinstance(feature, UprightStep | Rubble) for feature in config.ground)
     if profile is None and not config.rough and not shaped and config.height_image is None:
         return None
-    margin = 1.0  # the height field goes on so far beyond the map, m
+    margin = 1.0  # margin of the height field beyond the map, m
     x0, x1, y0, y1 = bounds[0] - margin, bounds[1] + margin, bounds[2] - margin, bounds[3] + margin
     columns, rows = (ceil((high - low) / HEIGHT_STEP) + 1 for low, high in ((x0, x1), (y0, y1)))
     x, y = np.meshgrid(x0 + np.arange(columns) * HEIGHT_STEP, y0 + np.arange(rows) * HEIGHT_STEP)

@@ -85,7 +85,7 @@ class Group(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class DriveLine:
-    """Between the shafts and the wheels.
+    """Mechanics between the shafts and the wheels.
 
     Args:
         shafts: for every driven shaft its wheels' spin joints; between them are open differentials: the shaft turns

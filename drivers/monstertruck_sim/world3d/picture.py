@@ -21,7 +21,7 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class CameraPose:
-    """From where a picture is taken.
+    """Viewpoint of a picture.
 
     Args:
         place: place of the camera, m.
@@ -56,7 +56,7 @@ class WorldRenderer:
     """Draws a model; to be used in one thread.
 
     Args:
-        model: MuJoCo's.
+        model: MuJoCo model.
         width: width of the pictures, pixels.
         height: pixels.
 
@@ -77,7 +77,7 @@ class WorldRenderer:
             self._gl = GLContext(width, height)
         except RuntimeError as error:
             raise NotInstalledError(
-                f"pictures: EGL does not draw (Debian: apt install libegl-mesa0): {error}"
+                f"pictures: EGL cannot render (Debian: apt install libegl-mesa0): {error}"
             ) from error
         self._gl.make_current()
         self._scene = mujoco.MjvScene(model, maxgeom=5000)
@@ -108,13 +108,13 @@ class WorldRenderer:
         robots: Sequence[Plant] = (),
         hidden: Collection[Group] = (),
     ) -> None:
-        """Take over what is to be seen; needs no thread of its own.
+        """Update the scene to draw; needs no particular thread.
 
         Args:
             data: state of the world.
             camera_pose: from where.
             people: who is there.
-            robots: others than the model's own; those of rigid bodies are drawn as they stand and steer.
+            robots: other robots than the model's; rigid bodies are drawn with their pose and steering.
             hidden: groups that are left out.
         """
         self._option.geomgroup[:] = [group in list(Group) and group not in hidden for group in range(mujoco.mjNGROUP)]
@@ -142,14 +142,14 @@ class WorldRenderer:
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = True
 
     def render(self) -> Picture:
-        """What was arranged; in the thread that made the renderer."""
+        """Draw the scene; only in the thread that made the renderer."""
         self._gl.make_current()
         mujoco.mjr_render(self._view, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._view, self._context)
         return self._pixels[::-1].copy()
 
     def _add_person(self, x: float, y: float, z: float, radius: float) -> None:
-        """Legs, trunk and head of somebody who stands at a place."""
+        """Legs, trunk and head of a person who stands at a place."""
         parts = (
             (mujoco.mjtGeom.mjGEOM_CYLINDER, (0.8 * radius, 0.4, 0.0), 0.4, (0.2, 0.24, 0.36, 1.0)),
             (mujoco.mjtGeom.mjGEOM_CYLINDER, (radius, 0.32, 0.0), 1.12, (0.6, 0.24, 0.2, 1.0)),

@@ -117,14 +117,14 @@ def directions(angles: Array) -> Array:
 
 
 def in_camera(points: Array, mount: Array, lidar: LidarPlace) -> Array:
-    """Points of the lidar in the camera's axes, m; (n, 3) both."""
+    """Return lidar points in the camera's axes, m; input and result (n, 3)."""
     x, y, z, yaw, pitch, roll = mount.tolist()
     on_body = points @ lidar.axes.T + lidar.place
     return np.asarray((on_body - (x, y, z)) @ camera_axes(yaw, pitch, roll))
 
 
 def in_board(points: Array, pose: BoardPose, mount: Array, lidar: LidarPlace) -> Array:
-    """Points of the lidar on the board, m: right, down, and behind it; (n, 3) both."""
+    """Return lidar points in the board's axes, m: right, down, and behind it; input and result (n, 3)."""
     return np.asarray((in_camera(points, mount, lidar) - pose.place) @ pose.axes)
 
 

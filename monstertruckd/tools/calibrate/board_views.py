@@ -157,7 +157,7 @@ class BoardGuide:
         if self.views and not self.uncovered():
             distances = [view.pose.place[2] for view in self.views]
             if max(distances) < 1.3 * min(distances):  # ratio of the farthest to the nearest view distance
-                found.append(f"the board nearer and farther than {min(distances):.2f} to {max(distances):.2f} m")
+                found.append(f"the board at more distances, not only {min(distances):.2f} to {max(distances):.2f} m")
         found += self._tilts(self.views, 3, "")  # views needed with a larger tilt, to each of four sides
         found += _more(24 - len(self.views), "view of it", "views of it")
         if self.beams is not None:
@@ -199,7 +199,7 @@ class BoardGuide:
         distances = [float(pose.place[2]) for pose in poses if abs(pose.lean) > STEEP]
         # 1.5: ratio of their farthest to their nearest distance: it separates height from pitch
         if not found and max(distances) < 1.5 * min(distances):
-            found.append(f"it so nearer and farther than {min(distances):.2f} to {max(distances):.2f} m")
+            found.append(f"it so at more distances, not only {min(distances):.2f} to {max(distances):.2f} m")
         return found
 
     @staticmethod

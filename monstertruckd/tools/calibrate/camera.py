@@ -65,7 +65,7 @@ class CameraWizard:
             InputError: a marker does not lie in its square.
         """
         if marker >= square:
-            text = f"expected less than --square {1000 * square:g}, in which it lies"
+            text = f"expected less than --square {1000 * square:g}, the square around it"
             raise InputError(f"--marker {1000 * marker:g}: {text}")
         return cls(BoardConfig(columns=columns, rows=rows, square=square, marker=marker), not lens_only, patience)
 
@@ -93,7 +93,7 @@ class CameraWizard:
             scans, picture = others.get(topics.SCAN.name, []), decoded(message)
             if picture is not None and picture.shape != shape:
                 now = " x ".join(map(str, picture.shape[::-1]))
-                raise InputError(f"the camera's pictures were {width} x {height} pixels and are {now} now: begin anew")
+                raise InputError(f"the camera's pictures were {width} x {height} pixels and are {now} now: start again")
             sighting = None if picture is None else reader.read(picture)
             if guide.take(message.stamp, sighting, scans, damaged=picture is None) is not None:
                 missing = guide.missing()
@@ -137,7 +137,7 @@ def check_kept(before: LidarPlace, after: LidarPlace | None) -> None:
     if turn > KEPT:
         raise InputError(
             f"the lidar has turned by {math.degrees(turn):.1f} degrees on its stabiliser meanwhile: stand the robot "
-            "firmly, lean on nothing of it, and begin anew"
+            "firmly, do not lean on it, and start again"
         )
 
 
@@ -158,7 +158,7 @@ def lens_of(views: Sequence[BoardView], reader: BoardReader, size: tuple[int, in
     if found.rms > worst:
         raise InputError(
             f"corners are off by {found.rms:.1f} pixels (expected {worst:g} at most): the board is not flat, it "
-            "moved, or the lens is no pinhole with some distortion"
+            "moved, or a pinhole with radial distortion does not describe the lens"
         )
     return found, kept
 
@@ -220,7 +220,7 @@ def lidar_halves(context: WizardContext) -> dict[str, float]:
 def result_of(found: LensFit, views: int, placed: PlacedMount | None = None) -> Result:
     """Assemble the result; without ``placed`` for the lens alone."""
     lens, (width, height) = found.lens, found.lens.size
-    sized = "pictures for which the lens holds"
+    sized = "size of the pictures that the lens describes"
     estimates = [
         Estimate(name=name, value=value, unit="px", samples=views, meaning=sized, key=f"{CAMERA_LENS}.{name}")
         for name, value in (("width", width), ("height", height))
@@ -236,9 +236,9 @@ def result_of(found: LensFit, views: int, placed: PlacedMount | None = None) -> 
         noise = "95 % of line and plane, lens and print, and of the lidar's mount where it was calibrated"
         for name, interval in placed.values.items():
             unit = "m" if name in ("x", "y", "z") else "rad"
-            text = f"of the camera on the body, by the lidar's; {noise}"
+            text = f"of the camera on the body, from the lidar's mount; {noise}"
             estimates.append(estimated(name, interval, unit, placed.lines, text, f"{CAMERA_MOUNT}.{name}"))
-        text = "of the board, as a share of what is stated, by lidar and ruler; for information"
+        text = "scale of the board relative to the stated size, by lidar and ruler; for information"
         estimates.append(estimated("board_size", placed.size, "", placed.lines, text))
     crossed = "" if placed is None else f", {placed.lines} across the lidar's beam"
     return Result(

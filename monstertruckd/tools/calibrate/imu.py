@@ -145,7 +145,7 @@ def result_of(
             len(resting),
             "bias of the angular velocity at rest; 95 % of the readings' noise"
             if name.startswith("rate")
-            else "bias of the specific force; 95 % of the noise and of the compass's tilt",
+            else "bias of the specific force; 95 % interval from the noise and the compass's tilt",
             f"{IMU}.{name}",
         )
         for name, found in biases.items()

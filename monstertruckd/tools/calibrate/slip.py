@@ -164,7 +164,7 @@ def result_of(arcs: Sequence[SkidArc], radius: float, half_track: float) -> Resu
     }
     return Result(
         wizard="slip",
-        measured=f"{len(arcs)} arcs between rests; unexplained {fit.rms:.2f} of what is expected",
+        measured=f"{len(arcs)} arcs between rests; residuals {fit.rms:.2f} of the expected noise",
         estimates=tuple(
             Estimate(
                 name=name,

@@ -174,7 +174,7 @@ def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape
     estimates = [
         estimated("cone", found[2].times(2.0), "rad", count, f"full opening angle, hard edges taken; {noise}",
                   f"{SONAR}.field_of_view"),
-        estimated("speed_of_sound", sound, "m/s", count, f"with which the wall is where the tape says; {noise}",
+        estimated("speed_of_sound", sound, "m/s", count, f"that puts the wall at the taped distance; {noise}",
                   f"{SONAR}.speed_of_sound"),
     ]  # fmt: skip
     meanings = {"x": "ahead of the robot's middle", "y": "left of it", "yaw": "of its axis, left positive"}
@@ -188,7 +188,7 @@ def result_of(legs: Sequence[SonarLeg], settings: Srf08Config, wall: float, tape
             )
     return Result(
         wizard="sonar",
-        measured=f"{len(legs)} arcs beside a wall, {count} echoes; unexplained {fit.rms:.2f} of what is expected",
+        measured=f"{len(legs)} arcs beside a wall, {count} echoes; residuals {fit.rms:.2f} of the expected noise",
         estimates=tuple(estimates),
         unobserved=(
             "height and tilt of the cones",
@@ -388,7 +388,7 @@ def _check_places(legs: Sequence[SonarLeg], places: Mapping[str, SonarPose], wal
         nearest = min(off, key=lambda at: off[at])
         # 0.4: maximum angle between the middles of the measured and of the expected echoes of any mount, rad
         if off[name] > 0.4 and nearest != name:
-            wrong.append(f"{name} hears what is due at {nearest}")
+            wrong.append(f"{name} hears the echoes due at {nearest}")
     if deaf:
         raise InputError(f"sonar {', '.join(deaf)}: too few echoes of the wall: is it where it was taped?")
     if wrong:

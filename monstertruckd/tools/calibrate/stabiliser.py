@@ -112,7 +112,7 @@ class StabiliserWizard:
         """Measure."""
         device = context.config.devices.stabiliser
         if device is None or context.config.devices.compass is None or context.config.devices.lidar is None:
-            raise RequestRefusedError(Reason.NOT_SUPPORTED, "a stabiliser is measured with compass and lidar")
+            raise RequestRefusedError(Reason.NOT_SUPPORTED, "calibrating a stabiliser needs a compass and a lidar")
         await context.confirm(_LEVEL)
         flat, scans = await self._stand(context)
         ahead, left = (beam_distance(scans, angle) for angle in (0.0, math.pi / 2))

@@ -40,7 +40,7 @@ BAND: Final = NORMAL * DEAD_BAND / math.sqrt(3)
 SPAN: Final = 50.0
 """Degrees of the servo between full circles to the left and to the right."""
 SHORT: Final = math.radians(2.0)
-"""Servo angle, rad, that has to be missing before a stop is assumed; circles keep as far from the ends."""
+"""Shortfall of the servo angle from which a mechanical stop is assumed, rad; circles keep this far from the ends."""
 
 _TURNED: Final = Confirm(
     "turned", "Steered to the left and driving ahead: did the robot turn to the LEFT, seen from above?", fact=True
@@ -124,7 +124,7 @@ class SteeringWizard:
             InputError: it is.
         """
         speed, angle, metres = ROUGH
-        await context.move(MoveStep("front wheels left once more, to see where it turns", speed, angle, 0.0, metres))
+        await context.move(MoveStep("front wheels left again, to see where it turns", speed, angle, 0.0, metres))
         if await context.confirm(_TURNED):
             raise InputError(
                 "the robot turns as it is steered, and the compass the other way: it is mounted upside down, or its "

@@ -73,7 +73,7 @@ def emulate(
 
     async def main(clock: "Clock") -> None:
         async with emulate_device(device, port, clock, seed) as emulated:
-            remark(f"{device} on {tcp or port}; faults on standard input, Ctrl-C ends")
+            remark(f"{device} on {tcp or port}; enter faults on standard input, stop with Ctrl-C")
             if (limits := OWN_CLIENTS.get(DEVICES.named(device).opens)) is not None:
                 remark(f"{device}: {limits}")
             await FaultConsole(CommandedGroup("device", {device: emulated}), sys.stdin, print_words).run()
@@ -86,7 +86,7 @@ def probe(
     device: DeviceArgument,
     port: Annotated[
         Path | None,
-        typer.Option("--port", "-p", help="Device node or ADDRESS:PORT on the network; of a camera also a pattern."),
+        typer.Option("--port", "-p", help="Device node, or ADDRESS:PORT on the network; for a camera also a pattern."),
     ] = None,
     baud: Annotated[int | None, typer.Option(min=1, help="Bits per second; default: the device's own.")] = None,
     json_output: JsonOption = False,
@@ -103,7 +103,7 @@ def probe(
 
     kind = DEVICES.named(device)
     if kind.opens in ("serial", "i2c") and port is None:
-        raise InputError(f"{device}: say where it hangs with --port")
+        raise InputError(f"{device}: give its port with --port")
     if kind.opens == "computer" and port is not None:
         raise InputError(f"{device}: is the computer's own and hangs on no port; leave out --port")
 

@@ -15,7 +15,7 @@ from monstertruck_schemas.state import Grid
 
 UNKNOWN, FREE, WALL, ROBOT = range(4)
 COLOURS: Final = ("grey15", "grey82", "grey35", "red")
-"""Of the four kinds of cells, by their number."""
+"""Colours of the four kinds of cells, by their number."""
 ARROWS: Final = "→↗↑↖←↙↓↘"
 """Headings in steps of 45 degrees."""
 
@@ -50,7 +50,7 @@ def map_text(grid: Grid, pose: Pose2D | None, columns: int, rows: int) -> Text:
 
     Args:
         grid: the map.
-        pose: robot's, in the map's frame; None = not drawn.
+        pose: pose of the robot in the map's frame; None to leave it out.
         columns: characters there is room for.
         rows: lines there is room for.
     """

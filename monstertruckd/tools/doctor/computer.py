@@ -46,7 +46,7 @@ def calendar(context: HostContext) -> Iterator[Finding]:
     if any((context.computer.root / "sys/class/rtc").glob("rtc*")):
         yield fine("clock chip", "there")
     else:
-        seen = "none: after a start without network the date is that of the last shutdown, until NTP steps it"
+        seen = "none: after a start without network the date continues from the last shutdown, until NTP steps it"
         yield fine("clock chip", seen)
 
 
@@ -113,7 +113,7 @@ def wireless(context: HostContext) -> Iterator[Finding]:
         found[named[1] if named is not None else "network"] = _security(block, "wep_key0", "psk=")
     for name, kind in found.items():
         if kind:
-            yield warn("wireless", Reason.LINK_OPEN, f"{name} is {kind}: anybody near can listen and speak; use WPA2")
+            yield warn("wireless", Reason.LINK_OPEN, f"{name} is {kind}: anyone in range can listen and send; use WPA2")
     if found and not any(found.values()):
         yield fine("wireless", f"{', '.join(found)}: with a key")
 
@@ -162,7 +162,7 @@ def access(context: HostContext) -> Iterator[Finding]:
     if zenoh.tls is not None:
         names = ", ".join(f"{name} ({grant.role})" for name, grant in zenoh.tls.grants().items())
         seen = (
-            f"{names}; Zenoh drops requests under another name than the certificate's, and answers nothing; "
+            f"{names}; Zenoh silently drops requests under names that the certificate lacks; "
             "`monstertruckd security check` tries what each role may do"
         )
         yield fine("names", seen)
@@ -204,9 +204,9 @@ def _expiry(context: HostContext, file: Path, place: Path) -> Finding:
     except InputError:
         return fail("certificate", Reason.BAD_INPUT, f"{file}: expected certificates", show)
     if days < 0:
-        return fail("certificate", Reason.NOT_PERMITTED, f"{file}: that of {name} expired {-days} days ago", show)
+        return fail("certificate", Reason.NOT_PERMITTED, f"{file}: {name}'s certificate expired {-days} days ago", show)
     if days < 30:  # days
-        return warn("certificate", Reason.NOT_PERMITTED, f"{file}: that of {name} expires in {days} days", show)
+        return warn("certificate", Reason.NOT_PERMITTED, f"{file}: {name}'s certificate expires in {days} days", show)
     return fine("certificate", f"{file}: good for {days} days")
 
 

@@ -83,7 +83,7 @@ def _require_stored(database: Path) -> None:
     with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as bag:
         for kind, name, declared in bag.execute("SELECT type, name, sql FROM sqlite_master").fetchall():
             if kind == "view" or (kind == "table" and str(declared).upper().startswith("CREATE VIRTUAL")):
-                raise InputError(f"{database}: {name} is computed when it is read: expected stored tables")
+                raise InputError(f"{database}: {name} is a view or virtual table: expected stored tables only")
             if kind == "table" and any(row[-1] for row in bag.execute("SELECT * FROM pragma_table_xinfo(?)", (name,))):
                 raise InputError(f"{database}: table {name} has computed columns: expected stored ones")
         ((fault,),) = bag.execute("PRAGMA quick_check(1)").fetchall()

@@ -1,4 +1,4 @@
-"""What `new-robot` asks: one model, from which questions, options and their checks follow."""
+"""What `new-robot` asks: one model that defines questions, options and their checks."""
 
 import math
 from typing import Annotated, Any, Final, Literal, Self, get_args, get_origin
@@ -56,9 +56,9 @@ class Answers(Schema):
     drive: Drive
     """Motor controller"""
     drive_ratio: Annotated[float, Field(ge=1, le=5000)] = 1.0
-    """Turns of what the motor controller measures per wheel turn: of the motor, or 1 for encoders on the wheels"""
+    """Turns of the measured shaft per wheel turn: of the motor, or 1 for encoders on the wheels"""
     pull: Positive | None = None
-    """Maximum force of all driven wheels (N); none: what the deceleration needs, and half as much again"""
+    """Maximum force of all driven wheels (N); none: 1.5 times the force of the deceleration"""
     steering: Literal["none", "drive", "maestro", "pca9685"] = "none"
     """Steering servos: on the motor controller's output, on a Maestro, on a PCA9685"""
     lidar: str = NONE

@@ -164,14 +164,14 @@ class Folder:
         given = {name: value for name, value in named.items() if value is not None}
         _validated(CertificateRegister, FIRST | given, self.path)
         if days > AUTHORITY_DAYS:
-            raise InputError(f"{days} days: expected at most {AUTHORITY_DAYS}, those of the authority")
+            raise InputError(f"{days} days: expected at most {AUTHORITY_DAYS}, the lifetime of the authority")
         make_folder(self.path, 0o700)
         with self._alone():
             new = not (self.path / "register.yaml").exists()
             if new and (names := sorted(file.stem for file in self.path.glob("issuers/*.pem"))):
                 raise InputError(
                     f"{self.path}: register.yaml is missing among certificates of {', '.join(names)}: restore it, "
-                    "or remove the folder issuers to begin anew, without them"
+                    "or remove the folder issuers to start again without them"
                 )
             before = FIRST if new else self.register().model_dump()
             register = _validated(CertificateRegister, before | given, self.path)
@@ -395,7 +395,7 @@ def require_address(address: str) -> None:
 
 
 def _require_time(authority: Certificate, now: int, days: int) -> None:
-    """Refuse a lifetime beyond the authority's.
+    """Refuse a lifetime that ends after the authority expires.
 
     Raises:
         InputError: the authority is not valid yet, as with a wrong clock, or expires earlier.

@@ -376,7 +376,7 @@ class ConsistencyMonitor:
     def _take_delay(self, stamp: int, delay: Delay) -> None:
         lidar, (first, *_) = self._sensors[Measure.SCANS], self._witnesses
         text = (
-            f"what the scans show lags {delay.seconds:.1f} s behind the {' and the '.join(self._witnesses)}: "
+            f"motion seen in the scans lags {delay.seconds:.1f} s behind the {' and the '.join(self._witnesses)}: "
             f"{self._config.delay:g} s tolerated"
         )
         self._found.setdefault(

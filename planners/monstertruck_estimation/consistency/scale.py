@@ -38,11 +38,11 @@ class ScaleWatch:
         """Motions from the reference to a revolution that nothing explained; empty without one."""
 
     def begin(self, newest: Revolution | None) -> None:
-        """Start anew at a revolution, or without one."""
+        """Restart at a revolution, or without one."""
         self._reference, self._over = newest, []
 
     def change(self, newest: Revolution, motions: list[Array]) -> float | None:
-        """Return the factor by which all ranges have changed, or None.
+        """Return the common scale factor of all ranges, or None.
 
         Args:
             newest: latest revolution.
@@ -115,7 +115,7 @@ def _polar(points: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
 
 
 def _ratios(bearings: Array, distances: Array, others: Array, reach: Array) -> Array:
-    """Logarithms of the ratios of distances to those of the other points nearest in bearing."""
+    """Logarithms of the ratios of distances to the distances of the other points nearest in bearing."""
     order = np.argsort(others)
     there = np.searchsorted(others[order], bearings)
     sides = [order[(there + side) % len(order)] for side in (-1, 0)]

@@ -183,7 +183,7 @@ def predict(state: FilterState, stamp: int, config: FusionConfig) -> FilterState
 
 
 def apply_measurement(state: FilterState, measurement: Measurement, config: FusionConfig) -> FilterState:
-    """Predict to the stamp of a measurement that is not earlier, and apply it."""
+    """Predict to the measurement's stamp, which must not be before the state's stamp, and apply the measurement."""
     state = predict(state, measurement.stamp, config)
     match measurement:
         case WheelMeasurement():

@@ -203,7 +203,7 @@ class Mapper:
         """Match after the predicted ``motion``, or after the first of the other predictions with a fit.
 
         Returns:
-            The scan, without what moves if the predicted motion is right; the motion, and the match after it.
+            The scan, without moving points if the predicted motion is right; the motion, and the match after it.
         """
         match = self._matched(scan, *motion)
         still = self._still(scan, stamp, motion[0], match)
@@ -222,7 +222,7 @@ class Mapper:
         return scan, motion, match
 
     def _still(self, scan: Scan, stamp: int, delta: Array, match: ScanMatch) -> Scan:
-        """Return ``scan`` without what moves, by the distance of ``delta`` and the turn of its ``match`` if it fits."""
+        """Return ``scan`` without moving points, by the distance of ``delta`` and the turn of a fitting ``match``."""
         by_wheels = delta if self._motion.by_wheels(delta) else None
         turn = between(self._pose, match.pose)[2] if fits(match) else delta[2]
         return self._movers.still(stamp, by_wheels, float(turn), scan)
@@ -255,7 +255,7 @@ class Mapper:
         return match.accepted and self._motion.by_wheels(delta) and led_there(match, guess, covariance)
 
     def _extends(self, scan: Scan, match: ScanMatch, guess: Array, covariance: Array) -> bool:
-        """Whether ``match`` is where the motion led, and what does not fit lies where the map has seen nothing."""
+        """Whether ``match`` is where the motion led, and all misfitting points lie where the map has seen nothing."""
         if self._loss.after_gap or not match.accepted or match.degenerate or not self._loss.misfits(match):
             return False
         here = led_there(match, guess, covariance)
@@ -392,7 +392,7 @@ def _moved(pose: Array, covariance: Array, delta: Array, noise: Array) -> tuple[
 
 
 LOST_AFTER: Final = 10
-"""Number of misfits in a row after which the robot is lost."""
+"""Number of consecutive misfits until the robot is lost."""
 
 
 class Estimator(Protocol):

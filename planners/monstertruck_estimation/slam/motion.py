@@ -424,7 +424,7 @@ def constrained(match: ScanMatch, information: Array) -> Array:
 
 
 def without_weak_direction(match: ScanMatch, guess: Array, covariance: Array) -> ScanMatch:
-    """Replace pose and covariance of a degenerate match along its weak direction by those of ``guess``."""
+    """Replace pose and covariance of a degenerate match along its weak direction by the values of ``guess``."""
     if match.information is None or not match.degenerate:
         return match
     information = constrained(match, match.information)

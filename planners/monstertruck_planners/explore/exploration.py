@@ -442,7 +442,7 @@ def _back(run: Exploration) -> Step | None:
 
 def _go(run: Exploration, target: Viewpoint) -> Step:
     x, y, yaw = target.pose
-    text = f"({x:.2f}, {y:.2f}, {yaw:.2f}), {target.path_length:.1f} m away, for about {target.gain:.1f} m^2"
+    text = f"({x:.2f}, {y:.2f}, {yaw:.2f}), {target.path_length:.1f} m away, may reveal about {target.gain:.1f} m^2"
     run = replace(_enter(run, ExplorationPhase.DRIVING), target=target, pursued=run.now, nothing=0, goals=run.goals + 1)
     return run, (Go(target.pose), Notice(Reason.FRONTIER_CHOSEN, Severity.INFO, text))
 

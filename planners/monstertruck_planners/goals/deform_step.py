@@ -394,7 +394,7 @@ def _walls_of(place: Path) -> DistanceField | None:
 
 
 def blind_beams(scan: LaserScan) -> NDArray[np.intp]:
-    """Return the beams that, like both neighbours, report neither a range nor that no obstacle is in range.
+    """Return the blind beams: like both neighbours, they report neither a range nor "no return".
 
     Single beams fail on edges and dark surfaces.
     """

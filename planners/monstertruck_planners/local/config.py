@@ -38,7 +38,7 @@ class PeopleConfig(Schema):
     """People who walk near the robot."""
 
     speed: Positive = 0.25
-    """Least speed of a person who walks (m/s); slower things are obstacles where they stand."""
+    """Minimum speed of a walking person (m/s); slower things are obstacles where they stand."""
     horizon: Annotated[float, Field(gt=0, le=5)] = 2.0
     """Time over which people are predicted along their motion (s)"""
     distance: NotNegative = 0.2
@@ -46,7 +46,7 @@ class PeopleConfig(Schema):
     spread: NotNegative = 0.1
     """Growth of that distance with the time predicted (m/s)."""
     patience: Positive = 8.0
-    """Time for which the robot lets people pass (s); then it goes on, and they are obstacles where they are."""
+    """Maximum wait for people to pass (s); then the robot continues, and treats them as obstacles where they are."""
 
 
 class LocalPlannerConfig(Schema):
@@ -70,7 +70,7 @@ class LocalPlannerConfig(Schema):
     clearance_cost: NotNegative = 0.5
     """Extra cost of a metre in contact, falling to 0 where obstacles are 0.1 m away, m."""
     shortest: Positive = 0.15
-    """Least length of a free beginning of a blocked path that is driven, m."""
+    """Minimum length of the free beginning of a blocked path for driving it, m."""
 
 
 class RsbandConfig(LocalPlannerConfig):
@@ -130,4 +130,4 @@ class TebConfig(LocalPlannerConfig):
     acceleration: Positive = 0.5
     """m/s^2."""
     steering_rate: Positive = 1.0
-    """Greatest steering rate of an axle, rad/s."""
+    """Maximum steering rate of an axle, rad/s."""

@@ -20,7 +20,7 @@ from monstertruck_planners.local.config import PeopleConfig
 from monstertruck_runtime.clock import SECOND
 
 LEGS_APART: Final = 0.3
-"""Greatest distance of neighbouring returns of one person (m): two legs."""
+"""Maximum distance of neighbouring returns of one person (m): two legs."""
 MEMORY: Final = 0.8
 """Time over which a velocity is measured (s)."""
 
@@ -70,7 +70,7 @@ class PeopleTracker:
     """Follows the people around the robot.
 
     Args:
-        config: what counts as a walker.
+        config: criteria for a walker.
     """
 
     def __init__(self, config: PeopleConfig) -> None:
@@ -141,7 +141,7 @@ def _nearest(tracks: Sequence[_PersonTrack], stamp: int, place: tuple[float, flo
 def meets(
     walkers: Sequence[Walker], poses: Array, times: Array, footprint: Footprint, distance: float, spread: float
 ) -> bool:
-    """Whether a robot comes nearer than it may to somebody who walks on as predicted.
+    """Whether a robot comes too near to a person who keeps walking as predicted.
 
     A robot that stands, or that moves away from a person, does not approach.
 

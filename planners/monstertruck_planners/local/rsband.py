@@ -1,6 +1,6 @@
 """Elastic band, then Reeds-Shepp motions of the truck's own turning radius that join its poses. Loads numba.
 
-The five strategies are those of the published planner: one motion to the band's end, to the next sub-goal, from pose to
+The five strategies of the published planner: one motion to the band's end, to the next sub-goal, from pose to
 pose until one fails, the same leaving out poses that fail, and to the furthest pose that can be reached. Where they
 fail a local search takes over; a path is kept while it is free.
 """
@@ -34,7 +34,7 @@ class RsbandPlanner:
     """The local planner of kind ``rsband``.
 
     Args:
-        vehicle: what is driven.
+        vehicle: body and its limits.
         config: strategy and limits.
     """
 
@@ -116,7 +116,7 @@ class RsbandPlanner:
         return self._join(obstacles, robot_pose, band.poses[-1])
 
     def _start_to_next(self, band: PosePath, obstacles: DistanceField, robot_pose: Array) -> MotionPath | None:
-        """To the first pose at the sub-goal's distance, or further if that needs no change of direction."""
+        """Motion to the first pose at the sub-goal's distance, or further if that needs no change of direction."""
         travelled = band.travelled
         end = next(
             end

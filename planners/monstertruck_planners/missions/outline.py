@@ -81,7 +81,7 @@ def _leaf_in_words(step: AnyStep) -> str:
 
 
 def lines(mission: Mission) -> tuple[MissionLine, ...]:
-    """Return all steps in order, those within others below them; a watch and an otherwise have a line of their own."""
+    """Return all steps in order, those within others below them; a watch and an otherwise have a separate line."""
     return tuple(_lines(mission, "", 0))
 
 
@@ -102,9 +102,9 @@ def _lines(node: Container, before: str, depth: int) -> Iterator[MissionLine]:
 
 
 def shown(all_lines: tuple[MissionLine, ...], number: str) -> tuple[MissionLine, ...]:
-    """Return the lines around the present step, marked where they contain it."""
+    """Return the lines around the current step, marked where they contain it."""
     at = next((index for index, line in enumerate(all_lines) if line.number == number), 0)
-    # 8: lines before and after the present one, so a report stays small
+    # 8: lines before and after the current one, so a report stays small
     return tuple(
         line.model_copy(update={"active": f"{number}.".startswith(f"{line.number}.")})
         for line in all_lines[max(0, at - 8) : at + 9]

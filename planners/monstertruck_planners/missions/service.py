@@ -216,7 +216,7 @@ class MissionService:
         self._blocked: int | None = None
         """Time since which an obstacle stops the robot (ns)."""
         self._known: tuple[PointsOfInterest | None, frozenset[str], int] = (None, frozenset(), 0)
-        """Newest points of interest, their names and the number of tags."""
+        """Latest points of interest, their names and the number of tags."""
         self._lines: tuple[MissionLine, ...] = ()
         """Steps of the mission in words."""
         self._noted: Pose2 | None = None
@@ -329,7 +329,7 @@ class MissionService:
             # 1.0: distance (m) from the interruption beyond which the robot was moved or its odometry was reset
             if not self._localised and not request.moved and (away := resumed.away(pose)) > 1.0:
                 text = f"its pose is {away:.1f} m from where {resumed.mission.name} was interrupted"
-                hint = "if it was put there, `--moved` goes on; else its odometry began anew (`odometry.start`)"
+                hint = "if you put it there, resume with `--moved`; else its odometry has restarted (`odometry.start`)"
                 raise RequestRefusedError(Reason.POSE_LOST, f"{text}: {hint}")
             return resumed.progress()
         assert request.mission is not None
@@ -713,7 +713,7 @@ class MissionService:
     async def _say_damaged(self, why: str) -> None:
         if (file := self._file) is not None:
             where = await self._offload(lambda: put_aside(file))
-            text = f"{why}; what was interrupted cannot be resumed; {where}"
+            text = f"{why}; the interrupted mission cannot be resumed; {where}"
             self._events(Reason.FILE_DAMAGED, Severity.WARNING, SOURCE, text)
 
     async def _save(self, progress: MissionProgress) -> None:

@@ -651,7 +651,7 @@ class _PlanningRun:
 
     @property
     def _gap_margin(self) -> float:
-        """Needed on both sides of a gap, m; without a margin, those just wide enough are left to the search."""
+        """Clearance needed on both sides of a gap, m; without a margin, the search decides about the tightest gaps."""
         gap_error = 0.01  # error of the positions and headings checked against the best ones, m
         # 0.005: width needed in a gap beyond the margin on both sides, m: with less no search finds a path through it
         return self.config.margin + (0.005 if self.config.margin >= gap_error else -gap_error)

@@ -73,7 +73,7 @@ class TrackerConfig(Schema):
 
     @property
     def reach(self) -> float:
-        """Search distance for the truck ahead of its last position on the path (m)."""
+        """How far ahead of its last position on the path the truck is searched for (m)."""
         return 0.4
 
     @property

@@ -60,7 +60,7 @@ class Lqr(PathTracker[LqrConfig]):
 
     def _reference(self, state: TrackingState) -> Array:
         """Return slip and turn of the next periods, shape (2 k,)."""
-        # What comes after a change of steering is not for these axles: as if the path went on as it is.
+        # The path after a change of steering is not for these axles: plan as if the path continued unchanged.
         # 0.03: a change of steering, m: more than the spacing of the reference
         end = state.reference.section_end(state.s) - 0.03
         ahead = state.reference.at(np.minimum(state.distances(self._times), end))

@@ -54,7 +54,7 @@ class PathService:
         events: where events go.
         max_age: seconds; see ``GateConfig.max_request_age``.
         require_drivable: raises an ``InputError`` for a path that the body cannot drive; takes up to 0.2 s.
-        offload: runs it beside the event loop.
+        offload: runs it outside the event loop.
     """
 
     name = ServiceName.PATH.value
@@ -132,7 +132,7 @@ class PathService:
         examine(request, self._gate.latest, self._sequences, self._clock.now(), None)
         present = self._present.latest
         if present is None or present.name != request.path.name:
-            raise RequestRefusedError(Reason.NOT_FOUND, f"path {request.path.name!r} is not the present one")
+            raise RequestRefusedError(Reason.NOT_FOUND, f"path {request.path.name!r} is not the current one")
         return present.model_copy(update={"halts": True})
 
     async def _examined(self, request: PathRequest) -> Path:

@@ -205,7 +205,7 @@ def check_path(path: Path) -> None:
     if len(path.clearance) not in (0, count) or np.isnan(path.clearance).any():
         _refuse(path, f"{len(path.clearance)} clearances: expected a number for each of the {count} poses, or none")
     if len(path.speeds) not in (0, count) or not (np.isfinite(path.speeds) & (path.speeds >= 0.0)).all():
-        _refuse(path, f"{len(path.speeds)} speeds: expected zero or more for each of the {count} poses, or none")
+        _refuse(path, f"{len(path.speeds)} speeds: expected one, at least 0, for each of the {count} poses, or none")
     if np.count_nonzero(stops(path.directions[1:], path.steering[1:])) >= MAX_RUNS:
         _refuse(path, f"direction or crab changes too often: expected at most {MAX_RUNS} runs")
     if not np.isfinite(poses).all() or np.abs(poses).max() > MAX_COORDINATE:

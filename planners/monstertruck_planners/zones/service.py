@@ -40,7 +40,7 @@ class ZoneService:
         clock: time.
         max_speed: 100 percent of a speed mask (m/s).
         footprint: outline of the robot.
-        file: the operators' zones; None = they are forgotten at the end.
+        file: the operators' zones; None if they are not kept after the end.
         inputs: topics read.
         out: ``state/zones``.
         events: receives changes.
@@ -155,7 +155,7 @@ class ZoneService:
         Raises:
             RequestRefusedError: the sender may not, or the change cannot be saved.
             NotFoundError: no zone has this name.
-            InputError: the name is one of the configuration's, or a new zone has no area.
+            InputError: a zone of the configuration has this name, or a new zone has no area.
         """
         examine(request, self._in.gate.latest, self._sequences, self._clock.now(), None)
         name, by = request.name, request.source
@@ -183,7 +183,7 @@ class ZoneService:
         if area is None:
             raise InputError("zone: area: expected for a new zone")
         if name in (KEEPOUT_MASK, SPEED_MASK):
-            raise InputError(f"zone {name!r}: expected another name, this one is a mask's")
+            raise InputError(f"zone {name!r}: expected another name, a mask has this one")
         if there is not None:
             self._require_own(there, "replaced")
         await self._save(self._areas | {name: area})
@@ -194,7 +194,7 @@ class ZoneService:
     @staticmethod
     def _require_own(zone: Zone, what: str) -> None:
         if not zone.saved:
-            raise InputError(f"zone {zone.name!r}: it is the configuration's: expected to be {what} there")
+            raise InputError(f"zone {zone.name!r}: it belongs to the configuration: expected to be {what} there")
 
     async def _save(self, areas: dict[str, ZoneArea]) -> None:
         """Write the operators' zones and keep them.

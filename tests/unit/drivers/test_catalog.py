@@ -113,12 +113,12 @@ RADAR = RoleSpec(name="radar", duty=Duty.SENSOR, doc="A distance", writes={"out"
     ("role", "fault"),
     [
         (RADAR, None),
-        (dataclasses.replace(LIDAR, doc="another"), "role lidar: there is another one of that name"),
+        (dataclasses.replace(LIDAR, doc="another"), "role lidar: another role has this name"),
         (dataclasses.replace(RADAR, name="so nar"), "expected a name of small letters"),
         (dataclasses.replace(RADAR, writes={"out": topics.POSE}), "drivers do not write state/pose"),
         (
             dataclasses.replace(RADAR, writes={"out": dataclasses.replace(topics.COMPASS, name="sensor/radar")}),
-            "sensor/radar is no entry point of monstertruck.topics",
+            "no entry point sensor/radar in monstertruck.topics",
         ),
     ],
 )

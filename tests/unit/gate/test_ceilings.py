@@ -263,6 +263,6 @@ def test_a_truck_knows_its_limits_and_what_weakens_it():
     opened = {"listen": ("tcp/0.0.0.0:7447",), "connect": ("tcp/10.0.0.1:7447",), "insecure": True}
     assert weak.model_copy(update={"zenoh": config.zenoh.model_copy(update=opened)}).weakened() == (
         "gate.scan.stale_after 0.5, default 0.25",
-        "zenoh.insecure: anybody who reaches tcp/0.0.0.0:7447 may drive",
-        "zenoh.insecure: anybody who reaches tcp/10.0.0.1:7447 may drive",
+        "zenoh.insecure: anyone who can reach tcp/0.0.0.0:7447 may drive",
+        "zenoh.insecure: anyone who can reach tcp/10.0.0.1:7447 may drive",
     )

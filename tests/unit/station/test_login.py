@@ -276,7 +276,7 @@ async def test_handshakes_that_never_end_are_few_and_short_and_who_comes_later_i
         assert max(times[4:]) < 0.4, "those beyond are closed at once"
         assert 0.4 < times[0] < 2.0
         assert times[1] < 0.4, "no TLS at all"
-        assert "4 connections of 127.0.0.1 are being set up" in caplog.text
+        assert "4 connections from 127.0.0.1 are being set up" in caplog.text
         assert "connection of 127.0.0.1 failed" in caplog.text
         async with (
             aiohttp.ClientSession(place.url, connector=aiohttp.TCPConnector(ssl=client)) as session,

@@ -1,6 +1,6 @@
 """Settings of docks and docking; light, for the daemon's start.
 
-Words are those of Nav2's docking server: staging pose, dock direction, undock.
+Terms as in Nav2's docking server: staging pose, dock direction, undock.
 """
 
 from typing import Annotated, Literal
@@ -21,7 +21,7 @@ class ChargingConfig(Schema):
     voltage: Annotated[float, Field(gt=0, le=5)] = 0.15
     """Minimum rise of the voltage at rest since the arrival (V), of a robot that does not measure the current"""
     within: Annotated[float, Field(gt=0, le=300)] = 30.0
-    """Time after the arrival in which it must begin (s)"""
+    """Maximum time from the arrival to the start of charging (s)"""
 
 
 class HousingConfig(Schema):
@@ -34,7 +34,7 @@ class HousingConfig(Schema):
 
 
 class DockConfig(Schema):
-    """One dock: where the docked robot stands in the map, and the tag by which it finds the dock."""
+    """One dock: where the docked robot stands in the map, and the tag that marks the dock."""
 
     x: float
     """Docked robot (base) in map (m)"""
@@ -82,7 +82,7 @@ class DockingConfig(BehaviourConfig):
     attempts: Annotated[int, Field(ge=1, le=20)] = 3
     """Attempts before docking has failed"""
     look: Annotated[float, Field(gt=0, le=30)] = 6.0
-    """Time in which the tag must be seen (s)"""
+    """Maximum time until the tag is seen (s)"""
 
 
 class UndockConfig(BehaviourConfig):
@@ -103,7 +103,7 @@ def chosen(docks: Docks, name: str) -> tuple[str, DockConfig]:
     """Return the dock of a run, with its name.
 
     Raises:
-        ValueError: no such dock, or none is named and there are several.
+        ValueError: no such dock, or several docks and no name.
     """
     if not docks:
         raise ValueError("the robot's configuration has no section `docks`")

@@ -33,9 +33,9 @@ Phase = Literal[
 ]
 
 STEERING_LENGTH: Final = 0.1
-"""Distance in which an error across the axis falls to 1/e, twice over (m): critically damped."""
+"""Decay distance (to 1/e) of an error across the axis, a double root (m): critically damped."""
 VIEW: Final = 0.15
-"""Distance before the docked pose from which a robot that docks in reverse looks at the tag (m)."""
+"""Distance before the docked pose where a robot that docks in reverse looks at the tag (m)."""
 
 
 class _Turns:
@@ -86,7 +86,7 @@ class Docking:
     image: int = 0
     """Stamp of the latest image (ns)."""
     seen: float = 0.0
-    """Time at which the tag was seen last (s)."""
+    """Time of the last sighting of the tag (s)."""
     tag: TagEstimate | None = None
     images: int = 0
     """Images of the tag since the start of the phase."""
@@ -157,7 +157,7 @@ class Dock(AtDock[DockingConfig]):
         return f"tag {self._dock.tag} of dock {self._name} was not seen within {self._config.look:g} s"
 
     def _observed(self, state: Docking, here: Odometry, inputs: Inputs, t: float) -> Docking:
-        """Return the state with the newest pose and image."""
+        """Return the state with the latest pose and image."""
         trail = state.trail
         if not trail or here.stamp > trail[-1][0]:
             x, y, yaw = _pose(here).tolist()
@@ -196,7 +196,7 @@ class Dock(AtDock[DockingConfig]):
                 return self._retreated(state, at, t)
 
     def _looked(self, state: Docking, nose: Array, t: float) -> BehaviourStep:
-        """Stand until the tag is known well enough: to set off, or from near by for an approach without the camera."""
+        """Stand until the tag is known well enough to start, or, near the dock, to approach without the camera."""
         assert state.tag is not None
         if state.phase == "look":
             if (left := -float(nose[0]) - VIEW) <= 0.005:
@@ -237,7 +237,7 @@ class Dock(AtDock[DockingConfig]):
 
     def _approached(self, state: Docking, at: Array, t: float) -> BehaviourStep:
         left, across, turn = -float(at[0]), float(at[1]), float(at[2])
-        if left <= 0.002:  # distance in which the robot stops from the lowest speed, m
+        if left <= 0.002:  # stopping distance from the lowest speed, m
             return self._next(state, "settle", t)
         if left < STEERING_LENGTH and abs(predicted(across, turn, left)) > self._config.tolerance:
             text = f"{across * 1000:+.0f} mm and {math.degrees(turn):+.1f} degrees off the axis of {self._name}"

@@ -51,7 +51,7 @@ NEARER: Final = 5.0
 LEAST_WALL_ECHOES: Final = 6
 """Minimum number of echoes of a wall."""
 TOUCHING: Final = 0.16
-"""Range at which the robot stops immediately (m)."""
+"""Range for an immediate stop (m)."""
 STRAY: Final = (0.3, 0.4)
 """Yaw rate error (rad/s) and its duration (s) that indicate a stalled motor."""
 DISAGREES, AGREES = 0.2, 0.7
@@ -324,7 +324,7 @@ class WallLine:
         return fit.line if facing and present and fit.explained >= max(LEAST_WALL_ECHOES, 0.5 * len(rows)) else None
 
     def _turned_to(self, state: LineState, cone: Cone) -> EstimateFit | None:
-        """Fit the wall that the robot turns to: all echoes since it is near, except those of the wall it leaves."""
+        """Fit the wall that the robot turns to: all echoes since it came near, except from the wall that it leaves."""
         echoes, at = state.echoes, state.pose[:2]
         late, sides = echoes[:, 5] > state.travelled - _reach(state), echoes[:, 4] < FRONT
         turning = echoes[:, 5] >= state.marks[0]
@@ -381,10 +381,10 @@ class WallLine:
         if turns is not None and t - turns > STRAY[1]:
             text = f"{state.w.at(t) * self._mirror:.2f} rad/s asked for and not turned: does a motor stall?"
             return Reason.STUCK, text
-        # 1.0: time without the requested motion after which the robot is considered stuck, s
+        # 1.0: time without the requested motion until the robot is considered stuck, s
         if stands is not None and t - stands > 1.0:
             return Reason.STUCK, f"{state.v.at(t):.2f} m/s asked for, {odometry.twist.vx:.2f} m/s driven"
-        if state.phase == "turn" and state.turned - state.marks[1] < 0.05:  # angle up to which a turn is starting, rad
+        if state.phase == "turn" and state.turned - state.marks[1] < 0.05:  # a turn is starting up to this angle, rad
             for number in (DIAGONAL, FRONT, FAR):
                 if 0.0 < (near := state.equal[number][0]) < TOUCHING:
                     return Reason.STUCK, f"sonar {self._names[number]} measures {near:.2f} m: too near to turn away"
@@ -416,7 +416,7 @@ class WallLine:
     # Phases
 
     def _advance(self, state: LineState, cone: Cone, t: float) -> LineState:
-        """Advance ramps and phases to ``t``, the time for which motion is requested now."""
+        """Advance ramps and phases to ``t``, the time of the motion to request."""
         config = self._config
         match state.phase:
             case "settle":
@@ -554,7 +554,7 @@ class WallLine:
         The start need not be such a place: a robot that begins along a door post leaves it for the wall.
         """
         config, (x, y, yaw), places = self._config, state.pose, state.places
-        if state.travelled - places[-1, 0] >= 0.5:  # distance between two places at which a lap may be complete, m
+        if state.travelled - places[-1, 0] >= 0.5:  # distance between two places that may complete a lap, m
             places = np.vstack([places, (state.travelled, x, y, yaw)])
             state = state._replace(places=places)
         if state.travelled - places[0, 0] < config.lap_length:
@@ -606,7 +606,7 @@ def _reach(state: LineState) -> float:
 
 def _fresh(echoes: Array, state: LineState) -> Array:
     """Return the recent echoes."""
-    # 0.35: time for which an echo represents the space before the robot, s
+    # 0.35: validity of an echo from the space ahead of the robot, s
     return echoes[echoes[:, 6] > (state.before or 0.0) - 0.35]
 
 

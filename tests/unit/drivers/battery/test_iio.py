@@ -59,7 +59,7 @@ def test_both_ends_of_the_scale_are_limits(tmp_path: Path):
 
 
 def test_a_converter_is_found_by_name_or_because_it_is_alone(tmp_path: Path):
-    with pytest.raises(DeviceLostError, match="no converter at all; there: none"):
+    with pytest.raises(DeviceLostError, match="no converter at all; found: none"):
         iio.find(tmp_path, "")
     converter(tmp_path, 0, "accel", in_accel_x_raw="1")
     converter(tmp_path, 1, "ads1015", in_voltage0_raw="1")

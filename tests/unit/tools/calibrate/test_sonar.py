@@ -45,7 +45,7 @@ def test_all_places_and_no_other_key_are_found():
 
 @pytest.mark.parametrize(("first", "second"), [("l", "r"), ("fl", "fr"), ("l", "fl"), ("f", "r")])
 def test_swapped_cables_are_named(first, second):
-    with pytest.raises(InputError, match=f"{first} hears what is due at {second}, {second} hears .* at {first}"):
+    with pytest.raises(InputError, match=f"{first} hears the echoes due at {second}, {second} hears .* at {first}"):
         result_of(legs(swapped(first, second)), SETTINGS, WALL, 0.002)
 
 

@@ -15,7 +15,11 @@ ROOT = Path(__file__).resolve().parents[4]
 
 WRONG = (
     ("track /nonexistent.csv", 3, "/nonexistent.csv: cannot be read: No such file or directory"),
-    ("calibrate camera --square 30 --marker 40", 3, "--marker 40: expected less than --square 30, in which it lies"),
+    (
+        "calibrate camera --square 30 --marker 40",
+        3,
+        "--marker 40: expected less than --square 30, the square around it",
+    ),
     ("track configs/truck.yaml", 3, "configs/truck.yaml: expected a mapping with waypoints, or with the poses of"),
     ("statu", 2, "Error: No such command 'statu'. Did you mean 'status', 'station', 'study'? Try '"),
     (
@@ -152,7 +156,7 @@ WRONG = (
     ("emulate lidar -l /proc/foo", 3, "/proc/foo: No such file or directory"),
     ("probe", 2, "Error: Missing argument 'device'."),
     ("probe nothing", 3, "unknown"),
-    ("probe lidar", 3, "lidar: say where it hangs with --port"),
+    ("probe lidar", 3, "lidar: give its port with --port"),
     ("probe lidar -p /nonexistent", 20, "/nonexistent: not plugged in"),
     ("probe lidar -p /dev/null", 20, "/dev/null: no serial port"),
     ("probe lidar -p /tmp", 20, "/tmp: Is a directory"),

@@ -125,7 +125,7 @@ def test_requests_that_arrive_and_those_that_are_dropped_are_named(tmp_path: Pat
     found = see(tmp_path, access, with_tls)
     assert found["access"].seen == "tls/0.0.0.0:7447, tls/0.0.0.0:7448, by certificate"
     assert found["names"].level is Level.OK
-    assert found["names"].seen.startswith("anna (pilot), ben (observer); Zenoh drops requests under another name")
+    assert found["names"].seen.startswith("anna (pilot), ben (observer); Zenoh silently drops requests under names")
     assert "names" not in see(tmp_path / "open", access)
 
 

@@ -236,7 +236,7 @@ ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELEC
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (f"CREATE VIEW messages(id, topic_id, timestamp, data) AS {ENDLESS}", "messages is computed when it is read"),
+        (f"CREATE VIEW messages(id, topic_id, timestamp, data) AS {ENDLESS}", "messages is a view or virtual table"),
         (
             "CREATE TABLE messages(id INTEGER, topic_id INTEGER, timestamp INTEGER, data BLOB AS (zeroblob(9e8)))",
             "table messages has computed columns",

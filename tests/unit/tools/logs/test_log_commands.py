@@ -46,7 +46,7 @@ class RobotWithRecordings:
             row = {"name": "run-000001-000.mcap", "bytes": 768, "modified": 1.8e9, "kind": "run", "open": True}
             return {"recordings": [row], "left_out": self.LEFT_OUT}
         if payload["name"] != "run-000001-000.mcap":
-            raise NotFoundError("recording: there is none of this name")
+            raise NotFoundError("recording: no such recording")
         data = self.DATA[payload["offset"] : payload["offset"] + 500]
         return {"data": base64.b64encode(data).decode(), "bytes": len(self.DATA)}
 
