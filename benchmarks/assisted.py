@@ -31,7 +31,7 @@ from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "demo.yaml"
 WORLDS = ("loop", "rooms", "corridor_maze")
 PERIOD = 0.1
-"""Of the stick's requests, s."""
+"""Period of the stick's requests, s."""
 STOPS = frozenset({Reason.OBSTACLE_STOP, Reason.UNSEEN_STOP})
 
 

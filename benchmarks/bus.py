@@ -3,7 +3,7 @@
     python benchmarks/bus.py [--rounds N]
 
 Pairs of processes run side by side and take turns, so that what else the machine does weighs on all of them, and every
-round starts them anew, for where the system puts a process weighs as much as what it does. They are:
+round restarts them, for where the system puts a process weighs as much as its work. They are:
 
 - ``typed``: the product, message object in, message object awaited in asyncio;
 - ``raw``: the same bytes untyped over the same way, Zenoh and asyncio; ``direct``: taken in the thread that reads the

@@ -58,7 +58,7 @@ GOAL = 0.9
 CURVATURE = 0.02
 """Greatest error of the curvature, as a share."""
 COVERAGE = (0.90, 0.99)
-"""Of all intervals of a wizard."""
+"""Bounds of the coverage by all intervals of a wizard."""
 EMPTIER = (0.15,)
 """Charge of the second pack that the battery wizard sees."""
 

@@ -44,7 +44,7 @@ CONFIG = Path(__file__).resolve().parents[1] / "configs" / "dock.yaml"
 WORLDS = ("rooms", "workshop", "hall")
 DIRECTIONS = ("forward", "reverse")
 LENGTH, WIDTH = 0.47, 0.34
-"""Of the robot, m."""
+"""Size of the robot, m."""
 TAG_DISTANCE, STAGING, RADIUS = 0.5, 0.7, 0.5
 """From the docked base to the tag and to the staging pose, and of the turn in reverse, m."""
 SPARE = 0.12

@@ -79,7 +79,7 @@ def main() -> int:
 
 
 class Rows:
-    """Those of a part, each written down at once.
+    """Result rows of a part, each written at once.
 
     Args:
         part: name of the file.
@@ -143,7 +143,7 @@ def whole(arguments: argparse.Namespace) -> tuple[dict[str, float], dict[str, fl
 
 
 def file_of(world: str, maps: Path | None) -> Path:
-    """Of a world's name, or of that of a file in the folder."""
+    """Return the file of a world, by the world's name or a file name in the folder."""
     if maps is None or world in SHIPPED:
         return Path(__file__).resolve().parents[1] / "configs" / "worlds" / f"{world}.yaml"
     return maps / f"{WORLDS.get(world, world)}.yaml"

@@ -287,7 +287,7 @@ class Whole:
 
     @property
     def mode(self) -> GateMode | None:
-        """Of its gate."""
+        """Mode of its gate."""
         return self.gate.latest.mode if self.gate.latest else None
 
     @property

@@ -89,7 +89,7 @@ class Score:
     held: Counter[str] = field(default_factory=Counter)
     """Why moves were refused or ended early."""
     pose_errors: list[float] = field(default_factory=list)
-    """Of its pose against the world's truth, once a second, m; on the virtual clock only."""
+    """Errors of its pose against the true pose, once a second, m; on the virtual clock only."""
 
 
 def configurations(folder: Path) -> list[Path]:

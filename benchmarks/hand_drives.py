@@ -12,7 +12,7 @@ while the operator goes on, or from which it does not back off, is counted as un
 With --scans-alone no motor current shows a contact, as of a drive that measures none.
 
 Drives are kept in ``runs/hand_drives.jsonl``, so that a run that ended early (``--minutes``) goes on where it was; one
-of other sources begins anew.
+of other sources starts again.
 
 A contact is one of the world's own footprint with its walls, whatever the gate sees. That they are avoided must not be
 bought by standing still: the distance travelled and the share of the time that the truck was kept standing are printed.

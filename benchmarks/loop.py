@@ -146,7 +146,7 @@ class Drives:
                     self.states.append((state.received, state.mode is GateMode.DRIVING))
 
     def share(self, begin: int, end: int) -> float:
-        """Of the time between two instants in which the truck drove.
+        """Return the share of the time between two instants in which the truck drove.
 
         Raises:
             SystemExit: it hardly did, so there is nothing to measure.

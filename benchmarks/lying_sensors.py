@@ -344,7 +344,7 @@ class Recording(NamedTuple):
     step: float
     """Angle between beams, rad."""
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the lidar, m and rad."""
+    """Mount of the lidar, m and rad."""
     time_step: float = 0.0
     """Time between beams, s."""
 

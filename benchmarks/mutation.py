@@ -102,7 +102,7 @@ class Baseline:
     lines: dict[str, dict[int, list[str]]]
     """Tests by file and line."""
     seconds: dict[str, float]
-    """Of every test."""
+    """Duration of every test."""
 
     def tests(self, mutant: Mutant, sources: dict[str, bytes]) -> tuple[list[str], bool]:
         """Tests that reach a mutant's function, likely and quick ones first, and whether its line runs on import."""

@@ -59,19 +59,19 @@ RATE, SPEED, TURNING = 5.0, 0.2, 0.6
 CLEAR = 0.34
 """Metres from walls at which the truck may stand anyhow."""
 SIGMA, SIGMA_YAW, SLOW = 0.015, math.radians(0.4), 20.0
-"""Of the pose's error, and its time constant, s."""
+"""Standard deviations of the pose error (m, rad) and its time constant, s."""
 LENS: dict[str, Any] = {"k1": -0.12, "k2": 0.02}
 Pose = tuple[float, float, float]
 
 
 @dataclass
 class Score:
-    """Of one drive, or of several together."""
+    """Score of one drive, or of several together."""
 
     near: int = 0
     """Tags that came near enough."""
     found: int = 0
-    """Of those."""
+    """Number of them that were found."""
     false: int = 0
     known: int = 0
     errors: list[float] = field(default_factory=list)

@@ -49,7 +49,7 @@ from monstertruckd.recorder.repair import recover
 GOALS = {"cpu_over_rosbag": 1.0, "cpu_s_per_1000": 0.018, "stall_ms": 1.0, "unreadable": 0, "worst_loss_s": 1.0}
 RATES: dict[Topic[Any], int] = {POSE: 100, SCAN: 10, CAMERA: 2}
 SECONDS = 20
-"""Of the mix, in one round of the cost."""
+"""Duration of the mix in one round of the cost."""
 WATCHED = 5.0
 """Seconds of one round of the stall."""
 Mix = list[tuple[Topic, bytes]]

@@ -69,7 +69,7 @@ GOALS = {
     "cpu_percent": 5.0,
     "goals": ENDS,
 }
-"""Of each face; ``least_rate`` is a least share, statuses and faults are exact, all others greatest values."""
+"""Goals of each face; ``least_rate`` is a least share, statuses and faults are exact, all others greatest values."""
 TICKS = os.sysconf("SC_CLK_TCK")
 TWIST = "geometry_msgs/msg/Twist"
 DOMAIN = "77"

@@ -103,7 +103,7 @@ def trial(case: Case) -> Outcome:
 
 
 def seconds(case: Case, outcome: Outcome) -> float | None:
-    """Of the event, from when the robot is to stand."""
+    """Return the time of the event, from when the robot has to stand still (s)."""
     if outcome.event is None:
         return None
     return max(outcome.event - (LAPSE if case.moment is Moment.LEASE else 0.0), 0.0)

@@ -40,9 +40,9 @@ REFERENCES = (1.57, 1.25, 1.04)
 RATIOS = (2.0, 3.0, math.inf)
 GOALS = {"radius": 0.01, "speed": 0.01, "drift_share": 0.1, "drift_m_s": 2e-5}
 STAND_GOALS = {"radius": 0.02, "speed": 0.02, "drift_of_allowed": 1.0}
-"""Of what is measured by the stand; of a drift as much is allowed as of the analysis of noisy poses."""
+"""Goals of the measurements by the stand; of a drift as much is allowed as of the analysis of noisy poses."""
 EVERY = 2
-"""Of the log's 20 poses a second one in so many is rendered."""
+"""One in so many of the log's 20 poses a second is rendered."""
 TAG_HEIGHT = 0.08
 LINE_START = (-0.35, 0.0, 0.0)
 PAPER_LIKE = {
@@ -56,7 +56,7 @@ PAPER_LIKE = {
 
 
 def hidden(seed: int) -> dict[str, Any]:
-    """A world's truth."""
+    """Simulated truth of a world."""
     rng = np.random.default_rng(seed)
     left, right = rng.uniform(0.055, 0.09, 2).tolist()
     slide, way = rng.uniform(5e-5, 5e-4), rng.uniform(0.0, 2 * math.pi)

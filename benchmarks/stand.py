@@ -62,7 +62,7 @@ CROSSING = 10.0
 """Seconds that five robots cross, 25 pictures each."""
 HALF = PictureQuality(light=0.5)
 LOOK: tuple[Colour, Colour] = "red", "blue"
-"""Of every robot with discs."""
+"""Colours of every robot with discs."""
 APART = 0.1
 PERIOD = 20.0
 """Seconds after which robots are where they were."""
@@ -83,7 +83,7 @@ def marker(stand: Any, kind: str, number: int, x: float, y: float, yaw: float) -
 
 
 def tracker(stand: Any, kind: str, starts: Any) -> StandTracker:
-    """Of as many robots as there are starts."""
+    """Return a tracker of as many robots as there are starts."""
     _, config, found, _, _ = stand
     if kind == "tags":
         return StandTracker(found.placed(), config.robots, config.marks)
@@ -298,7 +298,7 @@ def faults(stand: Any, seed: int) -> tuple[float, float, int]:
 
 
 def rms(errors: Sequence[float]) -> float:
-    """Of nothing: infinite."""
+    """Return the root mean square; infinite without errors."""
     return float(np.sqrt(np.mean(np.square(errors)))) if errors else math.inf
 
 

@@ -99,7 +99,7 @@ class Result(NamedTuple):
     job: Job
     run: WallRun
     errors: Array
-    """Of the side sonar's distance at every point of ``run.track``, m; NaN where it does not count."""
+    """Errors of the side sonar's distance at every point of ``run.track``, m; NaN where it does not count."""
     ramp: tuple[float, float]
     """Greatest acceleration and jerk of the planned ramps."""
 

@@ -49,7 +49,7 @@ from monstertruckd.tools.demo.runs import run_fast_demo
 ROOT = Path(__file__).resolve().parents[1]
 SECOND = 1_000_000_000
 RPM = 644 / (2 * pi * 0.075) * 60
-"""Of the motor, a metre per second."""
+"""Speed of the motor (rpm) at one metre per second."""
 GRAVITY = 9.81
 GOALS: dict[str, tuple[str, float]] = {
     "scan_share_within_1mm": (">=", 0.999),
@@ -104,7 +104,7 @@ class Hands:
         world.truth(0)
 
     def pulse_us(self, channel: int, time_ns: int) -> float | None:
-        """Of a servo."""
+        """Pulse of a servo, us."""
         return self.pulses[channel]
 
     def steer(self, front: float, rear: float) -> None:

@@ -41,13 +41,13 @@ from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 SIDE, CELL = 8.0, 0.05
-"""Of the hall and of its cells, m."""
+"""Sides of the hall and of its cells, m."""
 LENGTH, WIDTH = 0.47, 0.34
-"""Of the robot, m."""
+"""Size of the robot, m."""
 START = (1.0, 1.0, 0.0)
 GOALS = 3
 LIMIT = 0.1
-"""Of the speed zones, m/s."""
+"""Speed limit of the speed zones, m/s."""
 EASY = 0.45
 """Half the width of ways that the judge calls easy, m: the circle around the robot with 15 cm to spare."""
 TOLERANCE = 0.005

@@ -31,12 +31,12 @@ from tests.calibration_kit import START_UP, LocalTruck, hidden, run_session
 
 ROOT = Path(__file__).resolve().parents[2]
 GOAL: Final = 0.2
-"""Of the closing error with signs alone."""
+"""Goal as a share of the closing error with signs alone."""
 SIGNS: Final = ("inverted", "front_direction", "rear_direction")
 PATH: Final = 10.0
 """m."""
 ANGLE: Final = 0.3
-"""Of both axles, against each other, in the corners, rad."""
+"""Steering angle of both axles, against each other, in the corners, rad."""
 SPEED: Final = 0.15
 HIDDEN: Final = ("battery", "compass", "drive", "steering", "odometry", "lidar")
 
@@ -49,7 +49,7 @@ def truck(seed: int, folder: Path) -> SimulatedTruckConfig:
 
 
 def results_of(config: SimulatedTruckConfig) -> list[Result]:
-    """Of the wizards so far."""
+    """Return the results of the wizards so far."""
     current = CalibrationStore(config.calibration_folder, config.robot).current()
     return [] if current is None else list(current.results.values())
 
@@ -77,7 +77,7 @@ def signs(results: Sequence[Result]) -> list[Result]:
 
 
 def closing_error(config: SimulatedTruckConfig) -> float:
-    """Of a square to the left, m."""
+    """Return the closing error of a square to the left, m."""
 
     def turned(record: MoveRecord) -> bool:
         yaws = np.unwrap([o.pose.yaw for o in record.of(topics.ODOMETRY)])

@@ -151,7 +151,7 @@ def peak() -> float:
 
 
 def reset_peak() -> None:
-    """Let ``peak`` begin anew."""
+    """Restart ``peak``."""
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 

@@ -312,7 +312,7 @@ async def measure(clock: Clock, folder: Path, count: int) -> dict[str, dict[str,
 
 
 def summary(values: list[float | None]) -> dict[str, Any]:
-    """Of delays in seconds; None = did not come, or does not count."""
+    """Summarise delays in seconds; None: the event did not come, or is excluded."""
     known = [1e3 * value for value in values if value is not None]
     p50, p99, most = np.percentile(known, (50, 99, 100)).tolist() if known else (np.inf, np.inf, np.inf)
     figures = {"p50_ms": round(p50, 1), "p99_ms": round(p99, 1), "max_ms": round(most, 1)}

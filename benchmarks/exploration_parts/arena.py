@@ -17,7 +17,7 @@ BODY, BARE = Footprint(), Footprint(padding=0.0)
 ROOM = 0.3
 """Metres between the footprint and obstacles where a run starts."""
 BEAMS, FIRST, STEP = 682, -340.5 * 2 * np.pi / 1024, 2 * np.pi / 1024
-"""Of the URG-04LX, which looks 240 degrees."""
+"""Beams of the URG-04LX, which sees 240 degrees."""
 MOUNT = (0.14, 0.0, 0.0)
 
 
@@ -34,13 +34,13 @@ class Arena:
 
     @classmethod
     def load(cls, name: str, file: Path) -> "Arena":
-        """Of a map_server file."""
+        """Load a map_server file."""
         world = load_map(file)
         return cls.of(name, world.cells != FREE, world.resolution, world.origin[:2])
 
     @classmethod
     def of(cls, name: str, cells: NDArray[np.bool_], resolution: float, corner: tuple[float, float]) -> "Arena":
-        """Of cells that block, shape (rows, columns); the corner is that of the first one, m."""
+        """Create from blocked cells, shape (rows, columns); ``corner`` is the corner of the first one, m."""
         blocked = np.pad(cells, 1, constant_values=True)  # nothing is seen beyond the edge
         origin = corner[0] - resolution, corner[1] - resolution
         field = DistanceField(blocked, resolution, (*origin, 0.0))

@@ -27,11 +27,11 @@ from monstertruck_sim.world.obstacles import Box
 
 FAULTS: Final = ("kidnap", "door", "person", "lidar", "battery")
 DOORS: Final = ((2.45, 3.1, 0.9, 0.1), (7.65, 3.1, 0.9, 0.1), (3.85, 4.8, 0.9, 0.1), (6.85, 4.8, 0.9, 0.1))
-"""Of the rooms: middle, length, width, m."""
+"""Doors of the rooms: middle, length, width, m."""
 WALK: Final = (
     (1.2, 3.95), (2.45, 3.95), (2.45, 2.2), (2.45, 3.95), (6.85, 3.95), (6.85, 5.8), (6.85, 3.95), (8.8, 3.95)
 )  # fmt: skip
-"""Of the person, round and round, through the hall and into two rooms, m."""
+"""Waypoints of the person, round and round, through the hall and into two rooms, m."""
 APART: Final = 1.5
 """Metres from the truck at which the person begins, at least."""
 BUDGET, LIMIT = 240.0, 600.0

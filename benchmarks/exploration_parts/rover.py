@@ -106,7 +106,7 @@ class Rover:
         self.stuck, self.stuck_at = 0, self.pose
         self.blameless = self.attempts, self.unreached
         self.hits = np.empty((0, 2))
-        """Of the newest scan, in the map; taken at this pose:"""
+        """Hits of the latest scan, in the map; taken at this pose:"""
         self.seen_from: Pose2 | None = None
         self.scanned: Pose2 | None = None
         self.sent: list[Grid | None] = [None, None]

@@ -131,7 +131,7 @@ class Scenario:
 
     @property
     def name(self) -> str:
-        """Of the fault."""
+        """Name of the fault."""
         return self.fault.name
 
 

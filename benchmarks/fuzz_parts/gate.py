@@ -63,7 +63,7 @@ class Finding(NamedTuple):
     """A shortest sequence that breaks the gate."""
 
     kind: str
-    """Of the body."""
+    """Kind of the body."""
     error: str
     actions: tuple[Action, ...]
 
@@ -166,7 +166,7 @@ def _action(rng: random.Random, shafts: int, angles: int) -> Action:
 
 
 def _times(rng: random.Random) -> dict[str, int]:
-    """Of a message, ns after now."""
+    """Draw the times of a message, ns after now."""
     late = (0, 0, 0, -1, 1, -(10**8), -2 * 10**9, -(2**63), 2**63)
     return {"stamp": rng.choice(late), "received": rng.choice((0, 0, rng.choice(late)))}
 

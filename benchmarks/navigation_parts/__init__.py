@@ -14,7 +14,7 @@ class Options:
     """Folder for plots."""
     quick: bool = False
     runs: int = 2000
-    """Of the harness."""
+    """Number of runs of the harness."""
 
 
 @dataclass

@@ -25,7 +25,7 @@ from navigation_parts import Options, Part
 from navigation_parts.daemon import CONFIGS, pursue
 
 CELL, LENGTH, WALL = 0.025, 5.0, 4
-"""Of the map: m, m, and cells."""
+"""Sizes of the map: m, m, and cells."""
 WIDTHS = (0.8, 0.85, 0.9, 1.0)
 TRACKERS = ("lqr", "mpc")
 SEEDS = (1, 2, 3)

@@ -18,7 +18,7 @@ CELL = 0.05
 ROUGHNESS = (0.01, 0.02, 0.03)
 """Standard deviation of the height, m."""
 DEPTHS = np.arange(0.5, 4.0, 0.25)
-"""Of the block between the two ways, m."""
+"""Depths of the block between the two ways, m."""
 DETOUR = 1.5
 START, GOAL = (0.8, 0.6, 0.0), (7.2, 0.6, 0.0)
 ROUGH = slice(round(2.0 / CELL), round(6.0 / CELL))

@@ -26,7 +26,7 @@ FOOTPRINT = DiscFootprint((-0.0283, 0.115, 0.2583), 0.1235)
 RADIUS = Vehicle.truck("4ws").radius
 """The least circle of the truck, m."""
 LIMIT = 10.0
-"""Of BIT*, s."""
+"""Time limit of BIT*, s."""
 CLI_STARTS = 3
 NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX"}
 

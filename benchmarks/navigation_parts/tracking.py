@@ -143,7 +143,7 @@ RESPONSES = {
 """Dead time (s), lag (s) and greatest turning rate (rad/s) of the axles."""
 SPEEDS, AXLES, VERSIONS = (0.2, 0.5, 1.0), ("ideal", "lag"), ("forward", "backward", "cusps")
 TURNS = (0.0, 0.4, 0.25, 0.75, 0.6, 1.0)
-"""Of the version with cusps: shares of the course between which it goes forward and backward."""
+"""Turning points of the version with cusps: shares of the course between which it goes forward and backward."""
 
 
 def run(options: Options) -> Part:

@@ -24,7 +24,7 @@ SEEDS = 5
 SCANS = 400
 """Scans of a log."""
 RADIUS = 0.25
-"""Of a person, m."""
+"""Radius of a person, m."""
 KINDS = ("along", "against", "across")
 MOST = 60
 """People of a log."""

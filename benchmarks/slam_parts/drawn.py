@@ -23,7 +23,7 @@ WAY, STEP, PERIOD = 240.0, 0.1, 0.2
 """Driven, m; between two scans at most, m, and s. Where it turns, scans are no more than ``TURN`` rad apart."""
 TURN = 0.2
 CLEARANCE, CELL = 0.4, 0.15
-"""Of the robot from walls, and of the grid on which its way is searched, m."""
+"""Clearance of the robot from walls, and cell size of the grid for its path search, m."""
 BEAMS, HALF_VIEW, REACH, NOISE = 271, math.radians(135), 8.0, 0.01
 SCALES, DRIFT, JITTER = (0.02, 0.03), 0.01, (0.03, 0.004)
 """Standard deviations: of the scales of ways and turns, of the drift, rad/m, and of each step, its share and rad."""

@@ -61,7 +61,7 @@ DITHERS = 6
 SPAN = 5
 """Scans."""
 DELAYS = np.arange(0.0, 0.4, 0.01)
-"""Of the scans behind the ticks, s."""
+"""Delays of the scans behind the ticks, s."""
 METRES_PER_TICK = 2 * np.pi * 0.077 / 2000
 """The robot of the recording: wheels of 77 mm, 2000 ticks a turn (BreezySLAM, examples/mines.py)."""
 MOST = {"occupied_ratio": 1.0, "seen_through_ratio": 1.0}

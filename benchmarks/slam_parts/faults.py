@@ -1,6 +1,6 @@
 """Mapping through what goes wrong: a robot that is carried, and odometry that is wrong. Parts kidnap, wrong_odometry.
 
-``kidnap``: 60 s are cut out of a log, at instants drawn by seed, and odometry begins anew behind the cut. In the time
+``kidnap``: 60 s are cut out of a log, at instants drawn by seed, and odometry restarts behind the cut. In the time
 after it the pose is wrong where it is more than ``WRONG`` from that of the uncut log; for no more than 3 s may it be
 wrong without being reported lost. Poses count in the error once the submap is joined to the map; what is never joined
 is counted apart. A reference of poses (rbpf) is itself some centimetres off, so there the error counts beyond that of
@@ -35,11 +35,11 @@ Found = tuple[dict[str, float], dict[str, float], bool]
 
 LOGS = ("intel1", "csail", "intel")
 QUICK_SCANS = 2500
-"""Of the first log, with --quick the only one."""
+"""Scans used of the first log, the only one with --quick."""
 CUT, CUTS, QUICK_CUTS = 60.0, 20, 4
 """Seconds left out, cuts of each log."""
 SHARES = (0.2, 0.85)
-"""Of a log's time between which it is cut: there is a map before, and a way behind."""
+"""Range of the cuts as shares of a log's time: there is a map before, and a path behind."""
 WATCHED, WRONG = 30.0, 0.5
 """Seconds after a cut in which wrong poses count, and how far off these are, m."""
 UNREPORTED, ERROR, SCAN = 3.0, 0.06, 50.0
@@ -104,7 +104,7 @@ def kidnap(folder: Path, *, quick: bool, logs: Sequence[str] = LOGS) -> Found:
 def kidnapped(
     folder: Path, name: str, quick: bool, whole: np.ndarray, share: float
 ) -> tuple[float, float, float, bool, float]:
-    """Of one cut: longest time wrong and unreported and time lost, s; error, m; whether all was joined; ms a scan."""
+    """Run one cut: longest time wrong and unreported, time lost, s; error, m; whether all was joined; ms per scan."""
     log, first, kept = cut(read(folder, name, quick=quick), share)
     found = mapped(log, log.odom)
     seconds = log.stamps / SECOND

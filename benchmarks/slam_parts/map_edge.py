@@ -27,7 +27,7 @@ SOON, SPACING, WAY = 6.0, 1.5, 12.0
 """Way to the edge at most, between two starts at least, and driven, m."""
 SECONDS = 90.0
 STARTS, QUICK_STARTS = 8, 2
-"""Of every map, with and without wheels, by a lidar of 30 m and one of 5.6 m."""
+"""Starts on every map, with and without wheels, by a lidar of 30 m and one of 5.6 m."""
 GOALS = {f"map_edge.{log}.{kind}.hidden_share": 0.01 for log in LOGS for kind in ("wheels", "scans_alone")}
 
 
@@ -53,7 +53,7 @@ def starts(case: Mapped, count: int) -> list[int]:
 
 
 def tracked(case: Mapped, start: int, *, wheels: bool) -> list[tuple[bool, bool]]:
-    """Of every pose that one robot published: whether it is wrong, and whether its covariance hides that."""
+    """Return for every pose that one robot published whether it is wrong, and whether its covariance hides that."""
     log, geometry = case.log, case.log.geometry
     estimator = LocalisationEstimator(case.saved, MapperConfig(), tuple(case.poses[start].tolist()))
     way, found = 0.0, []

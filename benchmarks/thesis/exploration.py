@@ -15,7 +15,7 @@ from monstertruck_planners.explore.explore_step import warm_up
 
 KINDS = ("information", "author")
 REACH = 4.0
-"""Of the thesis's lidar, m."""
+"""Range of the thesis's lidar, m."""
 SEEDS = 2
 
 

@@ -13,13 +13,13 @@ from numba import njit
 from monstertruck_kinematics.elementary import Array
 
 OFFSET: Final = 0.35
-"""Of the robot's middle from the wall, m."""
+"""Distance of the robot's middle from the wall, m."""
 PATH: Final = 48.0
 """Length of the offset path, m."""
 GAP: Final = 0.4
 """m."""
 DEPTH: Final = 1.5
-"""Of the recess behind the gap, m: its walls are the ends of the two walls and a back."""
+"""Depth of the recess behind the gap, m: its walls are the ends of the two walls and a back."""
 
 
 class Arena(NamedTuple):

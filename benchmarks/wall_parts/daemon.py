@@ -30,7 +30,7 @@ from wall_parts.simulation import mirrored
 
 FILE: Final = Path(__file__).resolve().parents[2] / "configs" / "robots" / "sonar.yaml"
 CELL: Final = 0.01
-"""Of the map, m: walls at a slant are steps of this size."""
+"""Cell size of the map, m: walls at a slant are steps of this size."""
 LAP: Final = 20.0, 1.0
 """Least length of a lap, and how near its end is to its beginning, m: that of the benchmark."""
 LIMIT: Final = 500.0

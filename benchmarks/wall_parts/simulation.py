@@ -33,7 +33,7 @@ LAG: Final = 0.05
 """Time constant of the drives, s."""
 HALF_TRACK: Final = 0.135
 ACCELERATION, YAW_ACCELERATION, YAW_RATE, BRAKING = 0.8, 6.0, 1.5, 1.0
-"""Of the robot's gate: m/s^2, rad/s^2, rad/s, m/s^2."""
+"""Limits of the robot's gate: m/s^2, rad/s^2, rad/s, m/s^2."""
 JUMP: Final = 0.8
 """Change of a speed asked for beyond which it jumps, m/s^2 and rad/s^2: the published ramps have 0.6 at most."""
 IMU_STALE: Final = IMU.fresh_for()
@@ -53,7 +53,7 @@ class Fault:
     kind: FaultKind
     at: float
     part: str
-    """Of a sonar its name; of a motor ``left`` or ``right``."""
+    """Name of a sonar; ``left`` or ``right`` for a motor."""
 
 
 class WallRun(NamedTuple):
@@ -158,7 +158,7 @@ class Ears:
 
 
 def mounts() -> Transforms:
-    """Of the five sonars."""
+    """Return the mounts of the five sonars."""
     return Transforms(
         **HEAD,
         frame="odom",

@@ -27,14 +27,14 @@ ENDS = (0.5, 6.0)
 PATCH = (2.4, 4.0)
 """Where the stones begin and end along x, m."""
 WIDTHS = {"narrow": 0.5, "spanning": 6.0}
-"""Of the patch, m: one with room on both sides, half as wide again as the truck, and one from wall to wall."""
+"""Widths of the patch, m: one with room on both sides, half as wide again as the truck, and one from wall to wall."""
 TRIPS = 4
 LIMIT = 240.0
 """Seconds a trip may take."""
 STONE = 0.125
 """Half the side of the largest stone, m: so far beyond the patch it may lie."""
 HALF = 0.17
-"""Of the truck's width, m."""
+"""Half of the truck's width, m."""
 ROUGH = 0.004
 """A cell at least this rough is found to be, m."""
 

@@ -19,7 +19,7 @@ from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 ROBOTS = Path(__file__).resolve().parents[2] / "configs" / "robots"
 BODIES = ("truck", "ackermann", "skid_steer", "differential", "omni", "mecanum")
 END = (2.4, 4.15)
-"""Of the bend, m."""
+"""End of the bend, m."""
 WALL, ASIDE, DISTANCE = 3.5, 0.05, 0.30
 """The yard's wall along x; of the left sonar from the robot's middle; at which the robot is to follow it, m."""
 

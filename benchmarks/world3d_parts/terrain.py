@@ -61,7 +61,7 @@ class Driven(NamedTuple):
 
     @property
     def errors(self) -> np.ndarray:
-        """Of the pose; nothing is aligned."""
+        """Errors of the pose, without alignment."""
         return np.hypot(*(self.poses - self.true)[:, :2].T)
 
 

@@ -19,14 +19,14 @@ ORDERS: Final = frozenset(order.value for order in Order)
 
 
 class Allowance(NamedTuple):
-    """What calls of one kind may take."""
+    """Limits of the calls of one kind."""
 
     rate: float
-    """Calls a second of one owner."""
+    """Maximum calls per second of one owner."""
     served: int
-    """Calls under way, emergency stops not counted, from which on no further one is served."""
+    """Maximum number of calls being served, excluding emergency stops."""
     waiting: int
-    """Waiting calls from which on no further one is taken."""
+    """Maximum number of waiting calls."""
 
 
 CALLS: Final = Allowance(100.0, 16, 64)

@@ -333,7 +333,7 @@ _ROWS: Final = (
     ),
     WizardKind(
         name="sonar",
-        doc="""Where the sonars sit and look, their cones, and the speed of sound: arcs beside a flat wall.
+        doc="""Places, directions and cones of the sonars, and the speed of sound: arcs along a flat wall.
 
         Asks `park`, `wall` (m) and `clear`.
         """,

@@ -86,7 +86,7 @@ class Attitude(Message):
     tilt_valid: bool = True
     """False while the acceleration is not near 1 g: roll and pitch are then not tilt."""
     degraded: bool = False
-    """Whether it rests on a calibration that has expired."""
+    """Whether it depends on an expired calibration."""
 
 
 class DriveMode(StrEnum):
@@ -167,7 +167,7 @@ class Battery(Message):
     current: float | None = None
     """Current into the pack, A: positive while it is charged; None if the robot does not measure it."""
     degraded: bool = False
-    """Whether it rests on a calibration that has expired."""
+    """Whether it depends on an expired calibration."""
 
 
 class SonarEcho(Schema):
@@ -195,7 +195,7 @@ class SonarRanges(Message):
     range_max: Annotated[float, Field(gt=0)]
     """Maximum range (m)."""
     degraded: bool = False
-    """Whether it rests on a calibration that has expired."""
+    """Whether it depends on an expired calibration."""
 
     def echo(self, name: str) -> SonarEcho | None:
         """The sonar of that name; None = the array has none."""

@@ -36,7 +36,7 @@ class Odometry(Message):
     sources: tuple[str, ...] = ()
     """Sensors used in this estimate, e.g. ("drive", "steering", "compass")."""
     degraded: bool = False
-    """Whether it rests on a calibration that has expired."""
+    """Whether it depends on an expired calibration."""
 
     @property
     def position_deviation(self) -> float:

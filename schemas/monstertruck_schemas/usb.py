@@ -42,7 +42,7 @@ class UsbNode(Schema):
     replugs: Annotated[int, Field(ge=0)] = 0
     """Times it came back since the daemon started."""
     over_current: Annotated[int, Field(ge=0)] = 0
-    """Over-current conditions of the port it hangs on, since the hub came."""
+    """Over-current conditions of its port since the hub appeared."""
     autosuspend: bool = False
     """The kernel may suspend it, which costs the first bytes or a reset."""
     latency_ms: int | None = None

@@ -20,7 +20,7 @@ class EposConfig(Schema):
 
     kind: Literal["epos"] = "epos"
     node: Annotated[int, Field(ge=0, le=127)] = 1
-    """Node id on the cable; 0 = whichever is there."""
+    """Node id on the cable; 0 = any single controller."""
     inverted: bool = True
     """Driving forward needs negative rpm."""
 

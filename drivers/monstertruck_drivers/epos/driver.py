@@ -140,7 +140,7 @@ class EposDriver:
 
     Args:
         config: see ``EposConfig``.
-        port: where the controller hangs.
+        port: port of the controller.
         clock: time.
         commands: ``cmd/drive``; read by this driver alone.
         out: ``sensor/drive``, ``stamp`` in the middle of the exchange that read the position.

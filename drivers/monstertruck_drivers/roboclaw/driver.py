@@ -18,7 +18,7 @@ class RoboclawDriver:
 
     Args:
         config: see ``RoboclawConfig``.
-        port: where it hangs.
+        port: port of the controller.
         clock: time.
         out: angles of the wheels.
         events: who answers, and its restarts.
@@ -83,7 +83,7 @@ class RoboclawDriver:
         """
         steps = [step(old, new) for old, new in zip(before, now, strict=True)]
         if max(map(abs, steps)) * self._config.count > self._config.max_rate * dt:
-            text = f"{self._port.name}: counters jumped by {steps[0]} and {steps[1]}: the unit counts anew"
+            text = f"{self._port.name}: counters jumped by {steps[0]} and {steps[1]}: the unit restarted its count"
             self._events(Reason.DEVICE_RESTARTED, Severity.WARNING, self.name, text)
             raise DeviceRestartedError(text)
         self._turned = [turned + by for turned, by in zip(self._turned, steps, strict=True)]

@@ -58,5 +58,5 @@ class ClockWatch:
         elif arrival - self._late_since > late_for * SECOND:
             self._late_since = None
             raise DeviceTimeoutError(
-                f"{port}: scans arrive {mapping.late / SECOND:.1f} s later than at the start: begins anew"
+                f"{port}: scans arrive {mapping.late / SECOND:.1f} s later than at the start: the session restarts"
             )

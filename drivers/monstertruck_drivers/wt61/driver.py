@@ -72,7 +72,7 @@ class Wt61Driver:
 
     Args:
         config: averaging and checks.
-        port: where it hangs.
+        port: port of the unit.
         clock: time.
         out: measurements, in the unit's own axes.
         events: not used.

@@ -41,8 +41,8 @@ from monstertruckd.tools.calibrate.weave import weaves
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = (
-    "3 m x 3 m, with walls in sight on several sides; for heights a tape, a level floor, and walls straight ahead and "
-    "straight to the left"
+    "3 m x 3 m, with walls in sight on several sides; for heights a tape, a level floor, and a wall straight ahead and "
+    "one to the left"
 )
 QUARTER: Final = math.pi / 2
 LEAST_OVERLAP: Final = 0.5

@@ -106,7 +106,7 @@ class SonarWizard:
     """An arc to each side, driven ahead and back, next to a wall."""
 
     name: ClassVar[WizardName] = "sonar"
-    doc: ClassVar[str] = "where the sonars sit and look, their cones, and the speed of sound, from arcs beside a wall"
+    doc: ClassVar[str] = "places, directions and cones of the sonars, and the speed of sound, from arcs along a wall"
     room: ClassVar[str] = ROOM
     turn: float = 2 * math.pi
     """Turn of each arc, rad"""

@@ -1,4 +1,4 @@
-"""`replay`: a log on Zenoh once more, or computed again and compared."""
+"""`replay`: publish a log on Zenoh again, or compute it again and compare."""
 
 import math
 from contextlib import suppress

@@ -57,7 +57,7 @@ def map_text(grid: Grid, pose: Pose2D | None, columns: int, rows: int) -> Text:
     kinds = np.full((grid.height, grid.width), UNKNOWN, dtype=np.uint8)
     cells = grid.cells.reshape(grid.height, grid.width)
     kinds[cells >= 0] = FREE
-    # Value of a grid's cell from which on it is a wall.
+    # Minimum value of a grid's wall cell.
     kinds[cells >= 50] = WALL
     known = np.argwhere(kinds)
     if not len(known):

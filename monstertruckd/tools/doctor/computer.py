@@ -204,9 +204,11 @@ def _expiry(context: HostContext, file: Path, place: Path) -> Finding:
     except InputError:
         return fail("certificate", Reason.BAD_INPUT, f"{file}: expected certificates", show)
     if days < 0:
-        return fail("certificate", Reason.NOT_PERMITTED, f"{file}: {name}'s certificate expired {-days} days ago", show)
+        return fail(
+            "certificate", Reason.NOT_PERMITTED, f"{file}: certificate of {name} expired {-days} days ago", show
+        )
     if days < 30:  # days
-        return warn("certificate", Reason.NOT_PERMITTED, f"{file}: {name}'s certificate expires in {days} days", show)
+        return warn("certificate", Reason.NOT_PERMITTED, f"{file}: certificate of {name} expires in {days} days", show)
     return fine("certificate", f"{file}: good for {days} days")
 
 

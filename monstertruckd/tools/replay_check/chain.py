@@ -1,4 +1,4 @@
-"""The services of a robot that compute from sensors, put together once more without its devices."""
+"""The services of a robot that compute from sensors, put together again without its devices."""
 
 import asyncio
 from bisect import bisect_left

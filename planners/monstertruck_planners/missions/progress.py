@@ -76,7 +76,7 @@ class MissionFrame(Schema):
     interrupted: Annotated[tuple["MissionFrame", ...], Field(strict=False)] = ()
     """Position of a parallel step when a watch interrupted it: its frame and its inner frames"""
     spent: Annotated[float, Field(ge=0)] = 0.0
-    """Seconds spent in it, pauses left out"""
+    """Seconds spent in it, excluding pauses"""
 
 
 @dataclass(frozen=True, slots=True)

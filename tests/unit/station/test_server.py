@@ -292,4 +292,4 @@ async def test_connections_of_one_address_have_an_end_and_those_that_were_there_
             pass
         for _, writer in crowd:
             writer.close()
-    assert "connections of 127.0.0.1" in caplog.text
+    assert "connections from 127.0.0.1" in caplog.text

@@ -65,7 +65,7 @@ def test_a_converter_is_found_by_name_or_because_it_is_alone(tmp_path: Path):
     converter(tmp_path, 1, "ads1015", in_voltage0_raw="1")
     assert iio.find(tmp_path, "").name == "ads1015"
     converter(tmp_path, 2, "mcp3208", in_voltage0_raw="1")
-    with pytest.raises(DeviceMismatchError, match="ads1015, mcp3208; say which"):
+    with pytest.raises(DeviceMismatchError, match="ads1015, mcp3208; select one"):
         iio.find(tmp_path, "")
     assert iio.find(tmp_path, "mcp3208").path.name == "iio:device2"
     with pytest.raises(DeviceLostError, match="no converter max1363"):

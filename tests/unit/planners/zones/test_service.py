@@ -153,7 +153,7 @@ def test_the_zones_that_the_robot_is_in_are_said_once_each():
 def test_what_cannot_be_done_is_refused_and_changes_nothing(tmp_path):
     async def story(stage):
         for order, name, error, said in (
-            (ZoneOrder.REMOVE, "ramp", InputError, "configuration's: expected to be removed there"),
+            (ZoneOrder.REMOVE, "ramp", InputError, "belongs to the configuration: expected to be removed there"),
             (ZoneOrder.OFF, "yard", NotFoundError, "no zone 'yard': expected one of ramp"),
             (ZoneOrder.ADD, "yard", InputError, "area: expected"),
         ):

@@ -315,7 +315,7 @@ async def test_a_lidar_whose_joints_turn_meanwhile_tells_no_mount(session, after
     devices = context.config.devices.model_copy(update={"stabiliser": stabiliser})
     context.config, context.joints = context.config.model_copy(update={"devices": devices}), [0.0, after]
     if refused:
-        with pytest.raises(InputError, match=r"turned by 1\.7 degrees .* lean on nothing of it"):
+        with pytest.raises(InputError, match=r"turned by 1\.7 degrees .* do not lean on it"):
             await CameraWizard()(context)
     else:
         assert (await CameraWizard()(context)).estimate("pitch") is not None

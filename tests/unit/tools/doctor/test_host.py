@@ -137,8 +137,8 @@ def test_what_expires(days: int, level: Level, words: str, tmp_path: Path):
     """The robot's own certificate, and any in the files of who is let in."""
     for number, (which, name) in enumerate(
         (
-            ({"robot_days": days}, "/pki/robot.pem: that of truck"),
-            ({"anna_days": days}, "/pki/pilots.pem: that of Issuer of anna"),
+            ({"robot_days": days}, "/pki/robot.pem: certificate of truck"),
+            ({"anna_days": days}, "/pki/pilots.pem: certificate of Issuer of anna"),
         )
     ):
         found = see_all(tmp_path / str(number), access, lambda emulated, which=which: with_tls(emulated, **which))
