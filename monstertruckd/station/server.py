@@ -255,7 +255,7 @@ class Station:
                 connection.transport.abort()
         for peer, count in of_peer.items():
             if count > MOST_CONNECTIONS:
-                self._remarks.add(peer, f"{count} connections of {peer}, {count - MOST_CONNECTIONS} are closed")
+                self._remarks.add(peer, f"{count} connections from {peer}: {count - MOST_CONNECTIONS} are closed")
 
     def _follow(self, feed: RobotFeed | ReplayFeed) -> None:
         """Follow a feed, and offer it in every browser."""

@@ -159,7 +159,7 @@ def test_what_cannot_be_done_is_refused_and_changes_nothing(tmp_path):
         ):
             with pytest.raises(error, match=said):
                 await stage.ask(order, name)
-        for name, said in (("ramp", "expected to be replaced there"), ("speed_mask", "a mask's")):
+        for name, said in (("ramp", "expected to be replaced there"), ("speed_mask", "a mask has this one")):
             with pytest.raises(InputError, match=said):
                 await stage.ask(ZoneOrder.ADD, name, AREA)
         with pytest.raises(RequestRefusedError) as refused:
