@@ -96,15 +96,17 @@ class WallClock(Clock):
 
     async def sleep(self, seconds: float) -> None:
         """Wait at least ``seconds``, and one iteration of the event loop."""
-        until = self.now() + round(seconds * SECOND)
-        if until <= self.now():
-            await asyncio.sleep(0)
-        await self.sleep_until(until)
+        await self.sleep_until(self.now() + round(seconds * SECOND))
 
     async def sleep_until(self, instant: int) -> None:
-        """Wait for the whole millisecond at or after ``instant``; the kernel may add most of a millisecond."""
-        while (now := self.now()) < instant:
-            await asyncio.sleep((-(-instant // MILLISECOND) - now // MILLISECOND) / 1000)
+        """Wait for the whole millisecond at or after ``instant``; the kernel may add most of a millisecond.
+
+        If it has passed, waits one iteration of the event loop: a task that never catches up does not stop the others.
+        """
+        while True:
+            await asyncio.sleep(max(-(-instant // MILLISECOND) - self.now() // MILLISECOND, 0) / 1000)
+            if self.now() >= instant:
+                return
 
     def now(self) -> int:
         """Nanoseconds of CLOCK_MONOTONIC."""

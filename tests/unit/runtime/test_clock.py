@@ -66,6 +66,13 @@ def test_sleep_until_the_past_returns_at_once():
     assert run_virtual(main, start=77) == 77
 
 
+async def test_a_late_task_lets_others_run_on_the_wall_clock():
+    clock, ran = WallClock(), []
+    asyncio.get_running_loop().call_soon(ran.append, True)
+    await clock.sleep_until(clock.now() - SECOND)
+    assert ran
+
+
 def test_replay_clock_starts_at_the_log_and_keeps_its_real_time():
     async def main(clock: ReplayClock) -> tuple[int, int]:
         return clock.now(), clock.real_offset()
