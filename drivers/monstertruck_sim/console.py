@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import signal
 import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -153,9 +154,13 @@ class FaultConsole:
         self._say = say
 
     async def run(self) -> None:
-        """Carry out lines until cancelled; the end of the input ends the commands, not the devices."""
+        """Carry out lines until cancelled; the end of the input ends the commands, not the devices.
+
+        A program in the background of a terminal gets no lines: its reads fail instead of stopping it.
+        """
         if not _pollable(self._source):
             await asyncio.Event().wait()
+        signal.signal(signal.SIGTTIN, signal.SIG_IGN)
         source, news, rest = self._source.fileno(), asyncio.Event(), b""
         when_readable(source, news.set)
         try:
@@ -186,7 +191,7 @@ class FaultConsole:
 
 
 def _read(source: int) -> bytes:
-    """What was written meanwhile, a line or more; nothing: it has ended, or the terminal is gone."""
+    """What was written meanwhile, a line or more; nothing: it has ended, or the terminal is gone or another's."""
     try:
         return os.read(source, 65536)
     except OSError:

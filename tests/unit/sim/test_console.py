@@ -3,6 +3,7 @@
 import asyncio
 import os
 import pty
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -112,3 +113,30 @@ def test_signals_are_falsified_by_name():
         set_signal_fault(emulator, ["help"])
     with pytest.raises(InputError, match="names no signals"):
         set_signal_fault(object(), ["heading", "off"])
+
+
+BACKGROUND = """
+import asyncio, fcntl, os, sys, termios
+from monstertruck_sim.console import FaultConsole
+
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+if not (child := os.fork()):
+    os.setpgid(0, 0)
+    asyncio.run(asyncio.wait_for(FaultConsole(None, sys.stdin, print).run(), 0.3))
+_, status = os.waitpid(child, os.WUNTRACED)
+print("stopped" if os.WIFSTOPPED(status) else "ran on")
+"""
+
+
+def test_in_the_background_of_a_terminal_the_devices_run_on():
+    user, program = pty.openpty()
+    os.write(user, b"a line for the shell\n")
+    command = [sys.executable, "-c", BACKGROUND]
+    try:
+        ended = subprocess.run(
+            command, stdin=program, start_new_session=True, capture_output=True, text=True, check=False
+        )
+    finally:
+        os.close(program)
+        os.close(user)
+    assert ended.stdout == "ran on\n", ended.stdout + ended.stderr
