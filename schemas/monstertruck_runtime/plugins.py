@@ -118,8 +118,11 @@ class Plugin:
         except TruckError:
             raise
         except Exception as error:
-            frame = traceback.extract_tb(error.__traceback__)[-1]
-            text = f"{frame.filename}:{frame.lineno}: {type(error).__name__}: {error}"
+            cause = error
+            while isinstance(cause, ExceptionGroup):  # raised in a task
+                cause = cause.exceptions[0]
+            frame = traceback.extract_tb(cause.__traceback__)[-1]
+            text = f"{frame.filename}:{frame.lineno}: {type(cause).__name__}: {cause}"
             raise InputError(f"kind {self.name}: {place}: {text}") from error
 
     def default_settings(self) -> Schema:

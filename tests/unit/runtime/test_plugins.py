@@ -1,5 +1,6 @@
 """Catalogs: our rows, and those of distributions that are installed with us."""
 
+import asyncio
 import json
 import re
 from dataclasses import dataclass
@@ -170,6 +171,20 @@ def test_an_implementation_that_takes_other_arguments_is_named():
         plugin.callable_at(f"{__name__}:GROUP")
     with pytest.raises(InputError, match=r"kind ball: json\.dumps: No module"):
         plugin.callable_at("json.dumps")
+
+
+def test_a_mistake_in_a_task_is_named():
+    async def mistake() -> None:
+        raise ValueError("two motors")
+
+    async def main() -> None:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(mistake())
+
+    plugin = row("ball", "BallConfig", f"{__name__}:Painter")
+    refused = r"kind ball: here: \S+test_plugins\.py:\d+: ValueError: two motors"
+    with pytest.raises(InputError, match=refused), plugin.refusing("here"):
+        asyncio.run(main())
 
 
 def test_settings_without_a_default_are_named():
