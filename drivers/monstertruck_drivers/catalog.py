@@ -63,8 +63,9 @@ class RoleSpec:
     elements: str | None = None
     """Field of the driver's settings with several sensing elements by name: their mounts are in the tree of frames, as
     ``<role>_<name>``."""
-    start: int = 100
-    """Rank among the devices that start again behind a returned hub."""
+    start: int = 11
+    """Rank among the devices that start again behind a returned hub: by default with the sensors, before what loads the
+    hub."""
     shafts: tuple[int, ...] = ()
     """Driven shafts it may control, of those as many as its settings have (``shafts``); else the first one."""
     loads_hub: bool = False
