@@ -93,7 +93,7 @@ def test_another_distribution_adds_a_topic(install):
     assert {broken.name: broken.error for broken in table.broken} == {
         "cmd/motor": "expected a name like sensor/radar, in one of the groups sensor, state, plan, health",
         "sensor/forged": "written by gate: expected driver",
-        "sensor/plain": "model: expected a subclass of Message",
+        "sensor/plain": "model: expected a subclass of Message, found <class 'dict'>",
         "sensor/scan": "the name is taken by monstertruckd",
         "sensor/taken": "another message is called monstertruck.Battery",
         "sonar/ahead": "expected a name like sensor/radar, in one of the groups sensor, state, plan, health",

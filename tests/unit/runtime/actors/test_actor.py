@@ -79,7 +79,7 @@ async def test_a_worker_is_niced_named_single_threaded_and_light(fresh_server: N
         facts = await worker.step("facts")
     assert facts["pid"] != os.getpid()
     assert facts["name"] == "counter"
-    assert facts["nice"] >= os.nice(0) + 5
+    assert facts["nice"] >= min(os.nice(0) + 5, 19)
     assert facts["threads"] == "1"
     assert not {"zenoh", "asyncio", "pydantic"} & set(facts["modules"])
 
