@@ -133,5 +133,7 @@ def new_driver(
     print(
         f"cd {made}\npython -m pytest\npython -m hatchling build -t wheel -d dist\n"
         f"python -m zipfile -e dist/{name}_driver-0.1-py3-none-any.whl plugins\n"
-        "PYTHONPATH=plugins monstertruckd plugins"
+        "export PYTHONPATH=$PWD/plugins\nmonstertruckd plugins\n"
+        f"monstertruckd emulate {name} --link /tmp/{name}\n"
+        f"monstertruckd probe {name} --port /tmp/{name}  # in a second terminal, with the same PYTHONPATH"
     )

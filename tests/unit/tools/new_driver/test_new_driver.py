@@ -1,16 +1,23 @@
 """The package that `new-driver` writes is whole: its tests pass, ruff and mypy are content, the catalog takes it."""
 
+import asyncio
 import importlib
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
+from monstertruck_drivers.cable import MemoryPort
 from monstertruck_drivers.catalog import DEVICES
+from monstertruck_drivers.emulation import EmulatorSetup
+from monstertruck_runtime.clock import VirtualClock, run_virtual
 from monstertruck_runtime.errors import InputError
+from monstertruck_sim.world.config import WorldConfig
+from monstertruck_sim.world.world import World
 from monstertruckd.tools.cli.main import app
 from monstertruckd.tools.new_driver.write import DriverKind, write_driver
 
@@ -48,13 +55,27 @@ def test_its_types_are_right(tmp_path: Path, kind: DriverKind):
 
 
 @pytest.mark.parametrize("kind", DriverKind)
-def test_the_catalog_takes_its_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: DriverKind):
+def test_the_catalog_takes_its_kind_and_emulates_it_on_the_truck(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: DriverKind
+):
     monkeypatch.syspath_prepend(str(write_driver(kind, f"acme_{kind}", tmp_path)))
     row = importlib.import_module(f"acme_{kind}_driver.plugin").KIND
     assert DEVICES.fault(row) is None
     assert row.settings_class()().kind == row.name
     assert callable(row.implementation_class())
-    assert row.callable_at(row.emulator)
+
+    async def emulated(clock: VirtualClock) -> dict[str, Any]:
+        port = MemoryPort("/dev/test")
+        async with asyncio.TaskGroup() as group:
+            device = row.emulated(EmulatorSetup(row.role.name, None, clock, World(WorldConfig(), 0), 0, port))
+            serving = group.create_task(row.serve(device, port.device))
+            await asyncio.sleep(0)
+            port.plug()
+            found = await row.identify(port, clock)
+            serving.cancel()
+        return found
+
+    assert run_virtual(emulated)["device"] == row.doc
 
 
 def test_nothing_is_overwritten_and_odd_names_are_refused(tmp_path: Path):
@@ -71,6 +92,7 @@ def test_the_command_says_what_is_next(tmp_path: Path):
     done = CliRunner().invoke(app, ["new-driver", "sensor", "acme", "--folder", str(tmp_path)])
     assert done.exit_code == 0, done.output
     assert f"cd {tmp_path}/acme" in done.stdout
+    assert "monstertruckd emulate acme --link /tmp/acme\nmonstertruckd probe acme --port /tmp/acme" in done.stdout
     refused = CliRunner().invoke(app, ["new-driver", "sonar", "acme"])
     assert refused.exit_code != 0
     assert "lidar" in refused.output
