@@ -2,6 +2,7 @@
 
 from typing import Annotated, Any, Final
 
+from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.plugins import Catalog, Plugin
 from monstertruck_schemas.body import BodyConfig
 
@@ -84,6 +85,11 @@ def build_chassis(body: BodyConfig, dimensions: Any) -> Any:
 
     Raises:
         InputError: the body does not load.
-        KinematicsError: dimensions no robot can have.
+        ValueError: dimensions no robot can have, such as a ``KinematicsError`` of ours.
     """
-    return BODIES.build(body, dimensions, **body.model_dump(exclude={"kind"}))
+    try:
+        return BODIES.build(body, dimensions, **body.model_dump(exclude={"kind"}))
+    except InputError as error:
+        if isinstance(error.__cause__, ValueError):  # of the values, not of the plug-in
+            raise error.__cause__ from None
+        raise

@@ -19,7 +19,7 @@ def test_it_measures_from_the_mark_what_wizards_ask_for():
     said = []
     tape = EmulatedTape(SimpleNamespace(truth=truth), SimpleNamespace(now=lambda: 0), (0.5, 0.3), said.append)
     tape.command([])
-    assert said.pop().startswith("pack 24.83 V; `tape mark` first"), "the meter needs no mark"
+    assert said.pop().startswith("pack 24.83 V; type `tape mark` first"), "the meter needs no mark"
     tape.command(["mark"])
     tape.command([])
     assert said[0].startswith(

@@ -54,8 +54,12 @@ class Library:
         self.port.closePort()
 
     def repeated(self, call: Callable[[], tuple[T, int, int]]) -> tuple[T, int]:
+        result = sdk.COMM_RX_TIMEOUT
         for _ in range(ATTEMPTS):
-            value, result, error = call()
+            try:
+                value, result, error = call()
+            except IndexError:  # the library indexes an answer that it has cut off at its time-out
+                continue
             if result == sdk.COMM_SUCCESS:
                 return value, error
         raise AssertionError(self.packet.getTxRxResult(result))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from monstertruck_estimation.slam import global_search, localisation
+from monstertruck_estimation.slam.budget import ScanBudget
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.localisation import LocalisationEstimator
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch
@@ -99,7 +100,7 @@ def test_of_twin_rooms_neither_is_taken():
 
 def test_a_search_that_takes_many_scans_finds_where_the_robot_is_when_it_ends(monkeypatch):
     """With one piece of a search at each scan."""
-    monkeypatch.setattr(global_search, "BUDGET", 1e-3 * global_search.BUDGET)
+    monkeypatch.setattr(global_search, "ScanBudget", lambda units: ScanBudget(1e-3 * units))
     truth = rounds(160, laps=1.2)
     estimates = followed(SavedMap(drawn(), None), ROOM, truth)
     found = next(k for k, estimate in enumerate(estimates) if estimate.status in PLACED)
