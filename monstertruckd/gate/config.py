@@ -173,8 +173,8 @@ class ContactConfig(Schema):
     """Rise of a motor's current above the rolling current that shows a contact, A: less than half of its rise until the
     clutch slips."""
     rolling: Annotated[float, Field(gt=0, le=2)] = 0.25
-    """Assumed rolling current until the robot has measured its own, A. Raise it for motors that draw more than
-    ``rolling`` plus ``current`` while they roll: such currents are taken for contact, and never learned."""
+    """Assumed rolling current on unseen ground and near a dock until the robot has measured its own elsewhere, A. Raise
+    it for motors that draw more than ``rolling`` plus ``current`` while they roll."""
     share: Annotated[float, Field(gt=0, lt=1)] = 0.3
     """Fraction of the commanded speed below which shafts, free wheels and turns are held."""
     within: Annotated[float, Field(gt=0, le=0.3)] = 0.15

@@ -276,3 +276,12 @@ def test_without_the_check_nothing_is_noticed_and_the_robot_says_so():
     rig.load = PUSHING
     assert rig.until(Reason.CONTACT) is None
     assert "gate.contact null: a contact in unseen ground is not noticed" in weakened(GateConfig(contact=None))
+
+
+def test_without_a_lidar_a_motor_that_draws_more_than_assumed_is_measured_first():
+    rig = Backing(scan={"stale_after": 0.25, "critical": False})
+    rig.silent = {"scan"}
+    rig.driver, rig.load = {"speed": 0.15}, 1.0
+    assert rig.until(Reason.CONTACT) is None
+    rig.load = 1.4
+    assert rig.until(Reason.CONTACT) is not None
