@@ -279,7 +279,7 @@ class ObstacleGuard:
             sweep = self._sweep(*twist)
             unknown = self._unknown(twist, sweep.ground)
             ground, before = sweep.ground[unknown], sweep.before[unknown]
-            if _on_the_spot(*twist[:2]):
+            if _is_turn(twist, self._footprint):
                 self._free = float(before[_near(ground, measured[near], depth)].min(initial=self._free))
             elif twist[0] < 0 or (_is_sideways(twist, self._footprint) and not _is_ahead(twist)):
                 self._stop_before(twist, before)
@@ -440,6 +440,11 @@ class ObstacleCheck(Check):
 def _on_the_spot(x: int, y: int) -> bool:
     """Whether a motion, in steps of ``TWIST_STEP``, is a turn on the spot."""
     return math.hypot(x, y) * TWIST_STEP < AHEAD
+
+
+def _is_turn(twist: _Steps, body: Footprint) -> bool:
+    """Whether a motion is a turn on the spot, or about another point beside or under the body that is not ahead."""
+    return _on_the_spot(*twist[:2]) or not (twist[0] < 0 or _is_ahead(twist) or _is_sideways(twist, body))
 
 
 def _near(points: Array, others: Array, within: float) -> NDArray[np.bool_]:

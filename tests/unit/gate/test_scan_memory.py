@@ -360,6 +360,13 @@ def passing(*obstacles, metres=0.6):
     return guard
 
 
+@pytest.mark.parametrize("motion", [(0.4, -0.4, 3.0), (0.2, -0.2, 3.0)])
+def test_a_turn_about_a_point_under_the_body_stays_off_unseen_ground_near_a_wall(motion):
+    """The tail swings out of sight behind walls 18 cm beside the body; it need not turn about the middle for that."""
+    assert guarding().free_distance((motion,)) == math.inf
+    assert guarding(*((x, math.copysign(0.38, y)) for x, y in BESIDE)).free_distance((motion,)) < 0.1
+
+
 def ahead(front, rear):
     """Unit twist of the truck with these axle angles."""
     return FourWheelSteering().body_twist(1.0, front, rear)
