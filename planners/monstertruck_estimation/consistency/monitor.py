@@ -399,7 +399,10 @@ class ConsistencyMonitor:
         self._scale *= factor
         self._scaled = None
         if abs(self._scale - 1.0) > tolerated:
-            text = f"its ranges became {self._scale:.2f} times as long from one revolution to the next"
+            text = (
+                f"its ranges became {self._scale:.2f} times as long from one revolution to the next; measure one, then "
+                f"switch the lidar off for more than {IN_USE / SECOND:g} s to accept them"
+            )
             self._scaled = Doubt(
                 sensor=self._sensors[Measure.SCANS],
                 kind=DoubtKind.SCALE,

@@ -30,6 +30,7 @@ def test_a_change_is_found_at_once(factor, front):
     trial = drive(HALL, LANE, Lies(scan=changed(factor)), front=front)
     doubt = trial.found["lidar"]
     assert doubt.kind is DoubtKind.SCALE
+    assert "switch the lidar off for more than 2 s" in doubt.text
     assert doubt.difference == pytest.approx(abs(factor - 1.0), abs=0.03)
     assert trial.at["lidar"] == pytest.approx(21 * 0.025, abs=0.03), "at the first revolution"
 
