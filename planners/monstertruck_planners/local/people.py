@@ -6,7 +6,7 @@ scan. It counts as a walker once it moves. Everything else stays an obstacle whe
 
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -91,16 +91,16 @@ class PeopleTracker:
         Returns:
             The walkers, and whether each point belongs to one, shape (n,).
         """
-        known, self._tracks = self._tracks, []
+        known, self._tracks = {track: track.place(stamp) for track in self._tracks}, []
         walkers, walking = [], np.zeros(len(points), np.bool_)
         for group in _groups(points, mapped, sensor):
             ends = points[group[[0, -1]]]
             x, y = ends.mean(axis=0).tolist()
-            track = _nearest(known, stamp, (x, y))
+            track = _nearest(known, (x, y))
             if track is None:
                 track = _PersonTrack()
             else:
-                known.remove(track)
+                del known[track]
             track.rows.append((stamp, x, y))
             track.radius = max(track.radius, math.dist(*ends) / 2)
             while stamp - track.rows[0][0] > MEMORY * SECOND:
@@ -131,11 +131,10 @@ def _groups(points: Array, mapped: NDArray[np.bool_], sensor: Array) -> Iterator
             yield group
 
 
-def _nearest(tracks: Sequence[_PersonTrack], stamp: int, place: tuple[float, float]) -> _PersonTrack | None:
+def _nearest(places: Mapping[_PersonTrack, tuple[float, float]], place: tuple[float, float]) -> _PersonTrack | None:
     """Return the track whose predicted place is nearest, within the gap of a person's returns."""
-    near = [(math.dist(track.place(stamp), place), i) for i, track in enumerate(tracks)]
-    far, i = min(near, default=(math.inf, 0))
-    return tracks[i] if far < LEGS_APART else None
+    track = min(places, key=lambda one: math.dist(places[one], place), default=None)
+    return track if track is not None and math.dist(places[track], place) < LEGS_APART else None
 
 
 def meets(
