@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -72,3 +73,13 @@ def slow_to_build():
 def slow_to_build_once():
     time.sleep(0.5)
     return Counter()
+
+
+def runs_a_program():
+    with subprocess.Popen(["true"]) as program:
+        os.waitid(os.P_PID, program.pid, os.WEXITED | os.WNOWAIT)
+    return Counter()
+
+
+def ends_itself():
+    raise SystemExit("no licence")

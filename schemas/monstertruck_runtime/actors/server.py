@@ -1,11 +1,13 @@
 """Main program of the fork server, and of the workers that it forks.
 
-``python -m monstertruck_runtime.actors.server FD`` forks a worker per request until its parent is gone. It has one
-thread, hence its forks are safe. It builds a worker of each kind once and discards it: forks then share the imported
-modules and the compiled kernels. Signals to the daemon's whole group are ignored: the parent decides when its workers
-end. Imports stay few, for every worker shares them.
+``python -m monstertruck_runtime.actors.server FD`` forks a worker per request until its parent is gone, in the middle
+of a build too. It has one thread, hence its forks are safe. It builds a worker of each kind once and discards it: forks
+then share the imported modules and the compiled kernels. Builds and workers go behind the daemon's loop: both are
+niced. Signals to the daemon's whole group are ignored: the parent decides when its workers end. Imports stay few, for
+every worker shares them.
 """
 
+import fcntl
 import gc
 import importlib
 import json
@@ -67,30 +69,34 @@ class _Server:
     def run(self) -> None:
         """Serve until the parent is gone."""
         signal.signal(signal.SIGCHLD, self._reap)
+        signal.signal(signal.SIGIO, self._end_with_parent)
+        fcntl.fcntl(self._requests, fcntl.F_SETOWN, os.getpid())
+        fcntl.fcntl(self._requests, fcntl.F_SETFL, fcntl.fcntl(self._requests, fcntl.F_GETFL) | os.O_ASYNC)
         while True:
             packet, descriptors, _, _ = socket.recv_fds(self._requests, _LONGEST, 3)
             if not packet:
                 return
-            request = ForkRequest.decode(packet)
-            self._build(request)
-            self._fork(request, *descriptors)
+            if not closed(descriptors[0]):
+                request = ForkRequest.decode(packet)
+                self._build(request)
+                if not closed(descriptors[0]):
+                    self._fork(request, *descriptors)
+                    continue
+            for descriptor in descriptors:
+                os.close(descriptor)
 
     def _build(self, request: ForkRequest) -> None:
         """Load what all workers of a target share; the worker itself reports what fails here."""
         if request.target in self._built:
             return
         sys.path[:] = request.path
-        with suppress(Exception):
+        with suppress(Exception, SystemExit):
             _made(request.target)
             self._built.add(request.target)
         gc.collect()
         gc.freeze()  # a collection in a fork would copy the shared pages
 
     def _fork(self, request: ForkRequest, connection: int, end: int, folder: int) -> None:
-        if closed(connection):
-            for descriptor in (connection, end, folder):
-                os.close(descriptor)
-            return
         signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGCHLD,))
         process = os.fork()
         if process == 0:
@@ -113,14 +119,29 @@ class _Server:
         os.close(folder)
 
     def _reap(self, *_: object) -> None:
-        while self._ends:
-            process, status = os.waitpid(-1, os.WNOHANG)
-            if process == 0:
-                return
+        for process in tuple(self._ends):  # not any child: a build may wait for a program of its own
+            try:
+                ended, status = os.waitpid(process, os.WNOHANG)
+            except ChildProcessError:  # the next signal came in this function, and has seen to it
+                continue
+            if not ended:
+                continue
             end = self._ends.pop(process)
             with suppress(OSError):  # the parent may no longer care
                 os.write(end, NUMBER.pack(os.waitstatus_to_exitcode(status)))
             os.close(end)
+
+    def _end_with_parent(self, *_: object) -> None:
+        """End at once when the parent is gone; the kernel sends SIGIO for a request, too."""
+        if closed(self._requests.fileno()):
+            os._exit(0)
+
+
+def readable(connection: int) -> bool:
+    """Whether something waits to be read, or the other side has closed a connection, given by its file descriptor."""
+    poll = select.poll()
+    poll.register(connection, select.POLLIN)
+    return bool(poll.poll(0))
 
 
 def closed(connection: int) -> bool:
@@ -134,6 +155,7 @@ def main() -> int:
     """Serve one parent; returns the exit code."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    os.nice(5)
     _Server(socket.socket(fileno=int(sys.argv[1]))).run()
     return 0
 
@@ -145,7 +167,8 @@ def _made(target: str) -> Any:
 
 def _become(request: ForkRequest) -> None:
     """Turn a fork of the server into what a fresh process of the parent would be."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    for number in (signal.SIGCHLD, signal.SIGIO):
+        signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGCHLD,))
     with suppress(OSError):  # only ps and top show it
         Path("/proc/self/comm").write_text(request.name[:15], encoding="utf-8")  # 15: the kernel's limit
@@ -153,7 +176,6 @@ def _become(request: ForkRequest) -> None:
     os.environ.update(request.environment)
     sys.path[:] = request.path
     importlib.invalidate_caches()
-    os.nice(5)
 
 
 def _work(connection: Connection, target: str) -> int:
@@ -168,7 +190,7 @@ def _work(connection: Connection, target: str) -> int:
             begin = _processor_time()
             outputs = worker.step(inputs)
             connection.send((True, outputs, _processor_time() - begin))
-    except Exception:  # noqa: BLE001  # reported to the parent, which decides
+    except (Exception, SystemExit):  # noqa: BLE001  # reported to the parent, which decides
         connection.send((False, traceback.format_exc(), 0.0))
         return 1
 

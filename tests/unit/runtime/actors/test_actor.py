@@ -101,6 +101,66 @@ async def test_the_server_builds_each_kind_of_worker_once_and_a_worker_itself(fr
             assert (await worker.step("facts"))["built"] == 2
 
 
+def test_the_server_is_niced_while_it_builds(fresh_server: None):
+    """Compiling takes minutes on a slow board."""
+    building = WorkerProcess("building", "tests.worker_kit:slow_to_build_once")
+    server = process_module._current.server()
+    niced = 0
+    while building.pid is None:
+        niced = os.getpriority(os.PRIO_PROCESS, server.pid)
+        time.sleep(0.01)
+    assert niced >= os.nice(0) + 5
+    building.kill()
+
+
+async def test_the_server_builds_a_kind_that_runs_a_program_beside_workers(fresh_server: None):
+    async with counter(WallClock()) as running, counter(WallClock(), "runs_a_program") as worker:
+        assert (await running.step("facts"))["built"] == 2
+        assert (await worker.step("facts"))["built"] == 3
+
+
+def test_a_server_reaps_a_worker_whose_end_is_signalled_twice(tmp_path: Path):
+    """The second signal comes while the first is handled."""
+    script = tmp_path / "twice.py"
+    script.write_text(
+        textwrap.dedent("""
+        import os, signal, time
+        from monstertruck_runtime.actors import server
+
+        reaping = server._Server(None)
+        signal.signal(signal.SIGCHLD, reaping._reap)
+        process = os.fork()
+        if process == 0:
+            time.sleep(0.1)
+            os._exit(0)
+        ours, theirs = os.pipe()
+        reaping._ends[process] = theirs
+        before, signals = os.waitpid, [signal.SIGCHLD]
+
+        def waitpid(*arguments):
+            if signals:
+                os.kill(os.getpid(), signals.pop())
+            return before(*arguments)
+
+        os.waitpid = waitpid
+        assert os.read(ours, 8) == server.NUMBER.pack(0)
+        assert not reaping._ends
+        """)
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, str(script)], env=environment, check=True, timeout=30.0)
+
+
+def test_a_kind_that_ends_its_process_harms_no_other():
+    ending = WorkerProcess("ending", "tests.worker_kit:ends_itself")
+    other = WorkerProcess("other", "tests.worker_kit:Counter")
+    with pytest.raises(WorkerError, match=r"^worker ending raised SystemExit: no licence"):
+        ending.receive()
+    other.receive()
+    for worker in (ending, other):
+        worker.kill()
+
+
 @pytest.mark.timeout(300)
 def test_the_server_of_all_workers_of_a_robot_keeps_one_thread():
     """A fork of several threads may hang."""
@@ -277,18 +337,21 @@ async def test_closing_under_a_step_fails_it():
         await step
 
 
-async def test_a_worker_and_the_server_end_with_their_killed_parent(tmp_path: Path):
+@pytest.mark.parametrize("builds", [False, True])
+async def test_a_worker_and_the_server_end_with_their_killed_parent(builds: bool, tmp_path: Path):
     parent = tmp_path / "parent.py"
     parent.write_text(
         textwrap.dedent("""
         import asyncio
+        import sys
         from monstertruck_runtime.clock import WallClock
         from monstertruck_runtime.actors.actor import WorkerActor
-        from monstertruck_runtime.actors.process import _current
+        from monstertruck_runtime.actors.process import WorkerProcess, _current
 
         async def main():
             worker = WorkerActor("w", "tests.worker_kit:Counter", WallClock(), latency=1, deadline=99)
             await worker.start()
+            building = [WorkerProcess("b", f"tests.worker_kit:slow_to_build{once}") for once in sys.argv[1:]]
             print(worker.pid, _current.server().pid, flush=True)
             await worker.step({"sleep": 60})
 
@@ -296,7 +359,8 @@ async def test_a_worker_and_the_server_end_with_their_killed_parent(tmp_path: Pa
         """)
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    process = subprocess.Popen([sys.executable, str(parent)], env=environment, stdout=subprocess.PIPE, text=True)
+    command = [sys.executable, str(parent), *(["", "_once"] if builds else [])]
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
     with process:
         assert process.stdout is not None
         processes = [int(word) for word in process.stdout.readline().split()]
