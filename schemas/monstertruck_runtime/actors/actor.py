@@ -246,7 +246,7 @@ class WorkerActor:
                 async with self._clock.deadline(self._start_timeout):
                     await self._wait(process.receive)
         except TimeoutError:
-            await self._blocking(process.kill_idle_server)
+            await self._blocking(process.kill_hung_server)
             raise WorkerTimeoutError(f"worker {self.name} did not start within {self._start_timeout} s") from None
         self._built = True
 

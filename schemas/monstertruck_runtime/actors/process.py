@@ -31,6 +31,10 @@ class ForkServer:
     """
 
     def __init__(self) -> None:
+        self._sending = threading.Lock()
+        """Held while a request is sent, or ``_waiting`` is used."""
+        self._waiting: list[socket.socket] = []
+        """What ``fork`` has returned and ``forget`` was not told, in the order of the requests."""
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603  # our own interpreter and module
@@ -67,9 +71,10 @@ class ForkServer:
         folder = os.open(".", os.O_PATH)
         ours, theirs = socket.socketpair()
         try:
-            with theirs:
+            with theirs, self._sending:
                 descriptors = [connection.fileno(), theirs.fileno(), folder]
                 socket.send_fds(self._requests, [packet], descriptors, socket.MSG_DONTWAIT)
+                self._waiting.append(ours)
         except OSError as error:
             ours.close()
             self.kill()
@@ -77,6 +82,16 @@ class ForkServer:
         finally:
             os.close(folder)
         return ours
+
+    def unanswered(self) -> socket.socket | None:
+        """The request that the server works on: the socket of the oldest one without an answer; None if it idles."""
+        with self._sending:
+            return next((end for end in self._waiting if not server.readable(end.fileno())), None)
+
+    def forget(self, end: socket.socket) -> None:
+        """Note that a request, given by its socket, is answered or given up; call it before the socket is closed."""
+        with self._sending, suppress(ValueError):
+            self._waiting.remove(end)
 
     def kill(self) -> None:
         """Kill the server, and leave no zombie; its workers run on."""
@@ -188,7 +203,9 @@ class WorkerProcess:
         return self.receive()
 
     def kill(self) -> None:
-        """Kill the process, and a server that does not confirm its end; neither leaves a zombie.
+        """Kill the process, and an idle server that does not confirm its end; neither leaves a zombie.
+
+        A server that builds may be in one call of a library for longer than that.
 
         The connection ends with its last user: a thread may still wait for it.
         """
@@ -209,13 +226,17 @@ class WorkerProcess:
                 with suppress(ProcessLookupError):
                     os.kill(self._pid, signal.SIGKILL)
                 self._code = self._reported(_END_TIMEOUT)
-                if self._code is None:
+                if self._code is None and self._server.unanswered() is None:
                     self._server.kill()
+            self._server.forget(self._end)
             self._end.close()
 
-    def kill_idle_server(self) -> None:
-        """Kill the server if it has not forked the process; for a start that took too long."""
-        if self.pid is None:
+    def kill_hung_server(self) -> None:
+        """Kill the server if it still works on this process; for a start that took too long.
+
+        While it builds another kind it does not hang: that one has a time limit of its own.
+        """
+        if self._server.unanswered() is self._end:
             self._server.kill()
 
     def _reported(self, timeout: float) -> int | None:
@@ -225,6 +246,7 @@ class WorkerProcess:
             data = self._end.recv(server.NUMBER.size)
         except OSError:
             return None
+        self._server.forget(self._end)
         return server.NUMBER.unpack(data)[0] if data else None
 
     def _gone(self) -> str:

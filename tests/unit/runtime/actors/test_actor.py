@@ -211,6 +211,29 @@ async def test_a_frozen_server_is_replaced_when_it_does_not_confirm_an_end(monke
         assert await worker.step(None) == 1
 
 
+async def test_a_start_that_waits_too_long_for_another_kind_lets_the_server_build_it(fresh_server: None):
+    building = WorkerProcess("building", "tests.worker_kit:slow_to_build_once")
+    async with counter(WallClock(), start_timeout=0.1) as waiting:
+        with pytest.raises(WorkerTimeoutError, match=r"did not start within 0.1 s"):
+            await waiting.start()
+    building.receive()
+    building.kill()
+
+
+def test_a_server_that_builds_need_not_confirm_an_end(fresh_server: None, monkeypatch: pytest.MonkeyPatch):
+    """One call of the compiler may take longer; signals wait for its end."""
+    monkeypatch.setattr(process_module, "_END_TIMEOUT", 0.1)
+    worker = WorkerProcess("any", "tests.worker_kit:Counter")
+    worker.receive()
+    server = process_module._current.server()
+    os.kill(server.pid, signal.SIGSTOP)
+    building = WorkerProcess("building", "tests.worker_kit:Counter")
+    worker.kill()
+    os.kill(server.pid, signal.SIGCONT)
+    building.receive()
+    building.kill()
+
+
 @pytest.mark.parametrize("server_too", [False, True])
 def test_an_ended_worker_gets_no_signal(server_too: bool, monkeypatch: pytest.MonkeyPatch):
     """Another process may have its number by then."""
