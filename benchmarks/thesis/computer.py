@@ -65,7 +65,6 @@ def run(options: Options) -> Part:
         rows[name].sort(key=lambda row: row["factor"])
     part.goals["ours.x1.control_missed_share"] = part.goals["ours.x1.mapping_missed_share"] = ALLOWED
     part.add("ram_daemon_and_world_mb", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
-    part.add("ram_greatest_worker_mb", resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024)
     draw(options, rows)
     return part
 
