@@ -31,7 +31,7 @@ from monstertruckd.gate.config import GateConfig, InForce
 from monstertruckd.gate.motion import AHEAD, Course
 from monstertruckd.gate.rear_sonars import RearSonars
 from monstertruckd.gate.samples import age
-from monstertruckd.gate.scan_memory import DRIFT, MAP_CELL, ScanMemory
+from monstertruckd.gate.scan_memory import DRIFT, ScanMemory
 from monstertruckd.gate.sonars import Place
 from monstertruckd.gate.visibility import Sectors, Visibility
 
@@ -285,11 +285,8 @@ class ObstacleGuard:
                 self._stop_before(twist, before)
                 continue
             elif _is_ahead(twist):
-                stops = _near(ground * stretch, measured[near] * stretch, beside)
-                if _is_sideways(twist, self._footprint):
-                    # The memory rounds by half a cell: ground this near the body cannot be told from ground under it.
-                    stops |= ~on_body(self._footprint, ground, MAP_CELL / 2)
-                self._stop_before(twist, before[stops])
+                tail = _near(ground * stretch, measured[near] * stretch, beside)
+                self._stop_before(twist, before[tail])
             self.known_slowly = float(before.min(initial=self.known_slowly))
 
     def _stop_before(self, twist: _Steps, before: Array) -> None:
