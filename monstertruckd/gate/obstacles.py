@@ -281,7 +281,7 @@ class ObstacleGuard:
             ground, before = sweep.ground[unknown], sweep.before[unknown]
             if _is_turn(twist, self._footprint):
                 self._free = float(before[_near(ground, measured[near], depth)].min(initial=self._free))
-            elif twist[0] < 0 or (_is_sideways(twist, self._footprint) and not _is_ahead(twist)):
+            elif twist[0] < 0 or _is_sideways(twist, self._footprint):
                 self._stop_before(twist, before)
                 continue
             elif _is_ahead(twist):
@@ -456,9 +456,12 @@ def _is_ahead(twist: _Steps) -> bool:
 
 
 def _is_sideways(twist: _Steps, body: Footprint) -> bool:
-    """Whether a whole side of the body moves outwards: the centre of rotation lies neither beside nor under it."""
-    _, y, turn = twist
-    return y != 0 and abs(y + turn * body.offset) >= abs(turn) * body.half_length
+    """Whether a whole side of the body moves outwards, and as fast as the body moves ahead.
+
+    The centre of rotation then lies neither beside nor under the body.
+    """
+    x, y, turn = twist
+    return y != 0 and abs(y + turn * body.offset) >= max(abs(turn) * body.half_length, x)
 
 
 def _finite(value: float) -> float | None:
