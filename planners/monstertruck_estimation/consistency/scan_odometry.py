@@ -109,13 +109,13 @@ class ScanMotionStep:
             self._last = None
             self._scale.begin(None)
             return StepOutput(stamp, None, front=name)
-        cloud, found = Cloud.of(whole), None
+        found = None
         if last is not None and 0.0 < dt < GAP:
-            found = self._found(front, scan, whole, cloud, last[1], lasting)
-        self._last = stamp, cloud
+            found = self._found(front, scan, whole, last[1], lasting)
+        self._last = stamp, Cloud.of(whole)
         factor = self._scale_change(inputs, whole, dt, [lasting if found is None else found[0], np.zeros(3)])
         if found is None or last is None:
-            self._begin(front, scan, cloud, self._pose)
+            self._begin(front, scan, self._pose)
             self._motions.clear()
             self._standing = None
             self._changes.clear()
@@ -125,7 +125,7 @@ class ScanMotionStep:
         motion, overlap, fit, widened = found
         deviations = deviations_of(fit)
         self._pose = compose(self._pose, motion)
-        self._keep(front, scan, cloud)
+        self._keep(front, scan)
         if follows:
             changed = motion - lasting
             self._changes.append((float(changed[:2] @ changed[:2]), float(changed[2] ** 2)))
@@ -155,22 +155,22 @@ class ScanMotionStep:
             return None
         return self._scale.change(newest, [*motions, np.array(inputs.rolled)])
 
-    def _begin(self, front: KissFront | None, scan: Scan, cloud: Cloud, pose: Array) -> None:
-        self._reference = cloud, pose
+    def _begin(self, front: KissFront | None, scan: Scan, pose: Array) -> None:
+        self._reference = Cloud.of(scan), pose
         if front is not None:
             front.begin(scan, pose)
 
-    def _keep(self, front: KissFront | None, scan: Scan, whole: Cloud) -> None:
+    def _keep(self, front: KissFront | None, scan: Scan) -> None:
         if front is not None:
             front.keep(scan, self._pose)
         assert self._reference is not None
         moved = between(self._reference[1], self._pose)
         keep_way = 0.3  # maximum distance from the reference scan, m
         if math.hypot(moved[0], moved[1]) > keep_way or abs(moved[2]) > 0.35:  # maximum turn, rad
-            self._reference = whole, self._pose
+            self._reference = Cloud.of(scan), self._pose
 
     def _found(
-        self, front: KissFront | None, scan: Scan, whole: Scan, cloud: Cloud, before: Cloud, lasting: Array
+        self, front: KissFront | None, scan: Scan, whole: Scan, before: Cloud, lasting: Array
     ) -> tuple[Array, float, Fit, float] | None:
         """Return the motion since the previous scan, its overlap, fit and ``spread``; None if no motion fits.
 
@@ -178,23 +178,23 @@ class ScanMotionStep:
         its pose is only the start of the registration to the reference, whose pairs slide along surfaces.
         """
         assert self._reference is not None
-        reference, origin = self._reference
+        cloud, origin = self._reference
         guess = compose(self._pose, lasting)
         if front is not None:
             guess = front.match(scan, guess)
-        fit = register(whole, reference, between(origin, guess)) if np.isfinite(guess).all() else None
+        fit = register(scan, cloud, between(origin, guess)) if np.isfinite(guess).all() else None
         fits = 0.5  # minimum overlap of a valid motion with the previous scan
         if fit is not None and np.isfinite(fit.pose).all():
             motion = between(self._pose, compose(origin, fit.pose))
             overlap = measure(whole, before, motion).overlap
             if overlap >= fits:
-                return motion, overlap, fit, spread(fit, whole, reference)
+                return motion, overlap, fit, spread(fit, scan, cloud)
         # The velocity has changed, or the map holds objects that have gone.
         tries = [register(whole, before, start) for start in (np.zeros(3), lasting)]
         best = max(tries, key=lambda fit: fit.overlap)
         if best.overlap < fits:
             return None
-        self._begin(front, scan, cloud, compose(self._pose, best.pose))
+        self._begin(front, scan, compose(self._pose, best.pose))
         return best.pose, best.overlap, best, spread(best, whole, before)
 
     def _since(self, claim: Claim | None) -> tuple[int, Scan, Array] | None:
