@@ -226,8 +226,7 @@ class ConsistencyService:
                 self.monitor.observe_whole(DeviceRole.LIDAR, scan.stamp, whole)
                 work = self._work(setup, scan)
                 if work is None:
-                    if self._anew:
-                        self.monitor.observe_scan(StepOutput(scan.stamp, None))
+                    self.monitor.observe_scan(StepOutput(scan.stamp, None))
                     continue
                 output: StepOutput = await actor.step(work)
                 self._front = output.front
@@ -237,7 +236,8 @@ class ConsistencyService:
     def _work(self, setup: ScanSetup, scan: LaserScan) -> StepInput | None:
         """Return the worker's task for a scan; None if its plane is tilted.
 
-        A single tilted scan is only left out: the jolt of a contact looks like a tilt.
+        A single tilted scan ends the measured motion, but no evidence of standing: the jolt of a contact looks like a
+        tilt.
         """
         angles = None if setup.angles is None else setup.angles.at(scan)
         max_tilt = 0.1  # scans whose plane was tilted more than this are left out, rad: they show the ground
