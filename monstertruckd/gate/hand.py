@@ -3,6 +3,7 @@
 - The arm switch of the transmitter is a key: while it is off, the robot does not drive, even if another operator has
   armed it. Switching it from off to on is the order to arm.
 - While the arm switch and the drive switch (if fitted) are on, the sticks drive.
+- While the emergency stop switch is on, the robot stays emergency-stopped, whoever resets it.
 - Loss of the transmitter stops and disarms the robot, whichever source drives. After its return the arm switch must be
   seen off before it can arm the robot.
 """
@@ -64,7 +65,6 @@ class HandPolicy:
         self._config = config
         self._seen_off = False
         """Whether the arm switch has been off since the loss of the transmitter, or since the last order to arm."""
-        self._estop = False
         self._stopped_at: int | None = None
 
     def step(self, controls: HandControls | None, mode: GateMode | None, now: int) -> HandActions:
@@ -77,20 +77,17 @@ class HandPolicy:
         """
         lost = self._lost(controls, now)
         if lost is not None or controls is None:
-            self._seen_off = self._estop = False
+            self._seen_off = False
             return HandActions(self._stop(mode, now), lost=lost)
-        orders: tuple[Order, ...] = ()
-        if controls.estop and not self._estop:
-            orders = (Order.ESTOP,)
-        self._estop = controls.estop
+        orders = (Order.ESTOP,) if controls.estop and mode is not GateMode.ESTOPPED else ()
         if not controls.arm:
             self._seen_off = True
             return HandActions((*orders, *self._stop(mode, now)))
         self._stopped_at = None
-        if self._seen_off and mode is GateMode.DISARMED:
+        if self._seen_off and mode is GateMode.DISARMED and not controls.estop:
             orders = (*orders, Order.ARM)
         self._seen_off = False
-        return HandActions(orders, drives=controls.drive)
+        return HandActions(orders, drives=controls.drive and not controls.estop)
 
     def _lost(self, controls: HandControls | None, now: int) -> str | None:
         config = self._config

@@ -34,7 +34,7 @@ class ForkServer:
         self._sending = threading.Lock()
         """Held while a request is sent, or ``_waiting`` is used."""
         self._waiting: list[socket.socket] = []
-        """What ``fork`` has returned and ``forget`` was not told, in the order of the requests."""
+        """Forks that ``forget`` has not removed, in the order of the requests."""
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603  # our own interpreter and module
