@@ -71,12 +71,14 @@ def test_an_unknown_quality_is_no_loss_and_the_drive_switch_lets_others_drive():
     assert (found.orders, found.drives, found.lost) == ((Order.ARM,), False, None)
 
 
-def test_the_emergency_stop_is_ordered_once_for_each_time_it_is_switched_on():
+def test_the_emergency_stop_switch_holds_the_robot_though_another_client_resets_it():
     policy = HandPolicy(HandConfig())
     assert policy.step(controls(0, estop=True), GateMode.DRIVING, 0).orders[0] is Order.ESTOP
     assert Order.ESTOP not in policy.step(controls(1, estop=True), GateMode.ESTOPPED, 1).orders
-    policy.step(controls(2), GateMode.ESTOPPED, 2)
-    assert policy.step(controls(3, estop=True), GateMode.ESTOPPED, 3).orders == (Order.ESTOP,)
+    found = policy.step(controls(2, estop=True, arm=True), GateMode.DISARMED, 2)
+    assert (found.orders, found.drives) == ((Order.ESTOP,), False)
+    policy.step(controls(3), GateMode.DISARMED, 3)
+    assert policy.step(controls(4, arm=True), GateMode.DISARMED, 4).orders == (Order.ARM,)
 
 
 def test_nobody_outside_can_claim_to_be_the_hand():
