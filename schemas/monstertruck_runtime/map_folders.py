@@ -109,7 +109,8 @@ def write_save(
 ) -> Path | None:
     """Write a save with ``parts``, and with the previous save's files that are not ``owned``.
 
-    Once this returns, the save outlasts a power cut. The save before is kept, and one with the grid before.
+    Once this returns, the save outlasts a power cut. The save before is kept, one with the grid before, and
+    the latest map of the run before.
 
     Args:
         folder: folder of the map.
@@ -282,15 +283,24 @@ def _take_over(old: Path, new: Path) -> None:
 
 
 def _prune(saves: Path) -> None:
-    """Remove old saves, except the latest two and the latest of two grids that share no file."""
-    grids = set[int]()
+    """Remove all saves but the latest two, the latest of two grids that share no file, and another run's last map."""
+    grids, runs = set[int](), set[str]()
     for age, path in enumerate(numbered_saves(saves)):
         grid = {(path / YAML).stat().st_ino} if (path / YAML).exists() else set[int]()
-        another = len(grids) < 2 and not grid <= grids
+        run = {_run_of(path)} if grid else set[str]()
+        another = (len(grids) < 2 and not grid <= grids) or (len(runs) < 2 and not run <= runs)
         grids |= grid
+        runs |= run
         if age >= 2 and not another:
             doomed = path.rename(path.with_name(f"{path.name}{SCRATCH}"))  # no reader sees half a save
             shutil.rmtree(doomed)
+
+
+def _run_of(save: Path) -> str:
+    try:
+        return _manifest(save).run
+    except InputError:
+        return ""
 
 
 def _remove_leftovers(saves: Path) -> list[Path]:

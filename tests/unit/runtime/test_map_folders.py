@@ -75,6 +75,15 @@ def test_the_save_before_and_the_last_two_maps_are_kept(tmp_path: Path):
     assert saves(tmp_path) == ["000002", "000008", "000009"], "one whose grid is another file"
 
 
+def test_a_run_that_saves_often_leaves_the_map_of_the_run_before(tmp_path: Path):
+    write_save(tmp_path, grid("yesterday, early"), GRID, "yesterday")
+    write_save(tmp_path, grid("yesterday"), GRID, "yesterday")
+    for minute in range(5):
+        write_save(tmp_path, grid(f"minute {minute}"), GRID, "today")
+    assert saves(tmp_path) == ["000002", "000006", "000007"]
+    assert (tmp_path / SAVES / "000002" / YAML).read_text() == f"{YAML} yesterday"
+
+
 @pytest.mark.parametrize("name", [*GRID, MANIFEST])
 @pytest.mark.parametrize("harm", ["flip", "cut", "gone", "of another save"])
 def test_a_damaged_or_mixed_save_is_refused_for_the_one_before(tmp_path: Path, name: str, harm: str):
