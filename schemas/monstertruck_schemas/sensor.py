@@ -36,7 +36,7 @@ class LaserScan(Message):
     """Shape (n,): intensity of the returns in the sensor's own unit, 0 without a return; None if not measured."""
     tilt: Annotated[float, Field(ge=0)] | None = None
     """Angle between the scanning plane and the horizontal in the middle of the scan (rad); None if not measured."""
-    range_noise: Annotated[float, Field(ge=0)] | None = None
+    range_noise: Annotated[float, Field(ge=0, le=1)] | None = None
     """Standard deviation of a range close by (m), by the sensor's data sheet; None if it is not known."""
 
     @property

@@ -39,6 +39,11 @@ def test_a_scan_says_which_way_its_lidar_turns(start: float, end: float, step: f
     assert message.field == (-2.0, 2.0)
 
 
+def test_a_noise_that_would_make_every_range_worthless_is_refused():
+    with pytest.raises(ValidationError, match="range_noise"):
+        scan(np.ones(3), range_noise=1e6)
+
+
 def odometry(**changes: object) -> Odometry:
     values: dict[str, object] = {
         "pose": Pose2D(x=1.0, y=2.0, yaw=0.5),
