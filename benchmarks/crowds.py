@@ -11,7 +11,6 @@ last line is JSON.
 """
 
 import argparse
-import contextlib
 import json
 import math
 import sys
@@ -25,6 +24,7 @@ from scipy.ndimage import label
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.virtual_runs import goal_end
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import DistanceField
 from monstertruck_runtime.clock import VirtualClock, run_virtual
@@ -32,7 +32,6 @@ from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.map_files import FREE
 from monstertruck_schemas import topics
-from monstertruck_schemas.plan import GoalPhase
 from monstertruck_schemas.reasons import Reason
 from monstertruck_sim.world.built_in import BUILT_IN
 from monstertruckd.config.load import load_config
@@ -134,13 +133,7 @@ async def to_goal(rig: VirtualRig, operator: LocalOperator, goal: tuple[float, f
                         if refused.refusal is not Reason.GOAL_BLOCKED:
                             return str(refused.refusal.value)
                         await clock.sleep(5.0)
-                while True:
-                    state = await states.next()
-                    if state.number == number and state.phase is GoalPhase.IDLE:
-                        return str(state.outcome.value)
-                    if gate.latest is not None and not gate.latest.mode.active:
-                        with contextlib.suppress(RequestRefusedError):
-                            await operator.arm()
+                return await goal_end(number, operator, states, gate)
         except TimeoutError:
             return "late"
 

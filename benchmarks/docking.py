@@ -11,7 +11,6 @@ docked pose, and the true footprint touched nothing. The last line is JSON.
 """
 
 import argparse
-import contextlib
 import json
 import math
 import sys
@@ -24,21 +23,16 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.virtual_runs import behaviour_run
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import compose
 from monstertruck_planners.collision import DistanceField, Footprint
-from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruck_runtime.mailbox import fifo
+from monstertruck_runtime.clock import SECOND, run_virtual
 from monstertruck_runtime.map_files import OCCUPIED
-from monstertruck_schemas.plan import BehaviourState
 from monstertruck_schemas.reasons import Reason
-from monstertruck_schemas.req import BehaviourOrder
-from monstertruck_schemas.topics import BEHAVIOUR
 from monstertruck_sim.world.built_in import BUILT_IN
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
-from monstertruckd.tools.simulation.operator import LocalOperator
-from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "dock.yaml"
 WORLDS = ("rooms", "workshop", "hall")
@@ -128,7 +122,9 @@ def trial(seed: int, direction: str) -> dict[str, Any]:
     if direction == "reverse":
         overlay["slam"] = {"mode": "mapping"}
     config = with_overlay(load_config(CONFIG, SimulatedTruckConfig)[0], overlay)
-    states, truth = run_virtual(lambda clock: dock(config, clock), start=SECOND)
+    states, truth = run_virtual(
+        lambda clock: behaviour_run(config, "dock", clock, settle=3.0, limit=LIMIT), start=SECOND
+    )
     end, last = states[-1], truth[-1, 1:4]
     off = math.dist(last[:2], docked[:2])
     turn = abs(math.degrees(math.remainder(float(last[2] - docked[2]), math.tau)))
@@ -140,25 +136,6 @@ def trial(seed: int, direction: str) -> dict[str, Any]:
         "attempts": end.values.get("attempt", 0.0), "seconds": round(end.elapsed, 1),
         "light": {name: round(value, 2) for name, value in light.items()},
     }  # fmt: skip
-
-
-async def dock(config: SimulatedTruckConfig, clock: VirtualClock) -> tuple[list[BehaviourState], Array]:
-    """Run the behaviour to its end; returns its states and the truth."""
-    rig, seen = VirtualRig(config, clock), []
-    with rig.bus.subscribe(BEHAVIOUR, fifo(4096)) as states:
-        async with rig.running():
-            operator = LocalOperator(rig.daemon, clock)
-            await clock.sleep(3.0)
-            await operator.arm()
-            number = int((await operator.behave(BehaviourOrder.START, "dock"))["number"])
-            with contextlib.suppress(TimeoutError):
-                async with clock.deadline(LIMIT):
-                    async for state in states:
-                        seen += [state] if state.number == number else []
-                        if seen and not seen[-1].running:
-                            break
-            await clock.sleep(1.0)
-            return seen, rig.truth.array()
 
 
 def main() -> None:

@@ -26,13 +26,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.scoring import distance, map_error, rms
+from benchmarks.virtual_runs import goal_end
 from monstertruck_planners.collision import DistanceField
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
-from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.map_files import FREE, OCCUPIED
 from monstertruck_schemas import topics
-from monstertruck_schemas.plan import ExplorationState, GoalPhase
+from monstertruck_schemas.plan import ExplorationState
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ExploreOrder
 from monstertruck_schemas.state import Grid
@@ -162,16 +162,10 @@ async def to_goal(rig: VirtualRig, operator: LocalOperator, x: float, y: float, 
     with rig.bus.subscribe(topics.GOAL, fifo(4096)) as states, rig.bus.subscribe(topics.GATE, latest()) as gate:
         await operator.arm()
         request = {**await operator.header(), "frame": "map", "goal": {"x": x, "y": y, "yaw": yaw}, "waypoints": []}
-        await operator.call("goal", request)
+        number = int((await operator.call("goal", request))["number"])
         try:
             async with clock.deadline(240.0):
-                while True:
-                    state = await states.next()
-                    if state.phase is GoalPhase.IDLE and state.outcome is not Reason.OK:
-                        return str(state.outcome.value)
-                    if gate.latest is not None and not gate.latest.mode.active:
-                        with contextlib.suppress(RequestRefusedError):
-                            await operator.arm()
+                return await goal_end(number, operator, states, gate)
         except TimeoutError:
             return "late"
 

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from benchmarks.virtual_runs import behaviour_run
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import TruckError
@@ -96,27 +97,11 @@ def lap(behaviour: str, side: str, seed: int, model: str) -> DaemonLap:
     with TemporaryDirectory() as folder:
         overlay = {"behaviours": {name: own}, "sim": {"world": {"sonar": {"model": model}}}}
         config = robot(Path(folder), walls, start, seed, **overlay)
-        states, truth = run_virtual(lambda clock: _lap(config, name, clock), start=SECOND)
+        states, truth = run_virtual(
+            lambda clock: behaviour_run(config, name, clock, settle=SETTLED, limit=LIMIT), start=SECOND
+        )
     end = states[-1]
     return DaemonLap(end.outcome, end.text, bool(truth[:, 5].any()), end.elapsed, _track(truth, states, side))
-
-
-async def _lap(config: Any, name: str, clock: VirtualClock) -> tuple[list[BehaviourState], Array]:
-    rig, seen = VirtualRig(config, clock), []
-    with rig.bus.subscribe(BEHAVIOUR, fifo(4096)) as states:
-        async with rig.running():
-            operator = LocalOperator(rig.daemon, clock)
-            await clock.sleep(SETTLED)
-            await operator.arm()
-            number = int((await operator.behave(BehaviourOrder.START, name))["number"])
-            with contextlib.suppress(TimeoutError):
-                async with clock.deadline(LIMIT):
-                    async for state in states:
-                        seen += [state] if state.number == number else []
-                        if seen and not seen[-1].running:
-                            break
-            await clock.sleep(1.0)
-            return seen, rig.truth.array()
 
 
 def _track(truth: Array, states: list[BehaviourState], side: str) -> Array:
