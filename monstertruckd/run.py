@@ -9,7 +9,7 @@ from pathlib import Path
 
 from monstertruck_runtime import wire
 from monstertruck_runtime.clock import Clock, run_wall
-from monstertruck_runtime.errors import PortBusyError
+from monstertruck_runtime.errors import PortBusyError, first_of
 from monstertruck_runtime.map_folders import tidy
 from monstertruck_runtime.memory import settle
 from monstertruck_runtime.small_files import remove_leftovers
@@ -58,7 +58,7 @@ def run_daemon(config_file: Path, *, verbose: bool) -> Reason:
     try:
         run_wall(main)
     except BaseExceptionGroup as group:
-        if (busy := _first(group.subgroup(PortBusyError))) is not None:
+        if (busy := first_of(group, PortBusyError)) is not None:
             raise busy from None
         log.exception("ended by a bug; the actuators were stopped")
         return Reason.INTERNAL
@@ -78,10 +78,3 @@ def clean_up(config: TruckConfig) -> None:
                 log.info("%s: removed; a program was killed while it wrote it", file)
         except OSError as error:
             log.warning("%s: files of killed programs cannot be removed: %s", folder, error.strerror)
-
-
-def _first(error: BaseException | None) -> BaseException | None:
-    """First plain exception in a tree of groups."""
-    while isinstance(error, BaseExceptionGroup):
-        error = error.exceptions[0]
-    return error

@@ -93,6 +93,8 @@ class RclpyNode:
         self.distributions: Sequence[str] = (distribution_here(),)
         self.missing: set[str] = set()
         """Interfaces that are not installed."""
+        self._undiscovered: dict[str, asyncio.TimerHandle] = {}
+        """Timers of latched messages whose publisher is not known yet, by topic."""
 
     async def __aenter__(self) -> Self:
         """Join the graph.
@@ -132,6 +134,8 @@ class RclpyNode:
 
     async def __aexit__(self, *_: object) -> None:
         """Leave the graph."""
+        for waiting in self._undiscovered.values():
+            waiting.cancel()
 
         def leave() -> None:
             for participant in self._participants:
@@ -188,16 +192,22 @@ class RclpyNode:
             sender, gid = self._publisher_of(topic)
             number, stamp = info["publication_sequence_number"], info["source_timestamp"]
             arrival = RosArrival(message, sender, gid, int(number or 0), int(stamp))
-            if sender is None and qos.latched:  # sent once, perhaps before the graph has its publisher
-                self._loop.call_soon_threadsafe(self._loop.call_later, 1.0, self._discovered, topic, take, arrival)
+            self._loop.call_soon_threadsafe(arrive, arrival)
+
+        def arrive(arrival: RosArrival) -> None:
+            if (waiting := self._undiscovered.pop(topic, None)) is not None:
+                waiting.cancel()
+            if arrival.sender is None and qos.latched:  # sent once, perhaps before the graph has its publisher
+                self._undiscovered[topic] = self._loop.call_later(1.0, self._discovered, topic, take, arrival)
             else:
-                self._loop.call_soon_threadsafe(take, arrival)
+                take(arrival)
 
         # A queue of 1: only the latest of the waiting messages is used.
         profile = _profile(RosQos(depth=1, reliable=qos.latched, latched=qos.latched))
         self._node_for(topic, interface).create_subscription(kind, topic, receive, profile, raw=True)
 
     def _discovered(self, topic: str, take: Take, arrival: RosArrival) -> None:
+        del self._undiscovered[topic]
         sender, gid = self._publisher_of(topic)
         take(replace(arrival, sender=sender, publisher=gid))
 

@@ -2,9 +2,11 @@
 
 import errno
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 from monstertruck_schemas.reasons import Reason
+
+E = TypeVar("E", bound=BaseException)
 
 
 class TruckError(Exception):
@@ -167,3 +169,11 @@ class WorkerTimeoutError(WorkerError):
 def disk_reason(error: OSError) -> Reason:
     """Reason of a failed write: disk full or another failure."""
     return Reason.DISK_FULL if error.errno in {errno.ENOSPC, errno.EDQUOT} else Reason.RECORDING_FAILED
+
+
+def first_of(error: BaseException, kind: type[E]) -> E | None:
+    """First exception of a kind in a tree of groups, which may be the exception itself; None without one."""
+    if isinstance(error, BaseExceptionGroup):
+        found = (first_of(each, kind) for each in error.exceptions)
+        return next((each for each in found if each is not None), None)
+    return error if isinstance(error, kind) else None

@@ -287,7 +287,7 @@ def _prune(saves: Path) -> None:
     grids, runs = set[int](), set[str]()
     for age, path in enumerate(numbered_saves(saves)):
         grid = {(path / YAML).stat().st_ino} if (path / YAML).exists() else set[int]()
-        run = {_run_of(path)} if grid else set[str]()
+        run = _runs_of(path) if grid else set[str]()
         another = (len(grids) < 2 and not grid <= grids) or (len(runs) < 2 and not run <= runs)
         grids |= grid
         runs |= run
@@ -296,11 +296,12 @@ def _prune(saves: Path) -> None:
             shutil.rmtree(doomed)
 
 
-def _run_of(save: Path) -> str:
+def _runs_of(save: Path) -> set[str]:
+    """The run of a save; none if its manifest is damaged."""
     try:
-        return _manifest(save).run
+        return {_manifest(save).run}
     except InputError:
-        return ""
+        return set()
 
 
 def _remove_leftovers(saves: Path) -> list[Path]:

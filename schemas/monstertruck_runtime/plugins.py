@@ -21,7 +21,7 @@ from pydantic import BaseModel, GetCoreSchemaHandler, TypeAdapter, ValidationErr
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, core_schema
 
-from monstertruck_runtime.errors import InputError, TruckError
+from monstertruck_runtime.errors import InputError, TruckError, first_of
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.entry_points import ExtensibleTable
 
@@ -96,12 +96,11 @@ class Plugin:
             InputError: see ``callable_at``; or it takes other arguments.
         """
         make = self.callable_at(place)
-        signature = inspect.signature(make)
         try:
-            signature.bind(*arguments, **named)
-        except TypeError as error:
+            inspect.signature(make).bind(*arguments, **named)
+        except (TypeError, ValueError) as error:
             given = ", ".join([*(type(one).__name__ for one in arguments), *(f"{name}=" for name in named)])
-            text = f"expected to be called with ({given}), found {signature}: {error}"
+            text = f"expected to be called with ({given}), found {make!r}: {error}"
             raise InputError(f"kind {self.name}: {place}: {text}") from error
         with self.refusing(place):
             return make(*arguments, **named)
@@ -115,12 +114,10 @@ class Plugin:
         """
         try:
             yield
-        except TruckError:
-            raise
         except Exception as error:
-            cause = error
-            while isinstance(cause, ExceptionGroup):  # raised in a task
-                cause = cause.exceptions[0]
+            if (ours := first_of(error, TruckError)) is not None:
+                raise ours from None
+            cause = first_of(error, Exception) or error
             frame = traceback.extract_tb(cause.__traceback__)[-1]
             text = f"{frame.filename}:{frame.lineno}: {type(cause).__name__}: {cause}"
             raise InputError(f"kind {self.name}: {place}: {text}") from error

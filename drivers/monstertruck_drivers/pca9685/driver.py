@@ -157,12 +157,12 @@ class Pca9685Driver:
         if not set_up:
             self._restarted()
         if lost:
-            if not self._failing:
+            if self._failing:
+                await self._require_rest(session, differ)
+            else:
                 what = f"channels {differ} differ" if set_up else "mode or frequency lost"
                 text = f"the PCA9685 reads back otherwise ({what}): settings and pulses sent again"
                 self._events(Reason.DEVICE_FAULT, Severity.WARNING, self.name, text)
-            if self._failing:
-                await self._require_rest(session, differ)
             await session.set_up(config.prescale)
             await self._write(session, dict(self._sent) | self._more(rest=self._command is None or self._stale))
         self._failing = lost

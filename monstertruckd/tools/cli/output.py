@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol, TextIO, cast
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from monstertruck_runtime.errors import RequestRefusedError, TruckError, disk_reason
+from monstertruck_runtime.errors import RequestRefusedError, TruckError, disk_reason, first_of
 from monstertruck_schemas.reasons import Reason
 
 if TYPE_CHECKING:
@@ -267,15 +267,6 @@ def until_stopped(main: "Callable[[WallClock], Coroutine[Any, Any, None]]") -> N
         run_wall(main)
 
 
-def _expected(group: BaseExceptionGroup[BaseException]) -> TruckError | None:
-    """First expected error in a tree of groups; None without one."""
-    for error in group.exceptions:
-        found = _expected(error) if isinstance(error, BaseExceptionGroup) else error
-        if isinstance(found, TruckError):
-            return found
-    return None
-
-
 class NumberCommand(TyperCommand):
     """One command: refuses nan, which passes every comparison with a least or greatest value, before anything runs."""
 
@@ -352,7 +343,7 @@ class CommandGroup(TyperGroup):
             with _usage_in_one_line():
                 return super().invoke(ctx)
         except BaseExceptionGroup as group:
-            raise _expected(group) or group from None
+            raise first_of(group, TruckError) or group from None
         finally:
             if sys.stdout is not None:
                 sys.stdout.flush()

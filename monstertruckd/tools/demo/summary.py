@@ -114,8 +114,7 @@ class Summary:
     def _closing_row(self) -> list[tuple[str, str]]:
         if not self.closed:
             return []
-        # Maximum true closing error of the lap, m.
-        return [("true closing error", f"{self.closing_error * 100:.1f} cm (goal {0.3 * 100:.0f} cm)")]
+        return [("true closing error", f"{self.closing_error * 100:.1f} cm (goal 30 cm)")]
 
     def as_json(self) -> dict[str, object]:
         """Everything as plain data."""

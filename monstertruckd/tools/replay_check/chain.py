@@ -15,7 +15,7 @@ from monstertruck_planners.track.paths import PathService
 from monstertruck_runtime import wire
 from monstertruck_runtime.actors.actor import use_delivery
 from monstertruck_runtime.clock import SECOND
-from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError
+from monstertruck_runtime.errors import InputError, NotFoundError, RequestRefusedError, TruckError, first_of
 from monstertruck_runtime.ports import Publisher
 from monstertruck_runtime.service import Service
 from monstertruck_schemas import topics
@@ -216,7 +216,7 @@ class Chain:
                     for task in running:
                         task.cancel()
         except* TruckError as group:
-            raise _first(group) from None
+            raise first_of(group, BaseException) or group from None
 
     async def take(self, topic: Topic[Message], message: Message, log_time: int) -> None:
         """Hand over an input, recorded at ``log_time``, ns."""
@@ -367,10 +367,3 @@ def _near(instants: Sequence[int], stamp: int) -> int | None:
 
 def _nothing() -> None:
     """Readiness is of no interest here."""
-
-
-def _first(group: BaseExceptionGroup[Any]) -> BaseException:
-    error: BaseException = group
-    while isinstance(error, BaseExceptionGroup):
-        error = error.exceptions[0]
-    return error

@@ -39,7 +39,7 @@ class StandingWatch:
     """
 
     def __init__(self, slip: float, delay: float) -> None:
-        self._rolls_at_least = 1.0 - slip
+        self._slip = slip
         self._delay = round(delay * SECOND)
         self._velocity: Array | None = None
         self._steady_since = 0
@@ -59,7 +59,7 @@ class StandingWatch:
         """
         velocity, before = rolled / (stamp - since) * SECOND, self._velocity
         self._velocity, speed = velocity, float(np.linalg.norm(velocity))
-        if before is None or not np.linalg.norm(velocity - before) < (1.0 - self._rolls_at_least) * speed:
+        if before is None or not np.linalg.norm(velocity - before) < self._slip * speed:
             self._places.clear()
             self._steady_since = stamp
             return None
@@ -82,7 +82,7 @@ class StandingWatch:
             free = len(rolled) - columns.shape[1] - 1
             if free < FREE:
                 continue
-            sides = np.column_stack((places, places - self._rolls_at_least * after))
+            sides = np.column_stack((places, places - (1.0 - self._slip) * after))
             coefficients = np.linalg.lstsq(columns, sides, rcond=None)[0]
             stands, rolls = ((sides - columns @ coefficients) ** 2).sum(axis=0).tolist()
             likelier = (rolls - stands) * (FREE + free) / (FREE * float(variances.mean()) + stands)

@@ -156,7 +156,7 @@ class GlobalLocaliser:
             if not self._due:
                 return None
             self._due, self._running = False, PiecewiseSearch(self._search())
-        # Share of ``BUDGET`` that one scan spends on the search, 14 to 18 ms: the local map searches for loops as well.
+        # Share of ``Work.SCAN`` for the search, 14 to 18 ms a scan: the local map searches for loops as well.
         share = 0.7
         if not self._running.run(ScanBudget(share * Work.SCAN)):
             return None

@@ -251,8 +251,8 @@ class DeformStep:
     def _observe(self, setup: Setup, task: DeformTask) -> tuple[Array, NDArray[np.bool_], tuple[Walker, ...]]:
         """Add a scan to the window; return the obstacles in base, which of them the map explains, and the walkers.
 
-        The obstacles are the scan points and, outside the view of the lidar and at blind beams, earlier ones. Walkers
-        are none while the robot lets them pass.
+        The obstacles are the scan points and, outside the view of the lidar and at blind beams, earlier ones. Points
+        of walkers are no obstacles while the robot lets them pass.
         """
         pose, points = task.pose, scan_points_at(task.scan, setup.lidar, task.stamp, task.twist)
         (sensor,) = placed(np.array([setup.lidar]), pose)

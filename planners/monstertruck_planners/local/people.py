@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import points_relative
-from monstertruck_planners.collision import Footprint
+from monstertruck_planners.collision import Footprint, rectangle_distance
 from monstertruck_planners.local.config import PeopleConfig
 from monstertruck_runtime.clock import SECOND
 
@@ -152,21 +151,11 @@ def meets(
         distance: kept between outline and person (m).
         spread: growth of a person's disc with time (m/s).
     """
-    here = tuple(poses[0].tolist())
     for walker in walkers:
         places = walker.at(times)
         limits = distance + walker.radius + spread * times
-        away = np.array([_beyond(footprint, places[i], poses[i]) for i in range(len(times))])
-        standing = np.array([_beyond(footprint, place, here) for place in places])
+        away = np.diagonal(rectangle_distance(footprint, poses, places))
+        (standing,) = rectangle_distance(footprint, poses[:1], places)
         if ((away < limits) & (away < standing - 1e-3)).any():
             return True
     return False
-
-
-def _beyond(footprint: Footprint, point: Array, pose: Array | tuple[float, ...]) -> float:
-    """Return the distance of a point (2,) from the outline at a pose (m); 0 inside."""
-    x, y, yaw = (float(value) for value in pose)
-    ((along, across),) = points_relative(point[None], (x, y, yaw)).tolist()
-    return math.hypot(
-        max(abs(along - footprint.offset) - footprint.half_length, 0.0), max(abs(across) - footprint.half_width, 0.0)
-    )

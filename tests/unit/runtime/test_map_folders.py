@@ -80,6 +80,8 @@ def test_a_run_that_saves_often_leaves_the_map_of_the_run_before(tmp_path: Path)
     write_save(tmp_path, grid("yesterday"), GRID, "yesterday")
     for minute in range(5):
         write_save(tmp_path, grid(f"minute {minute}"), GRID, "today")
+        if minute == 1:
+            (tmp_path / SAVES / "000003" / MANIFEST).write_text("damaged")
     assert saves(tmp_path) == ["000002", "000006", "000007"]
     assert (tmp_path / SAVES / "000002" / YAML).read_text() == f"{YAML} yesterday"
 

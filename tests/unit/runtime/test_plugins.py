@@ -10,7 +10,7 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from monstertruck_runtime.actors.remote import StepCodec
-from monstertruck_runtime.errors import InputError
+from monstertruck_runtime.errors import DeviceLostError, InputError
 from monstertruck_runtime.plugins import Catalog, Plugin, classes_in, kind_of
 from monstertruck_schemas.base import Schema
 from tests.plugin_kit import install
@@ -185,6 +185,17 @@ def test_a_mistake_in_a_task_is_named():
     refused = r"kind ball: here: \S+test_plugins\.py:\d+: ValueError: two motors"
     with pytest.raises(InputError, match=refused), plugin.refusing("here"):
         asyncio.run(main())
+
+
+def test_an_expected_failure_of_a_task_is_no_mistake_of_the_plug_in():
+    lost = DeviceLostError("cable pulled")
+    with pytest.raises(DeviceLostError, match="cable pulled"), row("ball", "BallConfig", "").refusing("here"):
+        raise ExceptionGroup("tasks", [ExceptionGroup("tasks", [ValueError("closed"), lost])])
+
+
+def test_a_callable_without_a_signature_is_named():
+    with pytest.raises(InputError, match=r"kind ball: builtins:dict: expected to be called with"):
+        row("ball", "BallConfig", "builtins:dict").build(BallConfig())
 
 
 def test_settings_without_a_default_are_named():

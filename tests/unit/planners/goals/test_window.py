@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from monstertruck_planners.collision import DistanceField
+from monstertruck_planners.collision import DistanceField, Footprint
 from monstertruck_planners.goals.config import WindowConfig
 from monstertruck_planners.goals.deform_step import Window
 from monstertruck_runtime.errors import InputError
@@ -73,6 +73,21 @@ def test_obstacles_are_thick_where_nobody_looked_behind_them():
     thin = Window(WindowConfig(thickness=0.0))
     scan(thin, 1.0)
     assert thin.field().lookup(behind)[0] > 0.04
+
+
+def test_discs_close_the_cells_around_places_but_not_those_under_the_robot():
+    window, footprint = Window(), Footprint()
+    scan(window, 1.0)
+    places = np.array([(0.8, 0.0), (0.3, 0.0)])
+    closed = window.discs(places, 0.2, footprint, (0.0, 0.0, 0.0))
+    away = np.hypot(*(window_middles(window, closed) - places[0]).T)
+    assert away.max() < 0.2
+    assert closed.sum() * window.config.resolution**2 == pytest.approx(math.pi * 0.2**2, rel=0.1)
+
+
+def window_middles(window, cells):
+    """Middles of the marked cells, m."""
+    return (np.argwhere(cells)[:, ::-1] + 0.5) * window.config.resolution + window.corner
 
 
 def test_a_scan_of_unequal_shapes_is_refused():

@@ -43,6 +43,14 @@ def test_a_person_who_walks_is_measured(vx: float, vy: float):
     assert walking.all()
 
 
+def test_a_person_who_was_hidden_for_a_moment_is_followed_on():
+    rng, tracker = np.random.default_rng(1), PeopleTracker(PeopleConfig())
+    for i in range(14):
+        points = np.zeros((0, 2)) if i in (11, 12) else seen(2.0, -0.5 + 0.08 * i, rng)
+        walkers, _ = tracker.observe(i * SECOND // 10, points, np.zeros(len(points), np.bool_), SENSOR)
+        assert len(walkers) == (i >= 4 and len(points) > 0), "half of the memory shows a velocity"
+
+
 def test_a_person_who_stands_or_was_seen_too_shortly_is_an_obstacle():
     assert followed(0.0, 0.0)[0] == ()
     assert followed(0.0, 0.8, scans=3)[0] == ()
