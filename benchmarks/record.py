@@ -2,8 +2,9 @@
 
     python benchmarks/record.py NAME --measures PATH [PATH ...] -- benchmarks/deaths.py --trials 20
 
-NAME is that of the file. The benchmark's last line gives figures and goals; Markdown tables in its output become the
-tables ``1``, ``2`` ... Pages that link them show them on the site.
+A benchmark that runs as a module is given as ``-m benchmarks.thesis``. NAME is that of the file. The benchmark's last
+line gives figures and goals; Markdown tables in its output become the tables ``1``, ``2`` ... Pages that link them show
+them on the site.
 """
 
 import argparse
@@ -32,6 +33,15 @@ def tables(output: str) -> dict[str, list[list[str]]]:
         if line.strip("|-: ") or not rows:
             rows.append([cell.strip() for cell in line.strip().strip("|").split("|")])
     return found
+
+
+def program(command: str) -> Path:
+    """Return the file of the benchmark that ``command`` runs."""
+    _, first, *rest = command.split()
+    if first != "-m":
+        return ROOT / first
+    place = ROOT.joinpath(*rest[0].split("."))
+    return place / "__main__.py" if place.is_dir() else place.with_suffix(".py")
 
 
 def record(output: str, command: str, measures: list[str], commit: str, machine: str) -> dict[str, Any]:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 os.environ["NO_MKDOCS_2_WARNING"] = "1"  # before the theme loads: its makers' announcement is none of the build's
 
+sys.path.insert(1, str(Path(__file__).resolve().parents[2]))  # the pages read benchmarks/
+
 from mkdocs.__main__ import cli
 
 if __name__ == "__main__":

@@ -1,26 +1,34 @@
 """Measured figures: one file a benchmark in ``docs/figures``, included in the pages by name.
 
 On the site a paragraph ``[Figures](figures/FILE.json)`` becomes the figures and goals of a file, and
-``[Figures](figures/FILE.json "TABLE")`` one of its tables. A test fails if a page of ``OWNED`` holds a measured number.
+``[Figures](figures/FILE.json "TABLE")`` one of its tables. Tests fail if a page holds a measured number itself.
 """
 
 import json
 import re
-from collections.abc import Iterable, Iterator
+import subprocess
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.older_figures import commits_since
 from pages.markdown import Page, join, table
 
 DOCS = Path(__file__).resolve().parents[2]
 FOLDER = DOCS / "figures"
-OWNED = ("benchmarks.md", "safety-case.md")
-"""Pages whose measured numbers all come from files."""
 LINK = re.compile(r'^\[Figures\]\(figures/(?P<file>\w+)\.json(?: "(?P<table>\w+)")?\)$', re.MULTILINE)
-NOT_PROSE = re.compile(r"^```.*?^```|`[^`\n]*`|\]\([^)]*\)|<!--.*?-->", re.MULTILINE | re.DOTALL)
+NOT_PROSE = re.compile(r"^```.*?^```|`[^`\n]*`|^    [^\n]*$|\]\([^)]*\)|<!--.*?-->", re.MULTILINE | re.DOTALL)
 UNITS = r"(?:[num]?s|%|[kM]?B|[cm]?m|x|Hz|rad|degrees|seconds|minutes|metres)"
 NUMBER = re.compile(rf"(?<![\w.-])\d[\d ]*(?:\.\d+)? ?{UNITS}(?![\w-])")
+RESULT = re.compile(rf"{NUMBER.pattern}|(?<![\w.-])\d+\.\d+(?![\w.-])|\b\d+ of \d+\b")
+"""A number with a unit, a decimal fraction or a count of a whole."""
+CELL = re.compile(r"(?<![\w.-])\d[\d.]*(?!\w)")
+"""A number of a table."""
+MEASURED = re.compile(r"#+ (Measured\b|Benchmarks$|Safety case$|.*, measured$)", re.MULTILINE)
+"""Heading of a section that shows results only."""
+BENCHMARK = re.compile(r"\bbenchmarks[/.]\w")
+"""What a paragraph names that shows results."""
 EXEMPT_COLUMNS = re.compile(r"goals?|condition|judged by")
 """Headings of columns that hold what is required, not what was measured."""
 
@@ -49,8 +57,13 @@ class Figures:
 
     @property
     def source(self) -> str:
-        """Sentence that names command, commit and machine."""
-        return f"Measured by `{self.command}` at {self.commit}, {self.machine}."
+        """Sentences that name command, commit and machine, and the commits since that changed the measured code."""
+        try:
+            later = commits_since(self.commit, self.measures)
+        except (OSError, LookupError, subprocess.CalledProcessError):
+            later = 0  # no clone, or a shallow one
+        older = f" {later} later commit{'s' * (later > 1)} changed the measured code." if later else ""
+        return f"Measured by `{self.command}` at {self.commit}, {self.machine}.{older}"
 
 
 def read(file: Path) -> Figures:
@@ -98,9 +111,24 @@ def pages() -> Iterator[Page]:
 
 
 def unowned(markdown: str) -> list[str]:
-    """Return the numbers with units that stand outside code and columns of requirements."""
-    text = NOT_PROSE.sub("", markdown)
-    return [found[0] for line in _without_requirements(text.splitlines()) for found in NUMBER.finditer(line)]
+    """Return the results that paragraphs on measurements hold outside code and columns of requirements."""
+    lines = (line for results, block in _blocks(markdown) if results for line in _prose(block))
+    return [found[0] for line in lines for found in (CELL if line.startswith("|") else RESULT).finditer(line)]
+
+
+def stated(markdown: str) -> set[str]:
+    """Return the numbers with units of all other paragraphs: settings, limits and facts."""
+    blocks = (block for results, block in _blocks(markdown) if not results)
+    return {found[0] for block in blocks for line in _prose(block) for found in NUMBER.finditer(line)}
+
+
+def _blocks(markdown: str) -> Iterator[tuple[bool, str]]:
+    """Yield each paragraph, and whether it shows results."""
+    measured = False
+    for block in NOT_PROSE.sub(lambda found: found[0].replace("\n\n", "\n"), markdown).split("\n\n"):
+        if block.startswith("#"):
+            measured = MEASURED.match(block) is not None
+        yield measured or BENCHMARK.search(block) is not None, block
 
 
 def _values(figures: Figures) -> list[list[str]]:
@@ -123,9 +151,10 @@ def _text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _without_requirements(lines: Iterable[str]) -> Iterator[str]:
+def _prose(markdown: str) -> Iterator[str]:
+    """Yield the lines outside code and columns of requirements."""
     exempt: set[int] | None = None
-    for line in lines:
+    for line in NOT_PROSE.sub("", markdown).splitlines():
         if not line.startswith("|"):
             exempt = None
             yield line
@@ -133,4 +162,4 @@ def _without_requirements(lines: Iterable[str]) -> Iterator[str]:
         cells = line.strip("|").split("|")
         if exempt is None:
             exempt = {n for n, cell in enumerate(cells) if EXEMPT_COLUMNS.fullmatch(cell.strip())}
-        yield "|".join(cell for n, cell in enumerate(cells) if n not in exempt)
+        yield "|" + "|".join(cell for n, cell in enumerate(cells) if n not in exempt)

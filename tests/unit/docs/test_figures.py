@@ -7,12 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.record import record, tables
+from benchmarks.record import program, record, tables
 
 ROOT = Path(__file__).resolve().parents[3]
 DOCS = ROOT / "docs"
 FILES = sorted((DOCS / "figures").glob("*.json"))
 PAGES = sorted(page for page in DOCS.glob("*.md") if "\n[Figures](" in page.read_text(encoding="utf-8"))
+HISTORY = {"errata.md"}
+"""Pages that quote figures of others; decision records quote those of their date."""
+JUDGED = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *(p for p in sorted(DOCS.glob("*.md")) if p.name not in HISTORY),
+]
+STATED = ROOT / "tests" / "data" / "stated_numbers.json"
+"""Numbers with units that pages state: settings, limits, conditions and facts of devices, none of them a result."""
 
 
 @pytest.fixture
@@ -38,15 +47,27 @@ def test_a_link_shows_one_table_or_the_figures_with_their_source(figures):
     assert "\n\nMeasured by `python benchmarks/loop.py" in shown
 
 
-def test_owned_pages_hold_no_other_measured_number(figures):
-    for name in figures.OWNED:
-        assert figures.unowned((DOCS / name).read_text(encoding="utf-8")) == [], name
+@pytest.mark.parametrize("page", JUDGED, ids=lambda page: page.name)
+def test_no_page_holds_a_result_itself(page: Path, figures):
+    assert figures.unowned(page.read_text(encoding="utf-8")) == [], "a result comes from a file in docs/figures"
+
+
+def test_other_numbers_of_the_pages_are_known_to_be_no_results(figures, tmp_path: Path):
+    found = {page.name: sorted(figures.stated(page.read_text(encoding="utf-8"))) for page in JUDGED}
+    now = tmp_path / STATED.name
+    now.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    known = json.loads(STATED.read_text(encoding="utf-8"))
+    new = {name: sorted(set(numbers) - set(known.get(name, []))) for name, numbers in found.items()}
+    assert {name: numbers for name, numbers in new.items() if numbers} == {}, (
+        "measured: record it in docs/figures and link it (docs/benchmarks.md); a setting, a limit or a fact: "
+        f"cp {now} {STATED}"
+    )
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_a_file_names_its_command_its_commit_and_the_code_it_measures(file: Path, figures):
     found = figures.read(file)
-    assert (ROOT / found.command.split()[1]).is_file()
+    assert program(found.command).is_file()
     assert found.machine
     assert found.commit
     assert found.measures
@@ -56,8 +77,45 @@ def test_a_file_names_its_command_its_commit_and_the_code_it_measures(file: Path
 
 
 def test_a_measured_number_of_a_page_is_found(figures):
-    text = "Takes 3.5 ms, with `--seconds 5 s`.\n\n| run | goal | result |\n|---|---|---|\n| a | 4 s | 12 % |\n"
-    assert figures.unowned(text) == ["3.5 ms", "12 %"]
+    table = "| run | goal | result |\n|---|---|---|\n| a | 4 s | 12 |\n"
+    text = f"## Measured\n\nTakes 3.5 ms in 7 of 8 runs, with `--seconds 5 s`.\n\n{table}\n## Limits\n\nAt most 2 s.\n"
+    assert figures.unowned(text) == ["3.5 ms", "7 of 8", "12"]
+    assert figures.stated(text) == {"2 s"}
+    assert figures.unowned("`python benchmarks/x.py`: 1.08 times as far.") == ["1.08"]
+
+
+def test_figures_older_than_their_code_are_shown_with_the_number_of_changes(figures, monkeypatch: pytest.MonkeyPatch):
+    found = figures.read(FILES[0])
+    monkeypatch.setattr(figures, "commits_since", lambda commit, measures: 2)
+    assert found.source.endswith(f"{found.machine}. 2 later commits changed the measured code.")
+    monkeypatch.setattr(figures, "commits_since", lambda commit, measures: 0)
+    assert found.source.endswith(f"{found.machine}.")
+
+
+def test_every_commit_of_a_file_is_in_the_history():
+    if (
+        subprocess.run(
+            ["git", "rev-parse", "--is-shallow-repository"], cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout
+        != "false\n"
+    ):
+        pytest.skip("a shallow clone")
+    commits = {file.stem: json.loads(file.read_text(encoding="utf-8"))["commit"] for file in FILES}
+    there = subprocess.run(
+        ["git", "cat-file", "--batch-check=%(objecttype)"],
+        cwd=ROOT,
+        input="\n".join(commits.values()),
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.splitlines()
+    assert dict(zip(commits, there, strict=True)) == dict.fromkeys(commits, "commit")
+
+
+def test_the_program_of_a_command_is_its_file():
+    assert program("python benchmarks/deaths.py --trials 3").name == "deaths.py"
+    assert program("python -m benchmarks.thesis --only 5.1").parent.name == "thesis"
+    assert program("python -m benchmarks.fleet").name == "fleet.py"
 
 
 def test_a_file_that_lacks_a_key_is_refused_by_name(figures, tmp_path: Path):
