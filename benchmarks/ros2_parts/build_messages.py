@@ -4,10 +4,10 @@
 
 ``PYTHON`` is a virtual environment of Python 3.12; ROS 2 need not be installed. It has the wheels
 ``ros-jazzy-rclpy[fastrtps]``, ``ros-jazzy-sensor-msgs``, ``-nav-msgs``, ``-std-srvs``, ``-diagnostic-msgs``,
-``-visualization-msgs``, all of ``ros-jazzy-ament-cmake*`` and ``ros-jazzy-rosidl*``, ``ros-ament-package``,
-``catkin_pkg``, ``empy==3.3.4``, and this program's own dependencies (extra ``ros2``). CMake and a C++ compiler are
-needed, too. The packages of ``monstertruckd/ros2/interfaces.txt`` that it cannot import (``tf2_msgs``, ``nav2_msgs``
-...) are installed into its prefix. Prints their names.
+``-visualization-msgs``, ``-python-cmake-module``, all of ``ros-jazzy-ament-cmake*`` and ``ros-jazzy-rosidl*``,
+``ros-ament-package``, ``catkin_pkg``, ``empy==3.3.4``, and this program's own dependencies (extra ``ros2``). CMake and
+a C++ compiler are needed, too. The packages of ``monstertruckd/ros2/interfaces.txt`` that it cannot import
+(``tf2_msgs``, ``nav2_msgs`` ...) are installed into its prefix. Prints their names.
 """
 
 import importlib.util
