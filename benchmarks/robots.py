@@ -29,6 +29,7 @@ from benchmarks.scoring import distance, map_error, rms
 from benchmarks.virtual_runs import goal_end
 from monstertruck_planners.collision import DistanceField
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
+from monstertruck_runtime.errors import RequestRefusedError
 from monstertruck_runtime.mailbox import fifo, latest
 from monstertruck_runtime.map_files import FREE, OCCUPIED
 from monstertruck_schemas import topics
@@ -142,12 +143,13 @@ def goals_of(name: str, count: int, seed: int = 1) -> dict[str, Any]:
     async def story(rig: VirtualRig, operator: LocalOperator) -> dict[str, Any]:
         outcomes: list[str] = []
         off: list[float] = []
+        refusals: list[str] = []
         for x, y, yaw in places:
-            outcome = await to_goal(rig, operator, float(x), float(y), float(yaw))
+            outcome = await to_goal(rig, operator, float(x), float(y), float(yaw), refusals)
             truth = rig.world.truth(rig.clock.now())
             outcomes.append(outcome)
             off.append(math.dist((truth.x, truth.y), (x, y)))
-        return {"outcomes": outcomes, "off_m": [round(value, 3) for value in off]}
+        return {"outcomes": outcomes, "off_m": [round(value, 3) for value in off], "refusals": refusals}
 
     run = driven(config, story)
     truth, grid = run.pop("truth"), run.pop("grid")
@@ -156,16 +158,21 @@ def goals_of(name: str, count: int, seed: int = 1) -> dict[str, Any]:
     return run | {"goals": count, "reached": reached} | {key: round(value, 4) for key, value in figures.items()}
 
 
-async def to_goal(rig: VirtualRig, operator: LocalOperator, x: float, y: float, yaw: float) -> str:
-    """Drive to a place, armed again after stops that disarm; the outcome."""
+async def to_goal(rig: VirtualRig, operator: LocalOperator, x: float, y: float, yaw: float, refusals: list[str]) -> str:
+    """Drive to a place, asked again after refusals, armed again after stops that disarm; the outcome."""
     clock = rig.clock
     with rig.bus.subscribe(topics.GOAL, fifo(4096)) as states, rig.bus.subscribe(topics.GATE, latest()) as gate:
-        await operator.arm()
-        request = {**await operator.header(), "frame": "map", "goal": {"x": x, "y": y, "yaw": yaw}, "waypoints": []}
-        number = int((await operator.call("goal", request))["number"])
+        request = {"frame": "map", "goal": {"x": x, "y": y, "yaw": yaw}, "waypoints": []}
         try:
             async with clock.deadline(240.0):
-                return await goal_end(number, operator, states, gate)
+                while True:
+                    try:
+                        await operator.arm()
+                        number = int((await operator.call("goal", {**await operator.header(), **request}))["number"])
+                        return await goal_end(number, operator, states, gate)
+                    except RequestRefusedError as refused:
+                        refusals.append(f"{clock.now() / SECOND:.1f} s: {refused}")
+                        await clock.sleep(1.0)
         except TimeoutError:
             return "late"
 

@@ -95,15 +95,14 @@ def _by_shaft(name: str, of_shafts: tuple[Topic[Any], ...]) -> dict[str, Topic[A
     return {f"{name}_{i}" if i > 1 else name: topic for i, topic in enumerate(of_shafts, 1)}
 
 
-LIDAR: Final = RoleSpec(
-    name=DeviceRole.LIDAR.value,
-    duty=Duty.SENSOR,
-    doc="Laser scanner",
-    writes={"out": topics.SCAN},
-    frame=True,
-    start=12,
-    loads_hub=True,
-)
+def _lidar(role: DeviceRole, doc: str, scan: Topic[Any]) -> RoleSpec:
+    return RoleSpec(
+        name=role.value, duty=Duty.SENSOR, doc=doc, writes={"out": scan}, frame=True, start=12, loads_hub=True
+    )
+
+
+LIDAR: Final = _lidar(DeviceRole.LIDAR, "Laser scanner", topics.SCAN)
+LIDAR_2: Final = _lidar(DeviceRole.LIDAR_2, "Second laser scanner, such as one that looks backwards", topics.SCAN_2)
 DRIVE, DRIVE_2, DRIVE_3, DRIVE_4 = map(_shaft, range(len(SHAFTS)))
 WHEELS: Final = RoleSpec(
     name=DeviceRole.WHEELS.value,
@@ -204,6 +203,7 @@ HOST: Final = RoleSpec(
 )
 OUR_ROLES: Final = (
     LIDAR,
+    LIDAR_2,
     DRIVE,
     DRIVE_2,
     DRIVE_3,
@@ -409,7 +409,7 @@ DEVICES: Final = DeviceCatalog(
     DeviceKind(
         name="hokuyo_urg",
         doc="Hokuyo URG-04LX laser scanner (SCIP 1.1 and 2.0)",
-        roles=(LIDAR,),
+        roles=(LIDAR, LIDAR_2),
         settings="monstertruck_drivers.hokuyo_urg.config:HokuyoConfig",
         implementation="monstertruck_drivers.hokuyo_urg.driver:HokuyoDriver",
         emulator="monstertruck_drivers.hokuyo_urg.emulator:emulated",
@@ -419,7 +419,7 @@ DEVICES: Final = DeviceCatalog(
     DeviceKind(
         name="hokuyo_lx",
         doc="Hokuyo UST-10LX, UST-20LX or UTM-30LX-EW laser scanner (SCIP 2.2 over TCP)",
-        roles=(LIDAR,),
+        roles=(LIDAR, LIDAR_2),
         settings="monstertruck_drivers.hokuyo_urg.config:HokuyoLxConfig",
         implementation="monstertruck_drivers.hokuyo_urg.driver:HokuyoDriver",
         emulator="monstertruck_drivers.hokuyo_urg.lx_emulator:emulated",
@@ -428,7 +428,7 @@ DEVICES: Final = DeviceCatalog(
     DeviceKind(
         name="ld19",
         doc="LDROBOT LD06, LD19 or STL-19P laser scanner",
-        roles=(LIDAR,),
+        roles=(LIDAR, LIDAR_2),
         settings="monstertruck_drivers.ld19.config:Ld19Config",
         implementation="monstertruck_drivers.ld19.driver:Ld19Driver",
         emulator="monstertruck_drivers.ld19.emulator:emulated",
@@ -439,7 +439,7 @@ DEVICES: Final = DeviceCatalog(
     DeviceKind(
         name="rplidar",
         doc="SLAMTEC RPLIDAR A1, A2, A3, C1, S1 or S2 laser scanner",
-        roles=(LIDAR,),
+        roles=(LIDAR, LIDAR_2),
         settings="monstertruck_drivers.rplidar.config:RplidarConfig",
         implementation="monstertruck_drivers.rplidar.driver:RplidarDriver",
         emulator="monstertruck_drivers.rplidar.emulator:emulated",
@@ -449,7 +449,7 @@ DEVICES: Final = DeviceCatalog(
     DeviceKind(
         name="sheet_lidar",
         doc="Laser scanner described by its data sheet (frames of this project)",
-        roles=(LIDAR,),
+        roles=(LIDAR, LIDAR_2),
         settings="monstertruck_drivers.sheet_lidar.config:SheetLidarConfig",
         implementation="monstertruck_drivers.sheet_lidar.driver:SheetLidarDriver",
         emulator="monstertruck_drivers.sheet_lidar.emulator:emulated",

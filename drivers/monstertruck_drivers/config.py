@@ -22,7 +22,7 @@ from monstertruck_runtime.service import RestartPolicy
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.roles import SHAFTS
-from monstertruck_schemas.topics import Topic
+from monstertruck_schemas.topics import SCANS, Topic
 
 if TYPE_CHECKING:
     from monstertruck_drivers.ax12.config import Ax12Config
@@ -154,6 +154,10 @@ class _Devices(Schema):
         }
         return self.model_copy(update=moved)
 
+    def lidars(self) -> dict[str, Device[Any]]:
+        """The lidars by role, in the order of their topics (``SCANS``)."""
+        return {role: device for role, device in self.present().items() if DEVICES.roles[role].topic in SCANS}
+
     def measures(self, topic: Topic[Any]) -> bool:
         """Whether a configured device publishes a sensor's topic."""
         written = ((*DEVICES.roles[role].writes.values(), *d.kind.also.values()) for role, d in self.present().items())
@@ -283,6 +287,7 @@ if TYPE_CHECKING:
         """Devices by role; only roles used by the robot's code are declared."""
 
         lidar: Device[Schema] | None = None
+        lidar_2: Device[Schema] | None = None
         drive: Device[EposConfig] | None = None
         steering: Device[MaestroConfig] | None = None
         compass: Device[Schema] | None = None

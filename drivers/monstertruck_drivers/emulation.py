@@ -13,6 +13,7 @@ from monstertruck_drivers.cable import DeviceEnd, EmulatedPort, MemoryPort
 from monstertruck_drivers.signals import Signals
 from monstertruck_runtime.clock import Clock
 from monstertruck_runtime.threads import Offload, in_thread
+from monstertruck_schemas.roles import DeviceRole
 
 Array = NDArray[np.float64]
 
@@ -309,6 +310,10 @@ class Physics(Protocol):
         """Source of the lidar's ranges."""
 
     @property
+    def lidar_2(self) -> ScannedRoom:
+        """Source of the second lidar's ranges."""
+
+    @property
     def view(self) -> ViewSource:
         """Source of camera pictures of the truck's surroundings."""
 
@@ -366,3 +371,8 @@ class EmulatorSetup:
     """Folder with proc and sys of the emulated computer."""
     offload: Offload = in_thread
     """Runs long computations."""
+
+    @property
+    def room(self) -> ScannedRoom:
+        """Source of the ranges of the lidar in this role."""
+        return self.physics.lidar_2 if self.role == DeviceRole.LIDAR_2 else self.physics.lidar

@@ -11,6 +11,7 @@ from monstertruck_drivers.computer import Computer, Machine
 from monstertruck_drivers.config import AnyPort, CommandPortConfig, Device, TcpPortConfig, kind_of
 from monstertruck_drivers.i2c.port import I2cPort
 from monstertruck_drivers.link import BAUD, Port
+from monstertruck_drivers.scanning.mounting import MountedScans
 from monstertruck_drivers.tcp import TcpPort
 from monstertruck_drivers.tty import SerialPort
 from monstertruck_drivers.usb.config import UsbPortConfig
@@ -28,6 +29,7 @@ from monstertruck_schemas import topics
 from monstertruck_schemas.base import Schema
 from monstertruck_schemas.event import Severity
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import Topic, Writer
 from monstertruckd.bus.local import Bus
@@ -207,21 +209,28 @@ def _publisher(
     owner = next((other for other in roles.values() if other.topic is topic), role)
     if owner is not role:
         return None
-    return scan_publisher(config, bus) if topic is topics.SCAN else bus.publisher(topic, Writer.DRIVER)
+    if topic not in topics.SCANS:
+        return bus.publisher(topic, Writer.DRIVER)
+    lidar = config.devices.lidars()[role.name]
+    return MountedScans(scan_publisher(role.name, config, bus), lidar.mount, getattr(lidar.driver, "hidden", ()))
 
 
-def scan_publisher(config: TruckConfig, bus: Bus) -> Publisher[LaserScan]:
-    """Sink of scans: adds the tilt of their plane, as measured by compass and stabiliser."""
-    out = bus.publisher(topics.SCAN, Writer.DRIVER)
-    angles = scan_angles(config, bus, RECENT)
+def scan_publisher(role: str, config: TruckConfig, bus: Bus) -> Publisher[LaserScan]:
+    """Sink of a lidar's scans: adds the tilt of their plane, as measured by compass and stabiliser."""
+    out = bus.publisher(DEVICES.roles[role].topic, Writer.DRIVER)
+    angles = scan_angles(config, bus, RECENT, role)
     return out if angles is None else TiltStamper(out, angles)
 
 
-def scan_angles(config: TruckConfig, bus: Bus, delivery: Delivery) -> ScanAngles | None:
-    """Angles of body and lidar mount at the time of scans; None without a compass."""
+def scan_angles(config: TruckConfig, bus: Bus, delivery: Delivery, role: str = DeviceRole.LIDAR) -> ScanAngles | None:
+    """Angles of body and mount of the lidar ``role`` at the time of scans; None without a compass.
+
+    The stabiliser carries the first lidar alone.
+    """
     devices = config.devices
     if devices.compass is None:
         return None
-    joints = bus.subscribe(topics.STABILISER, delivery) if devices.stabiliser is not None else None
+    jointed = devices.stabiliser is not None and role == DeviceRole.LIDAR
+    joints = bus.subscribe(topics.STABILISER, delivery) if jointed else None
     odometry = bus.subscribe(topics.ODOMETRY, delivery) if config.missing_actuators() is None else None
     return ScanAngles(bus.subscribe(topics.COMPASS, delivery), joints, odometry)

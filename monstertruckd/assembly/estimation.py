@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final, Self
 
 from monstertruck_drivers.catalog import DEVICES
+from monstertruck_drivers.scanning.mounting import upright
 from monstertruck_estimation.catalog import ODOMETRY
 from monstertruck_estimation.consistency.config import SCAN_LIBRARIES, ConsistencyConfig
 from monstertruck_estimation.consistency.service import START_TIMEOUT as SCANS_START
@@ -22,7 +23,7 @@ from monstertruck_estimation.points.service import TARGET as READER
 from monstertruck_estimation.points.service import PointFolders, PointInputs, PointService
 from monstertruck_estimation.slam.outside import OutsideLocalisation
 from monstertruck_estimation.slam.outside_map import OutsideMap
-from monstertruck_estimation.slam.service import SlamService
+from monstertruck_estimation.slam.service import OtherLidar, SlamService
 from monstertruck_estimation.transforms import TransformService, compose, invert, mount, quaternion_from_rpy
 from monstertruck_kinematics.chassis import Chassis
 from monstertruck_planners.collision import Footprint, ScanPoints
@@ -54,8 +55,8 @@ class Body:
 
     chassis: Chassis
     footprint: Footprint
-    points: ScanPoints
-    """Stamp of the latest scan."""
+    points: tuple[ScanPoints, ...]
+    """Points of the latest scan of every lidar; of a robot without a lidar one that never gets a scan."""
     sonars: Mapping[str, tuple[float, float, float]]
     """Pose in base of every sonar of a robot without a lidar, m, m, rad."""
     rear_sonars: Mapping[str, tuple[float, float, float]]
@@ -66,13 +67,13 @@ class Body:
     @classmethod
     def of(cls, config: TruckConfig) -> Self:
         """Estimators of a configured robot."""
-        lidar = config.devices.lidar
-        points = ScanPoints(lidar.mount.planar if lidar is not None else (0.0, 0.0, 0.0))
+        mounts = [lidar.mount for lidar in config.devices.lidars().values()]
+        points = tuple(ScanPoints(mount.planar) for mount in mounts or [Mount()])
         sonar = config.devices.sonar
-        mounts = {} if sonar is None else {name: one.mount.planar for name, one in sonar.driver.sonars.items()}
+        heard = {} if sonar is None else {name: one.mount.planar for name, one in sonar.driver.sonars.items()}
         length, width = config.geometry.length, config.geometry.width
         peers = {name: Footprint(peer.length or length, peer.width or width) for name, peer in config.peers.items()}
-        sonars, rear_sonars = (mounts, {}) if lidar is None else ({}, rear(mounts))
+        sonars, rear_sonars = ({}, rear(heard)) if mounts else (heard, {})
         return cls(config.chassis(), Footprint(length, width), points, sonars, rear_sonars, peers)
 
 
@@ -80,6 +81,7 @@ def sensor_mounts(config: TruckConfig) -> dict[str, Mount]:
     """Mounts of all sensors on the base, by frame; for the stabiliser, the point that its joints turn about."""
     devices = config.devices.present()
     mounts = {role: device.mount for role, device in devices.items() if DEVICES.roles[role].frame}
+    mounts |= {role: upright(device.mount) for role, device in config.devices.lidars().items()}
     for role, device in devices.items():
         if (elements := DEVICES.roles[role].elements) is not None:
             for name, element in getattr(device.driver, elements).items():
@@ -166,6 +168,7 @@ def _build_consistency(
             encoders=None if devices.encoders is None else bus.subscribe(topics.ENCODERS, fifo(ODOMETRIES)),
             battery=bus.subscribe(topics.BATTERY, fifo(SCANS)) if measures_battery(config) else None,
             camera=None if devices.camera is None else bus.subscribe(topics.CAMERA, fifo(SCANS)),
+            scan_2=None if devices.lidar_2 is None else bus.subscribe(topics.SCAN_2, fifo(SCANS)),
             stand=bus.subscribe(topics.STAND_POSE, fifo(ODOMETRIES)) if config.stand == "overhead" else None,
         ),
         scans=scans,
@@ -290,6 +293,7 @@ def build_slam(config: TruckConfig, bus: Bus, clock: Clock, run: str = "") -> Sl
         scan=bus.subscribe(topics.SCAN, fifo(SCANS)),
         odometry=bus.subscribe(topics.ODOMETRY, fifo(ODOMETRIES)) if config.missing_actuators() is None else None,
         angles=scan_angles(config, bus, fifo(ODOMETRIES)),
+        other=_other_lidar(config, bus),
         pose=bus.publisher(topics.POSE, Writer.ESTIMATION),
         whole=bus.publisher(topics.MAP, Writer.ESTIMATION),
         tiles=bus.publisher(topics.MAP_TILES, Writer.ESTIMATION),
@@ -297,3 +301,11 @@ def build_slam(config: TruckConfig, bus: Bus, clock: Clock, run: str = "") -> Sl
         health=bus.publisher(topics.SLAM, Writer.ESTIMATION),
         events=bus.event_sink(),
     )
+
+
+def _other_lidar(config: TruckConfig, bus: Bus) -> OtherLidar | None:
+    lidar, role = config.devices.lidar_2, DeviceRole.LIDAR_2
+    if lidar is None:
+        return None
+    angles = scan_angles(config, bus, fifo(ODOMETRIES), role)
+    return OtherLidar(lidar.mount, bus.subscribe(topics.SCAN_2, latest()), angles)

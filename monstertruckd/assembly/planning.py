@@ -188,7 +188,7 @@ def _build_tracker(
             with_response(tracker, config.devices),
             body.chassis.bicycle,
             body.footprint,
-            body.points.mount,
+            body.points[0].mount,
             located=config.slam is not None,
             freedom=body.chassis.freedom if body.chassis.steered else None,
         ),
@@ -198,7 +198,7 @@ def _build_tracker(
         tracker=bus.publisher(topics.TRACKER, Writer.PLANNER),
         events=bus.event_sink(),
         actor=actor,
-        points=body.points,
+        points=body.points[0],
     )
 
 

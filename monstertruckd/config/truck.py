@@ -320,6 +320,8 @@ class TruckConfig(Schema):
         if self.lidar_sonars is not None and (self.devices.lidar is None or self.devices.sonar is not None):
             raise ValueError("lidar_sonars needs the device lidar, and no device sonar")
         self._check_slam()
+        if self.devices.lidar_2 is not None and self.devices.lidar is None:
+            raise ValueError("devices.lidar_2: expected as a second lidar; call the only one lidar")
         measuring = [place for place, _ in packs(self.devices, self.monitors)]
         if len(measuring) > 1:
             raise ValueError(f"{' and '.join(measuring)} both measure the battery; set one of them null")

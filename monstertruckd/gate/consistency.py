@@ -109,6 +109,7 @@ class ConsistencyCheck(Check):
         config = self.view.config
         limits = {
             DeviceRole.LIDAR.value: config.scan,
+            DeviceRole.LIDAR_2.value: config.scan,
             DeviceRole.COMPASS.value: config.attitude,
             DeviceRole.DRIVE.value: config.drive,
             DeviceRole.WHEELS.value: config.drive,

@@ -11,7 +11,7 @@ source may continue; a fault longer than ``disarm_after``, or a reason in ``DISA
 
 import math
 from collections import deque
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple, assert_never
 
@@ -29,7 +29,7 @@ from monstertruck_schemas.event import Cause, Severity, Stop
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import ControlRequest, DriveForm, DriveRequest, Order, Role
 from monstertruck_schemas.state import GateMode
-from monstertruck_schemas.topics import BATTERY, COMPASS, DRIVES, SCAN, STEERING, Topic
+from monstertruck_schemas.topics import BATTERY, COMPASS, DRIVES, SCANS, STEERING, Topic
 from monstertruckd.gate.arbitration import EventLog, GateEvent, GateStateMachine, Source, Sources
 from monstertruckd.gate.assist import Assist
 from monstertruckd.gate.catalog import CheckConfig
@@ -120,7 +120,7 @@ def sensor_checks(view: GateView, *, battery_measured: bool, compared: bool = Fa
 
 def obstacle_checks(
     view: GateView,
-    points: ScanPoints,
+    points: Sequence[ScanPoints],
     sonars: Mapping[str, Place] | None,
     rear_sonars: Mapping[str, Place] | None,
     peers: Mapping[str, Footprint] | None,
@@ -196,7 +196,7 @@ class Gate:
         config: limits.
         chassis: kinematics of the body, its motors and servos.
         footprint: the truck's outline.
-        points: converts scans to points in base.
+        points: converts the scans of every lidar to points in base.
         services: reason given by the loss of each sensor service, by service name.
         nonce: nonce of this run; requests must carry it.
         battery_measured: whether a device measures the battery.
@@ -216,7 +216,7 @@ class Gate:
         *,
         chassis: Chassis,
         footprint: Footprint,
-        points: ScanPoints,
+        points: Sequence[ScanPoints],
         services: Mapping[str, Reason],
         nonce: str,
         battery_measured: bool,
@@ -234,7 +234,7 @@ class Gate:
         self._sources = Sources(nonce, config)
         self._events = EventLog(config.event_interval)
         self._states = GateStateMachine(self._events, latched=latched)
-        self._samples = Samples(self._limits, chassis, services)
+        self._samples = Samples(self._limits, chassis, services, len(points))
         self._motion = Motion(self._limits, chassis)
         view = GateView(self._limits, chassis, footprint, self._samples, self._motion, self._states)
         self._limiter = CommandLimiter(view)
@@ -293,8 +293,8 @@ class Gate:
     @property
     def reads(self) -> tuple[Topic[Any], ...]:
         """Topics whose latest message the gate must observe before every tick, in this order."""
-        drives = DRIVES[: len(self._chassis.shafts)]
-        return tuple(dict.fromkeys((SCAN, COMPASS, *drives, STEERING, BATTERY, *self._checks.reads)))
+        scans, drives = SCANS[: len(self._samples.scans)], DRIVES[: len(self._chassis.shafts)]
+        return tuple(dict.fromkeys((*scans, COMPASS, *drives, STEERING, BATTERY, *self._checks.reads)))
 
     def survey(self) -> Generator[None, None, GroundSurvey | None] | None:
         """Map the ground seen by the lidar, in short steps; None if no lidar guards the robot."""

@@ -76,7 +76,7 @@ class DockCheck(Check):
             self._located = seen
 
     def _area(self, now: int) -> DockArea | None:
-        behaviour, scan = self._behaviour, self.view.samples.scan
+        behaviour, scan = self._behaviour, self.view.samples.scans[0]
         if behaviour is None or not behaviour.running or behaviour.dock is None or not self._trail or scan is None:
             return None
         odometry = self._trail[-1]

@@ -24,7 +24,7 @@ from monstertruck_schemas.event import Measurement
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.sensor import LaserScan, SonarRanges
 from monstertruck_schemas.state import Odometry
-from monstertruck_schemas.topics import ODOMETRY, SONAR, Topic
+from monstertruck_schemas.topics import ODOMETRY, SCANS, SONAR, Topic
 from monstertruckd.gate.approach import Approach, comfortable_speed, reach, stopping
 from monstertruckd.gate.checks import Check, DockArea, GateView, PaceLimit, Tick
 from monstertruckd.gate.config import GateConfig, InForce
@@ -33,7 +33,7 @@ from monstertruckd.gate.rear_sonars import RearSonars
 from monstertruckd.gate.samples import age
 from monstertruckd.gate.scan_memory import DRIFT, ScanMemory
 from monstertruckd.gate.sonars import Place
-from monstertruckd.gate.visibility import Sectors, Visibility
+from monstertruckd.gate.visibility import Sectors, Visibility, travelled
 
 _Steps = tuple[int, int, int]
 """A unit twist in steps of ``TWIST_STEP``."""
@@ -90,31 +90,51 @@ class _Sweep(NamedTuple):
     before: Array
     """Distance of the last pose before the body reaches each ground point, shape (n,), m."""
     sectors: Sectors
-    """Sectors around the lidar that contain the ground."""
+    """Sectors around the lidars that contain the ground, shape (lidars, k)."""
+
+
+class _LidarView:
+    """What one lidar shows.
+
+    Args:
+        points: converts its scans to points in base.
+        visibility: when each sector around it was last seen.
+    """
+
+    def __init__(self, points: ScanPoints, visibility: Visibility) -> None:
+        self.scan_points, self.visibility = points, visibility
+        self.near = self.measured = np.empty((0, 2))
+        """Points near the body, and all points, in base at its latest scan, shape (n, 2), m."""
+        self.stamp = 0
+        """Stamp of its latest scan, ns."""
 
 
 class ObstacleGuard:
-    """Checks the swept footprint against the latest scan.
+    """Checks the swept footprint against the latest scan of every lidar.
 
-    The truck may have moved since the scan was taken, so the stopping distance includes travel during the scan's age.
+    The truck may have moved since a scan was taken, so the stopping distance includes travel during the age of the
+    oldest one.
 
     Args:
         limits: limits in force.
         footprint: the body's outline.
-        points: converts scans to points in base.
+        points: converts the scans of every lidar to points in base.
         sonars: pose (x, y, yaw) of every sonar that looks backwards in base by name, m, m, rad.
     """
 
     def __init__(
-        self, limits: InForce, footprint: Footprint, points: ScanPoints, sonars: Mapping[str, Place] | None = None
+        self,
+        limits: InForce,
+        footprint: Footprint,
+        points: Sequence[ScanPoints],
+        sonars: Mapping[str, Place] | None = None,
     ) -> None:
         self._limits = limits
         self._sonars = RearSonars(limits, sonars or {})
         self._footprint = footprint
-        self._scan_points = points
-        self._visibility = Visibility(footprint, points.mount, limits.config.obstacle.seen)
-        kept = limits.config.obstacle
-        self.memory = ScanMemory(footprint, points.mount, kept.memory_distance, kept.memory_time, kept.memory_deviation)
+        kept, mounts = limits.config.obstacle, [one.mount for one in points]
+        self._eyes = [_LidarView(one, Visibility(footprint, one.mount, kept.seen)) for one in points]
+        self.memory = ScanMemory(footprint, mounts, kept.memory_distance, kept.memory_time, kept.memory_deviation)
         self._points = np.empty((0, 2))
         self._measured = np.empty((0, 2))
         self._stamp = 0
@@ -171,8 +191,8 @@ class ObstacleGuard:
         return points[~on_body(self._footprint, points, -self._footprint.padding)]
 
     def looks_at(self, points: Array) -> NDArray[np.bool_]:
-        """Whether each point (n, 2) in base (m) lies in the lidar's field of view."""
-        return self._visibility.covers(points)
+        """Whether each point (n, 2) in base (m) lies in a lidar's field of view."""
+        return np.asarray(np.logical_or.reduce([eye.visibility.covers(points) for eye in self._eyes]))
 
     def move(self, now: int, twist: Twist2 | None, dt: float) -> None:
         """Move the body with ``twist`` for the ``dt`` s before ``now`` (ns); None if the motion is unknown."""
@@ -191,17 +211,22 @@ class ObstacleGuard:
             self.memory.hear(*ping)
             self._checked = None
 
-    def observe(self, scan: LaserScan) -> None:
-        """Take a scan."""
-        points = self._scan_points.of(scan)
-        self._visibility.observe(scan, points)
-        self._measured = points
+    def observe(self, scan: LaserScan, lidar: int = 0) -> None:
+        """Take a scan of a lidar, by its number."""
+        eye = self._eyes[lidar]
+        points = eye.measured = eye.scan_points.of(scan)
+        eye.visibility.observe(scan, points)
         near = points[np.hypot(points[:, 0], points[:, 1]) < self._near]
-        age = self._visibility.age(self._points, scan.stamp)
+        age = eye.visibility.age(eye.near, scan.stamp)
         # Points of a sector are kept while the sector is not seen, until they are too old.
-        self._points = np.concatenate((near, self._points[(age > 0) & (age <= self._keep)]))
-        self.memory.observe(scan, near)
-        self._stamp = min(scan.stamp, scan.received)  # a sensor's clock may run ahead: at latest the arrival
+        eye.near = np.concatenate((near, eye.near[(age > 0) & (age <= self._keep)]))
+        # A sensor's clock may run ahead: the stamp is at latest the arrival.
+        eye.stamp = self._stamp = min(scan.stamp, scan.received)
+        self.memory.observe(scan, near, lidar)
+        self._points, self._measured = (
+            np.concatenate([self.memory.moved(points, i) for i, points in enumerate(shown)])
+            for shown in ([eye.near for eye in self._eyes], [eye.measured for eye in self._eyes])
+        )
         self._checked = None
 
     def free_distance(self, twists: tuple[UnitTwist, ...], dock: DockArea | None = None) -> float:
@@ -228,10 +253,16 @@ class ObstacleGuard:
         return self._free
 
     def _update_unseen(self, twists: frozenset[_Steps]) -> None:
-        """Update ``unseen`` from the sectors of travel within the lidar's field of view."""
-        seen = np.concatenate([self._visibility.last_seen(self._sweep(*twist).sectors) for twist in twists])
-        oldest = int(seen.min(initial=self._stamp))
-        self.unseen = (self._stamp - oldest) / SECOND if oldest > 0 else None
+        """Update ``unseen`` from the ground of travel in a field of view, each part by the lidar that sees it best."""
+        sectors = np.concatenate([self._sweep(*twist).sectors for twist in twists], axis=1)
+        ages = np.full(sectors.shape, np.nan)
+        for row, of_eye, eye in zip(ages, sectors, self._eyes, strict=True):
+            seen = eye.visibility.last_seen(of_eye)
+            row[seen == 0] = np.inf
+            row[seen > 0] = eye.stamp - seen[seen > 0]
+        best = np.fmin.reduce(ages)  # NaN: in no field of view
+        oldest = float(best[~np.isnan(best)].max(initial=0.0))
+        self.unseen = oldest / SECOND if math.isfinite(oldest) else None
 
     def _swept(self, x: int, y: int, turn: int) -> _Sweep:
         """Sweep a twist in steps of ``TWIST_STEP``; between two poses corners move no further than the base."""
@@ -242,7 +273,8 @@ class ObstacleGuard:
         ground = ground_ahead(self._footprint, self._outline, poses[::GROUND_STEP])
         before = np.repeat(distances[::GROUND_STEP][:-1], ground.shape[1])
         ground = ground.reshape(-1, 2)
-        return _Sweep(distances, poses, ground, before, self._visibility.travelled(ground))
+        views = [eye.visibility for eye in self._eyes]
+        return _Sweep(distances, poses, ground, before, travelled(views, self._footprint, ground))
 
     def _free_distance(self, x: int, y: int, turn: int, points: Array, remembered: Array, echoes: Array) -> float:
         sweep = self._sweep(x, y, turn)
@@ -300,7 +332,7 @@ class ObstacleGuard:
 
         A motion ahead leads into the lidar's field of view, where sectors and points decide (``unseen``).
         """
-        unknown = ~self._visibility.covers(ground) if _is_ahead(twist) else np.ones(len(ground), np.bool_)
+        unknown = ~self.looks_at(ground) if _is_ahead(twist) else np.ones(len(ground), np.bool_)
         unknown[unknown] = ~self.memory.seen(ground[unknown])
         if self._dock is not None:
             unknown[unknown] = ~self._dock.on_axis(ground[unknown])
@@ -331,15 +363,19 @@ class ObstacleGuard:
 
     def delay(self, now: int) -> float:
         """Time from the latest view of the path to the reaction, s."""
-        return max(now - self._stamp, 0) / SECOND + (self.unseen or 0.0) + self._limits.config.reaction
+        return (
+            max(now - min(eye.stamp for eye in self._eyes), 0) / SECOND
+            + (self.unseen or 0.0)
+            + self._limits.config.reaction
+        )
 
 
 class ObstacleCheck(Check):
-    """Keeps the swept footprint clear of present and earlier lidar returns; gives no limit without a fresh scan.
+    """Keeps the swept footprint clear of present and earlier lidar returns; gives no limit without fresh scans.
 
     Args:
         view: read access to the gate's state.
-        points: converts scans to points in base.
+        points: converts the scans of every lidar to points in base.
         sonars: pose (x, y, yaw) of every sonar that looks backwards in base by name, m, m, rad.
     """
 
@@ -354,7 +390,7 @@ class ObstacleCheck(Check):
     )
     reads = (ODOMETRY, SONAR)
 
-    def __init__(self, view: GateView, points: ScanPoints, sonars: Mapping[str, Place] | None = None) -> None:
+    def __init__(self, view: GateView, points: Sequence[ScanPoints], sonars: Mapping[str, Place] | None = None) -> None:
         super().__init__(view)
         self.guard = ObstacleGuard(view.limits, view.footprint, points, sonars)
         self._approach = Approach(view)
@@ -373,9 +409,13 @@ class ObstacleCheck(Check):
             # A disarmed robot may be pushed or carried; its memory stays valid while its wheels stand.
             known = view.mode.active or view.samples.at_rest(seen.now)
             self.guard.move(seen.now, view.samples.twist(seen.now) if known else None, seen.elapsed / SECOND)
-        elif isinstance(seen, LaserScan) and seen is view.samples.scan:
-            self.guard.memory.rest(None if view.mode.active else seen)
-            self.guard.observe(seen)
+        elif isinstance(seen, LaserScan) and topic in SCANS:
+            lidar = SCANS.index(topic)
+            if seen is not view.samples.scans[lidar]:
+                return
+            if lidar == 0:
+                self.guard.memory.rest(None if view.mode.active else seen)
+            self.guard.observe(seen, lidar)
         elif isinstance(seen, Odometry) and topic is ODOMETRY:
             self.guard.memory.doubt(seen.pose_covariance)
         elif isinstance(seen, SonarRanges):
@@ -426,12 +466,13 @@ class ObstacleCheck(Check):
     def figures(self, reason: Reason, now: int) -> Iterator[Measurement]:
         """Free distance, distance on seen ground, or how long the lidar has not seen the path."""
         config = self.view.config
+        ages = [age(scan, now) for scan in self.view.samples.scans]
         if reason is Reason.LIDAR_BLIND:
             yield Measurement(name="unseen", value=self.guard.unseen, unit="s", limit=config.scan.stale_after)
         elif reason is Reason.UNSEEN_STOP:
             yield Measurement(name="seen distance", value=_finite(self.guard.known), unit="m", limit=DRIFT)
         elif reason is Reason.OBSTACLE_STOP:
-            yield self._approach.free_distance(age(self.view.samples.scan, now))
+            yield self._approach.free_distance(max((one for one in ages if one is not None), default=None))
 
 
 def _on_the_spot(x: int, y: int) -> bool:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from monstertruck_kinematics.chassis import Chassis, Speeds
 from monstertruck_kinematics.se2 import Twist2
@@ -29,7 +29,7 @@ from monstertruck_schemas.topics import Topic
 from monstertruckd.gate.config import InForce, SensorLimit
 
 STALE_TOPICS: Final[Mapping[Topic[Any], Reason]] = {
-    topics.SCAN: Reason.SCAN_STALE,
+    **dict.fromkeys(topics.SCANS, Reason.SCAN_STALE),
     topics.COMPASS: Reason.ATTITUDE_STALE,
     **dict.fromkeys(topics.DRIVES, Reason.DRIVE_STALE),
     topics.STEERING: Reason.STEERING_STALE,
@@ -61,6 +61,17 @@ class Staleness:
     """Maximum age, s."""
     refused: Measurement | None
     """Why a later sample was rejected."""
+    source: DeviceRole
+    """The stale sensor; of several, the one with the oldest sample."""
+
+
+class _Sample(NamedTuple):
+    """Latest valid sample of one sensor."""
+
+    lidar: DeviceRole | None
+    """The lidar, of a robot with several; None for every other sensor."""
+    topic: Topic[Any]
+    sample: Message | None
 
 
 class Samples:
@@ -70,13 +81,15 @@ class Samples:
         limits: limits in force.
         chassis: kinematics of the body.
         services: staleness reason that applies at once when a service reports its loss, by service name.
+        lidars: number of lidars.
     """
 
-    def __init__(self, limits: InForce, chassis: Chassis, services: Mapping[str, Reason]) -> None:
+    def __init__(self, limits: InForce, chassis: Chassis, services: Mapping[str, Reason], lidars: int = 1) -> None:
         self._limits = limits
         self._services = services
         self._chassis = chassis
-        self.scan: LaserScan | None = None
+        self.scans: list[LaserScan | None] = [None] * lidars
+        self._lidars = (DeviceRole.LIDAR, DeviceRole.LIDAR_2)[:lidars] if lidars > 1 else (None,)
         self.drives: list[DriveFeedback | None] = [None] * len(chassis.shafts)
         self.steering: SteeringFeedback | None = None
         self.attitude: Attitude | None = None
@@ -85,8 +98,9 @@ class Samples:
         self._shaken: Attitude | None = None
         """Latest attitude whose tilt is hidden by an acceleration."""
         self.battery: Battery | None = None
-        self._lost: dict[Reason, int] = {}
-        self._refused: dict[Reason, Measurement] = {}
+        self._lost: dict[str, int] = {}
+        """Latest loss of every service, ns."""
+        self._refused: dict[Topic[Any], Measurement] = {}
         self._speed: tuple[int, float | None] | None = None
         """Time (ns) and cached result of ``speed``, valid until the next sample."""
         self.angles = chassis.straight
@@ -96,17 +110,17 @@ class Samples:
         """Take a message of a topic."""
         match message:
             case LaserScan():
-                self._take_scan(message)
+                self._take_scan(message, topic)
             case DriveFeedback():
-                if self._valid(message, Reason.DRIVE_STALE):
+                if self._valid(message, topic):
                     self.drives[topics.DRIVES.index(topic)] = message
                     self._speed = None
             case SteeringFeedback():
-                if self._valid(message, Reason.STEERING_STALE) and message.trusted:
+                if self._valid(message, topic) and message.trusted:
                     self.steering = message
                     self.angles = self._chassis.steering(*message.servos)
             case Attitude():
-                if not self._valid(message, Reason.ATTITUDE_STALE):
+                if not self._valid(message, topic):
                     return
                 if message.tilt_valid:
                     self.attitude = message
@@ -114,54 +128,71 @@ class Samples:
                 else:
                     self._shaken = message
             case Battery():
-                if self._valid(message, Reason.BATTERY_STALE) and message.level in MEASURED:
+                if self._valid(message, topic) and message.level in MEASURED:
                     self.battery = message
             case HealthTable():
                 self._lose(message)
 
-    def _take_scan(self, scan: LaserScan) -> None:
+    def _take_scan(self, scan: LaserScan, topic: Topic[Any]) -> None:
         """Take a scan unless its latency, the tilt of its plane or the lack of any range makes it invalid."""
-        if not self._valid(scan, Reason.SCAN_STALE):
+        if not self._valid(scan, topic):
             return
         config = self._limits.config
         if not (config.obstacle.open_ground or (scan.codes == VALID_BEAM).any()):
-            self._refused[Reason.SCAN_STALE] = Measurement(name="beams with a range", value=0.0, limit=1.0)
+            self._refused[topic] = Measurement(name="beams with a range", value=0.0, limit=1.0)
         elif scan.tilt is not None and scan.tilt > config.scan_tilt:
-            self._refused[Reason.SCAN_STALE] = Measurement(
+            self._refused[topic] = Measurement(
                 name="scan plane tilt", value=scan.tilt, unit="rad", limit=config.scan_tilt
             )
         else:
-            self.scan = scan
+            self.scans[topics.SCANS.index(topic)] = scan
 
     def _lose(self, table: HealthTable) -> None:
         """Mark samples from before the loss of a service as stale."""
         for service in table.services:
-            if service.state is not ServiceState.READY and (stale := self._services.get(service.name)) is not None:
-                self._lost[stale] = max(service.since, self._lost.get(stale, service.since))
+            if service.state is not ServiceState.READY and service.name in self._services:
+                self._lost[service.name] = max(service.since, self._lost.get(service.name, service.since))
                 self._speed = None
+
+    def _loss(self, stale: Reason, lidar: DeviceRole | None) -> int | None:
+        """Latest loss of a sensor behind ``stale``, of several lidars of this one, ns."""
+        services = [name for name, reason in self._services.items() if reason is stale and lidar in (None, name)]
+        return max((self._lost[name] for name in services if name in self._lost), default=None)
 
     def gives(self, service: str) -> Reason | None:
         """Staleness reason of the sensor that is lost with a service."""
         return self._services.get(service)
 
-    def _valid(self, message: Message, stale: Reason) -> bool:
+    def _valid(self, message: Message, topic: Topic[Any]) -> bool:
         latency = abs(message.received - message.stamp) / SECOND
         if latency <= self._limits.config.max_latency:
-            self._refused.pop(stale, None)
+            self._refused.pop(topic, None)
             return True
         limit = self._limits.config.max_latency
-        self._refused[stale] = Measurement(name="latency", value=latency, unit="s", limit=limit)
+        self._refused[topic] = Measurement(name="latency", value=latency, unit="s", limit=limit)
         return False
 
-    def _fresh(self, message: Message | None, limit: SensorLimit | None, now: int, stale: Reason) -> bool:
+    def _fresh(
+        self,
+        message: Message | None,
+        limit: SensorLimit | None,
+        now: int,
+        stale: Reason,
+        lidar: DeviceRole | None = None,
+    ) -> bool:
         """Whether a sample is fresh; False for a sensor that the robot does not have (no limit)."""
-        if limit is None or message is None or message.received <= self._lost.get(stale, -1):
+        if limit is None or message is None:
+            return False
+        lost = self._loss(stale, lidar)
+        if lost is not None and message.received <= lost:
             return False
         return now - message.received <= limit.stale_after * SECOND
 
     def scan_fresh(self, now: int) -> bool:
-        """Whether the scan is fresh."""
-        return self._fresh(self.scan, self._limits.config.scan, now, Reason.SCAN_STALE)
+        """Whether the scans of all lidars are fresh."""
+        limit = self._limits.config.scan
+        rows = zip(self._lidars, self.scans, strict=True)
+        return all(self._fresh(scan, limit, now, Reason.SCAN_STALE, lidar) for lidar, scan in rows)
 
     def steering_fresh(self, now: int) -> bool:
         """Whether the steering feedback is fresh."""
@@ -260,25 +291,31 @@ class Samples:
         return sampled >= since and abs(speed) < self._limits.config.standstill
 
     def staleness(self, stale: Reason, now: int) -> Staleness:
-        """Details of the stale sensor behind ``stale``; with several shafts, of the oldest sample."""
-        samples: tuple[Message | None, ...] = {
-            Reason.SCAN_STALE: (self.scan,),
-            Reason.ATTITUDE_STALE: (self.attitude,),
-            Reason.DRIVE_STALE: tuple(self.drives),
-            Reason.STEERING_STALE: (self.steering,),
-            Reason.BATTERY_STALE: (self.battery,),
-        }[stale]
-        limit = self.sensor_limits()[stale]
-        received = [sample.received for sample in samples if sample is not None]
-        lost = self._lost.get(stale)
-        refused = self._refused.get(stale)
-        if len(received) < len(samples):
-            return Staleness(lost, None, limit.stale_after, refused)
-        oldest = min(received)
-        since = min(now, oldest + round(limit.stale_after * SECOND))
-        if lost is not None and lost >= oldest:
+        """Details of the stale sensor behind ``stale``; with several lidars or shafts, of the oldest stale sample."""
+        limit, rows = self.sensor_limits()[stale], self._samples(stale)
+        late = [row for row in rows if not self._fresh(row.sample, limit, now, stale, row.lidar)] or rows
+        lidar, topic, sample = min(late, key=lambda row: -1 if row.sample is None else row.sample.received)
+        lost, refused, source = self._loss(stale, lidar), self._refused.get(topic), lidar or STALE_SENSORS[stale]
+        if sample is None:
+            return Staleness(lost, None, limit.stale_after, refused, source)
+        since = min(now, sample.received + round(limit.stale_after * SECOND))
+        if lost is not None and lost >= sample.received:
             since = min(since, lost)
-        return Staleness(since, (now - oldest) / SECOND, limit.stale_after, refused)
+        return Staleness(since, (now - sample.received) / SECOND, limit.stale_after, refused, source)
+
+    def _samples(self, stale: Reason) -> list[_Sample]:
+        """Latest samples of the sensors behind ``stale``."""
+        match stale:
+            case Reason.SCAN_STALE:
+                return list(map(_Sample, self._lidars, topics.SCANS, self.scans))
+            case Reason.DRIVE_STALE:
+                return [_Sample(None, topic, drive) for topic, drive in zip(topics.DRIVES, self.drives, strict=False)]
+            case Reason.STEERING_STALE:
+                return [_Sample(None, topics.STEERING, self.steering)]
+            case Reason.ATTITUDE_STALE:
+                return [_Sample(None, topics.COMPASS, self.attitude)]
+            case _:
+                return [_Sample(None, topics.BATTERY, self.battery)]
 
 
 def age(message: Message | None, now: int) -> float | None:

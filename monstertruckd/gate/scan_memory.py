@@ -68,6 +68,22 @@ class _Taken(NamedTuple):
     """Ground this near to the body counts as free, m."""
 
 
+class _LidarMemory:
+    """Scans of one lidar, mounted at the pose ``mount`` in base, m, m, rad."""
+
+    def __init__(self, mount: Pose2) -> None:
+        self.mount = mount
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget its scans."""
+        self.newest: _Taken | None = None
+        self.taken: deque[_Taken] = deque(maxlen=20)
+        """Scans whose points are remembered."""
+        self.views: deque[_Taken] = deque(maxlen=32)  # at 0.21 m/s the truck takes 21 in 30 s
+        """Scans kept as views of free ground."""
+
+
 class _Heard(NamedTuple):
     """Pings of one sonar."""
 
@@ -92,17 +108,17 @@ class ScanMemory:
 
     Args:
         footprint: the body's outline.
-        mount: pose of the lidar in base, m, m, rad.
+        mounts: pose of every lidar in base, m, m, rad.
         distance: distance travelled before points are forgotten, m.
         time: age above which scans are forgotten, s.
         deviation: growth of the pose's standard deviation above which scans are forgotten, m.
     """
 
     def __init__(
-        self, footprint: Footprint, mount: Pose2, distance: float, time: float, deviation: float = math.inf
+        self, footprint: Footprint, mounts: Sequence[Pose2], distance: float, time: float, deviation: float = math.inf
     ) -> None:
         self._footprint = footprint
-        self._mount = mount
+        self._eyes = [_LidarMemory(mount) for mount in mounts]
         self._distance = distance
         self._time = round(time * SECOND)
         self._variance_kept = deviation**2
@@ -118,8 +134,8 @@ class ScanMemory:
         poses_kept = 64  # number of ticks whose pose is kept, to place a scan where it was taken
         self._ticks: deque[tuple[int, Pose2, float]] = deque(maxlen=poses_kept)
         self._newest: _Taken | None = None
-        self._taken: deque[_Taken] = deque(maxlen=20)
-        self._views: deque[_Taken] = deque(maxlen=32)  # at 0.21 m/s the truck takes 21 in 30 s
+        for eye in self._eyes:
+            eye.forget()
         self._heard: dict[str, _Heard] = {}
         self._points = np.empty((0, 2))
 
@@ -149,25 +165,34 @@ class ScanMemory:
             self.forget()
             self._rested = scan
 
-    def observe(self, scan: LaserScan, points: Array) -> None:
+    def observe(self, scan: LaserScan, points: Array, lidar: int = 0) -> None:
         """Take a scan.
 
         Args:
             scan: the revolution.
             points: returns of the scan near the body, in base, shape (n, 2), m.
+            lidar: number of the lidar.
         """
         spacing = 0.02  # distance between remembered points along the sequence of beams, m: less than their drift
-        self._newest = self._take(Beams.of(scan), spaced(points, spacing), self._mount)
-        travelled = self._newest.travelled
+        eye = self._eyes[lidar]
+        self._newest = eye.newest = self._take(Beams.of(scan), spaced(points, spacing), eye.mount)
+        travelled, taken = self._newest.travelled, eye.taken
         # The view of a standing body does not age; points of its first scan there may be out of sight by now.
-        stood = [travelled - scan.travelled < STANDING for scan in list(self._taken)[-2:]]
+        stood = [travelled - scan.travelled < STANDING for scan in list(taken)[-2:]]
         memory_step = 0.1  # distance travelled between two remembered scans, m
         if stood == [True, True]:
-            self._taken[-1] = self._newest
-        elif stood[-1:] == [True] or not stood or travelled - self._taken[-1].travelled >= memory_step:
-            self._taken.append(self._newest)
-        _keep(self._views, self._newest)
+            taken[-1] = self._newest
+        elif stood[-1:] == [True] or not stood or travelled - taken[-1].travelled >= memory_step:
+            taken.append(self._newest)
+        _keep(eye.views, self._newest)
         self._points = self._hidden(self._newest)
+
+    def moved(self, points: Array, lidar: int) -> Array:
+        """Points (n, 2), m, in base at the latest scan of ``lidar`` as they are in base at the latest scan of all."""
+        taken = self._eyes[lidar].newest
+        if taken is None or self._newest is None or taken.pose == self._newest.pose:
+            return points
+        return points_relative(_lifted(points, taken.pose), self._newest.pose)
 
     def hear(self, sonar: str, mount: Pose2, beams: Beams, arc: Array) -> None:
         """Take an answer of a sonar.
@@ -196,26 +221,28 @@ class ScanMemory:
         """Place a view of the sensor at ``mount``, with its points (n, 2) in base (m), at the pose of its stamp."""
         present = beams.stamp, self._pose, self._travelled
         _, pose, travelled = min(self._ticks, key=lambda tick: abs(tick[0] - beams.stamp), default=present)
-        there = placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
+        there = _lifted(points, pose)
         (sensor,) = placed(np.array([mount]), pose).tolist()
         return _Taken(beams, pose, tuple(sensor), travelled, there, np.pad(beams.free, 1), self._variance)
 
     def points(self) -> Array:
-        """Remembered points outside the view of the latest scan, in base at that scan, shape (n, 2), m."""
+        """Remembered points outside the view of each lidar's latest scan, in base at the latest, shape (n, 2), m."""
         return self._points
 
     def _hidden(self, newest: _Taken) -> Array:
         """See ``points``."""
-        taken = self._fresh(self._taken, newest)
+        taken = self._fresh((scan for eye in self._eyes for scan in eye.taken), newest)
         kept = [scan.points for scan in taken if newest.travelled - scan.travelled < self._distance]
         there = np.concatenate((newest.points[:0], *kept))
-        beams = _beams((newest,), there)[0][0]
-        count, step = len(newest.beams.free), newest.beams.step
-        # Remembered points this near to the edge of the field of view are kept, rad: the error of the dead-reckoned
-        # yaw.
-        field_edge = 0.1
-        edge = 0.0 if is_full_turn(count, step) else field_edge / abs(step)
-        looked = (beams >= edge) & (beams < count - edge)
+        looked = np.zeros(len(there), np.bool_)
+        for scan in self._latest():
+            beams = _beams((scan,), there)[0][0]
+            count, step = len(scan.beams.free), scan.beams.step
+            # Remembered points this near to the edge of the field of view are kept, rad: the error of the
+            # dead-reckoned yaw.
+            field_edge = 0.1
+            edge = 0.0 if is_full_turn(count, step) else field_edge / abs(step)
+            looked |= (beams >= edge) & (beams < count - edge)
         points = points_relative(there[~looked], newest.pose)
         return points[~on_body(self._footprint, points, 0.0)]
 
@@ -226,14 +253,20 @@ class ScanMemory:
         arcs = np.concatenate([ping.points for heard in self._heard.values() for ping in heard.rounds])
         return points_relative(arcs, self._newest.pose)
 
-    def _seeing(self, newest: _Taken) -> list[_Taken]:
-        """Valid views of the ground by scans and pings, oldest first, ``newest`` last.
+    def _latest(self) -> list[_Taken]:
+        """The latest scan of every lidar, oldest first."""
+        return sorted((eye.newest for eye in self._eyes if eye.newest is not None), key=lambda scan: scan.beams.stamp)
 
-        While the body stands, the latest scan is also among the kept scans.
+    def _seeing(self, newest: _Taken) -> list[_Taken]:
+        """Valid views of the ground by scans and pings, oldest first, the latest scan of every lidar last.
+
+        While the body stands, the latest scans are also among the kept scans.
         """
         edge = 1e-6  # ground this near to a moving body counts as its edge, m
-        views = (*self._views, *(view for heard in self._heard.values() for view in heard.views))
-        return [*sorted(self._fresh(views, newest), key=lambda view: view.beams.stamp), newest._replace(beside=edge)]
+        scans = (view for eye in self._eyes for view in eye.views)
+        views = (*scans, *(view for heard in self._heard.values() for view in heard.views))
+        latest = [scan._replace(beside=edge) for scan in self._fresh(self._latest(), newest)]
+        return [*sorted(self._fresh(views, newest), key=lambda view: view.beams.stamp), *latest]
 
     def _fresh(self, kept: Iterable[_Taken], newest: _Taken) -> list[_Taken]:
         return [
@@ -248,7 +281,7 @@ class ScanMemory:
         newest = self._newest
         if newest is None:
             return on_body(self._footprint, points, DRIFT)
-        there = placed(np.column_stack((points, np.zeros(len(points)))), newest.pose)[:, :2]
+        there = _lifted(points, newest.pose)
         return np.asarray(self._free(self._seeing(newest), there).any(axis=0))
 
     def survey(self) -> Generator[None, None, GroundSurvey | None]:
@@ -313,6 +346,11 @@ def spaced(points: Array, spacing: float) -> Array:
     """Thin points (n, 2) in beam order to one per ``spacing`` (m) along the line through them."""
     along = np.cumsum(np.hypot(*np.diff(points, axis=0, prepend=points[:1]).T))
     return points[np.diff(along // spacing, prepend=-1.0) > 0]
+
+
+def _lifted(points: Array, pose: Pose2) -> Array:
+    """Points (n, 2) relative to ``pose`` as points of the frame that the pose is in."""
+    return placed(np.column_stack((points, np.zeros(len(points)))), pose)[:, :2]
 
 
 def _keep(views: deque[_Taken], taken: _Taken) -> None:

@@ -139,7 +139,7 @@ class StalenessCheck(Check):
             figures.append(staleness.refused)
         yield Cause(
             reason=reason,
-            source=STALE_SENSORS[reason].value,
+            source=staleness.source.value,
             since=since if staleness.since is None else staleness.since,
             text=reason.text,
             measurements=tuple(figures),

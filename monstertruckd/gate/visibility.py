@@ -1,6 +1,7 @@
 """View of the lidar: a beam without a range may mean free ground, or a covered or dazzled sensor."""
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
 from monstertruck_planners.collision import Footprint, on_body
-from monstertruck_schemas.sensor import NO_ECHO, VALID_BEAM, LaserScan
+from monstertruck_schemas.sensor import HIDDEN, NO_ECHO, VALID_BEAM, LaserScan
 
 SECTORS: Final = 36
 """Number of sectors around the lidar: 0.1 m wide at the end of the checked distance, narrower than the body."""
@@ -33,7 +34,7 @@ class Visibility:
         self._footprint = footprint
         self._mount = mount
         self._share = share
-        self._geometry: tuple[float, float, int] | None = None
+        self._geometry: tuple[float, float, bytes] | None = None
         self._sector_of_beam: Sectors = np.empty(0, np.intp)
         self._beams: Array = np.zeros(SECTORS)
         self._field: NDArray[np.bool_] = np.zeros(SECTORS, np.bool_)
@@ -46,12 +47,13 @@ class Visibility:
             scan: the revolution.
             points: valid returns of the scan in base, ``scan_points``, shape (n, 2), m.
         """
-        geometry = scan.start_angle, scan.angle_increment, len(scan.ranges)
+        shown = scan.codes != HIDDEN
+        geometry = scan.start_angle, scan.angle_increment, shown.tobytes()
         if geometry != self._geometry:
             self._geometry = geometry
-            start, increment, count = geometry
-            self._sector_of_beam = _sector(start + increment * np.arange(count, dtype=np.float64))
-            self._beams = np.bincount(self._sector_of_beam, minlength=SECTORS).astype(float)
+            start, increment, _ = geometry
+            self._sector_of_beam = _sector(start + increment * np.arange(len(shown), dtype=np.float64))
+            self._beams = np.bincount(self._sector_of_beam, weights=shown, minlength=SECTORS).astype(np.float64)
             present = 0.5  # minimum fraction of a sector's beams in a scan for the sector to be in the field of view
             self._field = self._beams * abs(increment) > present * SECTOR
         sees = scan.codes <= NO_ECHO
@@ -70,19 +72,24 @@ class Visibility:
         """Whether each point (n, 2) in base (m) lies in the lidar's field of view."""
         return self._field[self.sectors_of(points)]
 
-    def travelled(self, ground: Array) -> Sectors:
-        """Sectors of the points (n, 2) in base (m) that are not under the body."""
-        margin = 0.005  # ground this near to the body counts as under it, m
-        sectors = self.sectors_of(ground[~on_body(self._footprint, ground, margin)])
-        return np.bincount(sectors, minlength=SECTORS).nonzero()[0]
-
     def last_seen(self, sectors: Sectors) -> NDArray[np.int64]:
-        """Time each sector was last seen, ns, 0 for never; omits sectors outside the lidar's field of view."""
-        return self._seen_at[sectors[self._field[sectors]]]
+        """Time each sector was last seen, ns; 0 for never, -1 outside the lidar's field of view."""
+        return np.where(self._field[sectors], self._seen_at[sectors], -1)
 
     def age(self, points: Array, now: int) -> NDArray[np.int64]:
         """Time since the sector of every point (n, 2) in base was last seen, ns."""
         return now - self._seen_at[self.sectors_of(points)]
+
+
+def travelled(views: Sequence[Visibility], body: Footprint, ground: Array) -> Sectors:
+    """Sectors of the points (n, 2) in base (m) that are not under the body, by lidar.
+
+    Returns:
+        Shape (lidars, m): every combination of sectors once.
+    """
+    margin = 0.005  # ground this near to the body counts as under it, m
+    outside = ground[~on_body(body, ground, margin)]
+    return np.unique(np.stack([view.sectors_of(outside) for view in views]), axis=1)
 
 
 def _sector(bearings: Array) -> Sectors:

@@ -35,7 +35,7 @@ from monstertruck_schemas.zones import Zones
 
 RosValues = dict[str, Any]
 
-FRAMES: Final = {"base": "base_link", "lidar": "laser"}
+FRAMES: Final = {"base": "base_link", "lidar": "laser", "lidar_2": "laser_2"}
 """Frames that ROS calls otherwise."""
 
 

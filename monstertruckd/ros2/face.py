@@ -155,6 +155,7 @@ class RosFace:
         """Topics of the robot with the handlers of their messages."""
         return (
             (t.SCAN, self._scan),
+            (t.SCAN_2, partial(self._scan, topic="scan_2")),
             (t.ODOMETRY, self._odometry_message),
             (t.TRANSFORMS, self._transforms),
             (t.POSE, self._pose),
@@ -190,8 +191,8 @@ class RosFace:
             text = renamed_links(self._facts.description, self._names.frame)
             self._publish("robot_description", "std_msgs/msg/String", {"data": text}, LATCHED)
 
-    def _scan(self, message: LaserScan) -> None:
-        self._publish("scan", "sensor_msgs/msg/LaserScan", convert.scan(message, self._names), SENSOR)
+    def _scan(self, message: LaserScan, topic: str = "scan") -> None:
+        self._publish(topic, "sensor_msgs/msg/LaserScan", convert.scan(message, self._names), SENSOR)
 
     def _odometry_message(self, message: Odometry) -> None:
         self._odometry = True

@@ -61,6 +61,7 @@ SHOWN: Final[tuple[Shown[Any], ...]] = (
     _whole(topics.CALIBRATION, "calibration"),
     Shown(topics.GROUND, "ground", frames.ground, 2.0, 20_000.0),  # bandwidth limit of ground images (bytes/s)
     Shown(topics.SCAN, "scan", frames.scan, 0.1),
+    Shown(topics.SCAN_2, "scan_2", partial(frames.scan, kind="scan_2"), 0.1),
     Shown(topics.TRANSFORMS, "transforms", frames.transforms, 0.2),
     Shown(topics.PATH, "path", frames.path),
     _whole(topics.GOAL, "goal"),

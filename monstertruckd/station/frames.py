@@ -52,12 +52,12 @@ def refusal(number: int, error: TruckError) -> str:
     return text("answer", id=number, ok=False, reason=reason.value, text=str(error))
 
 
-def scan(of: LaserScan) -> bytes:
-    """Return a scan; payload: uint16 ranges in mm, little-endian, 0 = none."""
+def scan(of: LaserScan, kind: str = "scan") -> bytes:
+    """Return a scan of the lidar that ``kind`` names; payload: uint16 ranges in mm, little-endian, 0 = none."""
     # 65.0: maximum range (m), because ranges are sent as millimetres in 16 bits
     ranges = np.where(np.isfinite(of.ranges) & (of.ranges < 65.0), of.ranges * 1000.0, 0.0)
     return binary(
-        "scan",
+        kind,
         np.rint(ranges).astype("<u2").tobytes(),
         stamp=of.stamp,
         frame=of.frame,

@@ -11,6 +11,7 @@ class DeviceRole(StrEnum):
     """
 
     LIDAR = "lidar"
+    LIDAR_2 = "lidar_2"
     DRIVE = "drive"
     DRIVE_2 = "drive_2"
     DRIVE_3 = "drive_3"

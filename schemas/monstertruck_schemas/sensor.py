@@ -54,6 +54,8 @@ STANDARD_GRAVITY = 9.80665
 """1 g, the unit of accelerometers, m/s^2 (ISO 80000-3)."""
 VALID_BEAM = 255
 """``LaserScan.codes`` value of a beam that measured a range."""
+HIDDEN = 254
+"""``LaserScan.codes`` value of a beam that a part of the robot hides, by the configuration."""
 NO_ECHO = 2
 """Greatest ``LaserScan.codes`` value of a beam that met nothing within the sensor's range."""
 

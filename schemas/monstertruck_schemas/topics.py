@@ -158,6 +158,15 @@ POSE_STALE: Final = 0.2
 SCAN: Final = Topic(
     "sensor/scan", LaserScan, W.DRIVER, "Lidar revolution", 10, stale_after=0.25, foxglove="foxglove.LaserScan"
 )
+SCAN_2: Final = Topic(
+    "sensor/scan_2",
+    LaserScan,
+    W.DRIVER,
+    "Revolution of the second lidar, where there is one",
+    10,
+    stale_after=0.25,
+    foxglove="foxglove.LaserScan",
+)
 COMPASS: Final = Topic("sensor/compass", Attitude, W.DRIVER, "Heading and tilt", 20, stale_after=0.25)
 DRIVE: Final = Topic("sensor/drive", DriveFeedback, W.DRIVER, "Drive motor feedback", 20, stale_after=DRIVE_STALE)
 DRIVE_2: Final = Topic(
@@ -367,6 +376,8 @@ STAND_POSE: Final = Topic(
     place="stand/sensor/pose_{robot}",
 )
 
+SCANS: Final = (SCAN, SCAN_2)
+"""Scans of the lidars in their order; most robots have the first one only."""
 DRIVES: Final = (DRIVE, DRIVE_2, DRIVE_3, DRIVE_4)
 """Feedback of the driven shafts in their order; most robots have the first one only."""
 CMD_DRIVES: Final = (CMD_DRIVE, CMD_DRIVE_2, CMD_DRIVE_3, CMD_DRIVE_4)

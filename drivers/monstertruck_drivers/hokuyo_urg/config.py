@@ -6,18 +6,15 @@ from pydantic import Field
 
 from monstertruck_drivers.emulation import RangeSheet
 from monstertruck_drivers.hokuyo_urg.models import LX, URG_04LX
-from monstertruck_drivers.scanning.config import ReturnsConfig
-from monstertruck_schemas.base import FrameId, Schema
+from monstertruck_drivers.scanning.config import ReturnsConfig, ScannerConfig
 
 
-class ScipConfig(Schema):
+class ScipConfig(ScannerConfig):
     """How a scanner that speaks SCIP is driven; its geometry is always read from the sensor itself."""
 
     SERIES: ClassVar[tuple[str, ...]]
     """One of these is in the name of the product or of the model."""
 
-    frame: FrameId = "lidar"
-    """Frame of the published scans."""
     serial_number: str | None = None
     """Unit expected on this port (``SERI`` of VV); None accepts any."""
     scan_format: Literal["MD", "MS"] = "MD"

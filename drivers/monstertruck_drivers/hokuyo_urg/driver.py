@@ -426,7 +426,7 @@ class HokuyoDriver(ScannerDriver[ScipConfig]):
                 stamp=step_0 + round(first * geometry.step_time * SECOND),
                 received=received,
                 seq=self._out.next_seq(),
-                frame=config.frame,
+                frame=config.frame or self.name,
                 start_angle=geometry.angle(first),
                 end_angle=geometry.angle(last),
                 time_increment=geometry.step_time * config.cluster,

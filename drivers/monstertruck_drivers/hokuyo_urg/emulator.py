@@ -588,4 +588,4 @@ class HokuyoEmulator(FaultyDevice):
 
 def emulated(setup: EmulatorSetup) -> HokuyoEmulator:
     """The lidar of a simulated truck."""
-    return HokuyoEmulator(setup.clock, setup.physics.lidar, seed=setup.seed)
+    return HokuyoEmulator(setup.clock, setup.room, seed=setup.seed)

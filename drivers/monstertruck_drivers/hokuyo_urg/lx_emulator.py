@@ -112,4 +112,4 @@ class LxEmulator(HokuyoEmulator):
 def emulated(setup: EmulatorSetup) -> LxEmulator:
     """The lidar of a simulated robot."""
     settings = setup.settings if isinstance(setup.settings, HokuyoLxConfig) else HokuyoLxConfig()
-    return LxEmulator(setup.clock, setup.physics.lidar, LX[settings.model], seed=setup.seed)
+    return LxEmulator(setup.clock, setup.room, LX[settings.model], seed=setup.seed)

@@ -118,4 +118,4 @@ class Ld19Emulator(FaultyDevice):
 def emulated(setup: EmulatorSetup) -> Ld19Emulator:
     """The lidar of a simulated robot."""
     settings = setup.settings if isinstance(setup.settings, Ld19Config) else Ld19Config()
-    return Ld19Emulator(setup.clock, setup.physics.lidar, MODELS[settings.model], seed=setup.seed)
+    return Ld19Emulator(setup.clock, setup.room, MODELS[settings.model], seed=setup.seed)

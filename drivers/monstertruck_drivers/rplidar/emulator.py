@@ -302,4 +302,4 @@ def emulated(setup: EmulatorSetup) -> RplidarEmulator:
     """The lidar of a simulated robot."""
     settings = setup.settings if isinstance(setup.settings, RplidarConfig) else RplidarConfig()
     serial = settings.serial_number or "7DED9A87C5E392D3A5E49EF0ED383D65"
-    return RplidarEmulator(setup.clock, setup.physics.lidar, MODELS[settings.model], seed=setup.seed, serial=serial)
+    return RplidarEmulator(setup.clock, setup.room, MODELS[settings.model], seed=setup.seed, serial=serial)

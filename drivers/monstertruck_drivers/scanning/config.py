@@ -1,11 +1,14 @@
 """Settings that all scanners with a turning head share."""
 
+import math
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from monstertruck_drivers.emulation import RangeSheet
 from monstertruck_schemas.base import FrameId, Schema
+
+Bearing = Annotated[float, Field(ge=-math.pi, le=math.pi)]
 
 
 def sheet(settings: Any) -> RangeSheet:
@@ -15,7 +18,17 @@ def sheet(settings: Any) -> RangeSheet:
     return stated
 
 
-class ReturnsConfig(Schema):
+class ScannerConfig(Schema):
+    """Settings that all scanners share."""
+
+    frame: FrameId | None = None
+    """Frame of the published scans; null: named like the role"""
+    hidden: Annotated[tuple[tuple[Bearing, Bearing], ...], Field(strict=False)] = ()
+    """Sectors hidden by parts of the robot such as a mast: first and last bearing counter-clockwise in the published
+    scans (rad); they are outside the field of view"""
+
+
+class ReturnsConfig(ScannerConfig):
     """Settings of a scanner that cannot tell a covered window from open ground."""
 
     no_return: Literal["unknown", "free"] = "unknown"
@@ -26,8 +39,6 @@ class ReturnsConfig(Schema):
 class TurningHeadConfig(ReturnsConfig):
     """Settings of a scanner that streams its beams while its head turns."""
 
-    frame: FrameId = "lidar"
-    """Frame of the published scans."""
     silence: Annotated[float, Field(gt=0, le=10)] = 0.5
     """Maximum time without a byte before the session ends (s)"""
     first_scan: Annotated[float, Field(gt=0, le=60)] = 6.0

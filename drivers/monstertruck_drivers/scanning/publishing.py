@@ -18,6 +18,7 @@ def publish(
     received: int,
     sheet: RangeSheet,
     config: TurningHeadConfig,
+    name: str,
     out: Publisher[LaserScan],
 ) -> None:
     """Publish a revolution of a head that turns clockwise.
@@ -28,6 +29,7 @@ def publish(
         received: arrival time of its last sample (ns).
         sheet: ranges and noise of the scanner.
         config: settings of the scanner.
+        name: name of its service.
         out: publisher of the scans.
     """
     start = math.pi - math.tau * turn.first
@@ -37,7 +39,7 @@ def publish(
             stamp=origin + round(turn.begin),
             received=received,
             seq=out.next_seq(),
-            frame=config.frame,
+            frame=config.frame or name,
             start_angle=start,
             end_angle=start - math.tau * turn.step * (count - 1),
             time_increment=turn.period * turn.step / SECOND,

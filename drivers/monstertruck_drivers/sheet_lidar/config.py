@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from monstertruck_drivers.emulation import RangeSheet
 from monstertruck_drivers.scanning.config import ReturnsConfig
 from monstertruck_drivers.sheet_lidar.protocol import MOST_BEAMS
-from monstertruck_schemas.base import FrameId, Positive
+from monstertruck_schemas.base import Positive
 
 
 class SheetLidarConfig(ReturnsConfig):
@@ -36,8 +36,6 @@ class SheetLidarConfig(ReturnsConfig):
     """Error bound of a range (m)"""
     relative_error: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Error bound as a fraction of the range, where that is larger"""
-    frame: FrameId = "lidar"
-    """Frame of the published scans"""
     first_scan: Annotated[float, Field(gt=0, le=60)] = 6.0
     """Maximum time for the first scan, including the motor's start (s)"""
     stale: Annotated[float, Field(gt=0, le=10)] = 1.0

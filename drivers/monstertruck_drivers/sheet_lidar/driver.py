@@ -53,7 +53,7 @@ class SheetLidarDriver(ScannerDriver[SheetLidarConfig]):
                 stamp=stamp,
                 received=received,
                 seq=self._out.next_seq(),
-                frame=config.frame,
+                frame=config.frame or self.name,
                 start_angle=config.start_angle,
                 end_angle=config.start_angle + config.increment * (config.beams - 1),
                 time_increment=config.time_increment,

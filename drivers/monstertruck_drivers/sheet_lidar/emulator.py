@@ -93,4 +93,4 @@ class SheetLidarEmulator(FaultyDevice):
 
 def emulated(setup: EmulatorSetup) -> SheetLidarEmulator:
     """The scanner of a simulated robot."""
-    return SheetLidarEmulator(setup.clock, setup.physics.lidar, setup.settings, seed=setup.seed)
+    return SheetLidarEmulator(setup.clock, setup.room, setup.settings, seed=setup.seed)

@@ -4,7 +4,7 @@ These are the *true* values of the plant. The daemon has its own calibration: to
 here only. ``noise: false`` keeps the physics and disables every random part.
 """
 
-from math import radians
+from math import pi, radians
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
 
@@ -735,6 +735,8 @@ class WorldConfig(Schema):
     mechanics: MechanicsConfig = MechanicsConfig()
     battery: BatteryModelConfig = BatteryModelConfig()
     lidar: LidarConfig = LidarConfig()
+    lidar_2: LidarConfig = LidarConfig(x=-0.14, yaw=pi)
+    """True mount of the second lidar, which has no weight"""
     mount: MountConfig = MountConfig()
     camera: CameraConfig = CameraConfig()
     compass: CompassModelConfig = CompassModelConfig()

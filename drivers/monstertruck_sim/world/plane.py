@@ -1,6 +1,8 @@
 """The engine ``plane``: a footprint that moves over a map, tilted by a profile of the ground or as commanded."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import partial
 from math import hypot, radians
 from typing import NamedTuple
 
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, Twist2
 from monstertruck_runtime.errors import InputError
-from monstertruck_sim.world.config import SimTruckConfig, SinusoidTilt, SteadyTilt, TiltConfig, WorldConfig
+from monstertruck_sim.world.config import LidarConfig, SimTruckConfig, SinusoidTilt, SteadyTilt, TiltConfig, WorldConfig
 from monstertruck_sim.world.obstacles import Box, Obstacle
 from monstertruck_sim.world.plant import Caster, Plant
 from monstertruck_sim.world.scene import Surroundings
@@ -132,7 +134,8 @@ class Engine(NamedTuple):
 
     plant: Plant
     space: Space
-    sweep: Sweep
+    sweep_of: Callable[[LidarConfig], Sweep]
+    """Beams of a lidar on the robot."""
     solids: Solids | None = None
     """Objects that sonars detect in addition to the walls."""
 
@@ -173,4 +176,4 @@ def plane(config: WorldConfig, footprint: PlanOutline, start: Pose2, seed: int |
     """Create the plane engine for one robot."""
     space = PlaneSpace(footprint, config)
     plant = TruckPlant(config.truck, config.battery, start, space.contact, space.attitude, seed)
-    return Engine(plant, space, PlaneSweep(space.cast, space.terrain, config.lidar))
+    return Engine(plant, space, partial(PlaneSweep, space.cast, space.terrain))

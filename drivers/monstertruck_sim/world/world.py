@@ -78,18 +78,23 @@ class World:
         self._footprint = PlanOutline(self.scene, config.truck, name)
         if self.scene.overlap(self.scene.solid, self._footprint.box(start)) > 0:
             raise InputError(f"start: the robot at {start} touches what is not free on the map {config.map}")
-        self._plant, self._space, sweep, solids = make_engine(config, self._footprint, start, noise_seed, lidar=lidar)
+        self._plant, self._space, sweep_of, solids = make_engine(
+            config, self._footprint, start, noise_seed, lidar=lidar
+        )
         self._plant.together = self.scene.advance
         self._plant.chargers = config.chargers
         self._plant.on_blocked = self._footprint.blocked
         self.scene.add_body(self)
         cast = self._space.cast
-        self._lidar = SimulatedLidar(self._plant, sweep, config.lidar, noise_seed)
+        self._lidar = SimulatedLidar(self._plant, sweep_of(config.lidar), config.lidar, noise_seed)
         self.lidar: ScannedRoom = self._lidar
+        other_seed = None if noise_seed is None else noise_seed + 1
+        lidar_2 = SimulatedLidar(self._plant, sweep_of(config.lidar_2), config.lidar_2, other_seed)
+        self.lidar_2: ScannedRoom = lidar_2
         pitch, roll = config.mount.pitch, config.mount.roll
         self._horns = Horn(pitch.zero, pitch.direction), Horn(roll.zero, roll.direction)
         self.view = make_view(config, self._plant, cast, self.scene, seed)
-        self._lidar.board_at = self.view.board_at
+        self._lidar.board_at = lidar_2.board_at = self.view.board_at
         self.motors: tuple[SimulatedMotor, ...] = tuple(
             SimulatedMotor(self._plant, config.truck.motor, noise_seed, i) for i in range(len(self._plant.shafts))
         )

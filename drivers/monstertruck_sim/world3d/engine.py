@@ -5,6 +5,7 @@ heights by the project's own kernels: MuJoCo's rays cost 0.9 ms a scan against 4
 400 x 400 heights. Only blocks on the ground, which those kernels do not model, are found by MuJoCo's rays.
 """
 
+from functools import partial
 from math import hypot, radians
 
 import mujoco
@@ -325,5 +326,4 @@ def rigid(config: WorldConfig, footprint: PlanOutline, start: Pose2, *, lidar: b
     plant.before_steps = space.follow
     if config.tilt.kind == "steady":
         space.set_tilt(config.tilt)
-    sweep = RigidSweep(plant, space.cast, ground, config.lidar)
-    return Engine(plant, space, sweep, RigidEchoes(plant, config.sonar.height))
+    return Engine(plant, space, partial(RigidSweep, plant, space.cast, ground), RigidEchoes(plant, config.sonar.height))

@@ -3,6 +3,7 @@ import { compose, moved, outline, wheelAngles, wrapped } from "./geometry.js";
 import { Past } from "./series.js";
 
 const COLOURS = ["map", "map-free", "map-wall", "map-grid", "scan", "trail", "route", "deformed", "goal", "ghost", "truck", "ink", "card", "accent", "frontier", "point", "bad", "warn"];
+const LIDARS = ["scan", "scan_2"];
 const TRAIL_STEP = 0.03;
 const TRAIL_LENGTH = 6000;
 const POSES = 60;
@@ -48,7 +49,7 @@ export class MapView {
     this.past = new Past(0.2); // seconds between two poses
     this.cursor = null;
     this.pose = null;
-    this.points = null;
+    this.points = {};
     this.trail = [];
     this.grid = null;
     this.canvas.dataset.drawn = false;
@@ -82,7 +83,7 @@ export class MapView {
     const { link } = this;
     link.on("robot", () => this.clear());
     link.on("pose", (message) => this.takePose(message));
-    link.on("scan", (message) => this.takeScan(message));
+    for (const kind of LIDARS) link.on(kind, (message) => this.takeScan(message));
     link.on("path", (message) => this.takePath(message));
     link.on("map", (message) => this.takeMap(message));
     link.on("tile", (message) => this.takeTile(message));
@@ -153,7 +154,8 @@ export class MapView {
       points[count++] = x + (ranges[i] / 1000) * Math.cos(angle);
       points[count++] = y + (ranges[i] / 1000) * Math.sin(angle);
     }
-    this.take("points", points.subarray(0, count));
+    this.points[message.kind] = points.subarray(0, count);
+    this.dirty = true;
   }
 
   takePath(message) {
@@ -367,7 +369,7 @@ export class MapView {
       const { origin, width, height, resolution } = this.grid;
       for (const [i, j] of [[0, 0], [width, 0], [0, height], [width, height]]) places.push(compose(origin, [i * resolution, j * resolution, 0]));
     }
-    for (let i = 0; !this.grid && i < (this.points?.length ?? 0); i += 2) places.push([this.points[i], this.points[i + 1]]);
+    for (const points of this.grid ? [] : Object.values(this.points)) for (let i = 0; i < points.length; i += 2) places.push([points[i], points[i + 1]]);
     if (this.pose) places.push(this.pose);
     if (!places.length) return;
     const [xs, ys] = [places.map((p) => p[0]), places.map((p) => p[1])];
@@ -482,10 +484,12 @@ export class MapView {
   }
 
   drawScan(c, px) {
-    if (!this.points || this.link.age("scan") > 1) return;
     const size = Math.max(2.5 * px, 0.012);
     c.fillStyle = this.colour.scan;
-    for (let i = 0; i < this.points.length; i += 2) c.fillRect(this.points[i] - size / 2, this.points[i + 1] - size / 2, size, size);
+    for (const [kind, points] of Object.entries(this.points)) {
+      if (this.link.age(kind) > 1) continue;
+      for (let i = 0; i < points.length; i += 2) c.fillRect(points[i] - size / 2, points[i + 1] - size / 2, size, size);
+    }
   }
 
   shape() {

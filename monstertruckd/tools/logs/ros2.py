@@ -100,6 +100,7 @@ TEXT: Final = "std_msgs/msg/String"
 
 CONVERTERS: Final[dict[Topic[Any], tuple[str, str, Converter]]] = {
     t.SCAN: ("/sensor/scan", "sensor_msgs/msg/LaserScan", convert.scan),
+    t.SCAN_2: ("/sensor/scan_2", "sensor_msgs/msg/LaserScan", convert.scan),
     t.CAMERA: ("/sensor/camera/compressed", "sensor_msgs/msg/CompressedImage", convert.image),
     t.BATTERY: ("/sensor/battery", "sensor_msgs/msg/BatteryState", convert.battery),
     t.ODOMETRY: ("/state/odometry", "nav_msgs/msg/Odometry", convert.odometry),

@@ -23,6 +23,7 @@ from monstertruck_schemas.base import Message
 from monstertruck_schemas.health import SlamHealth
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.req import GoalControl, GoalRequest
+from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.sensor import LaserScan
 from monstertruck_schemas.topics import Topic
 from monstertruckd.assembly.devices import scan_publisher
@@ -188,7 +189,7 @@ class Chain:
         self._answering = False
         self._answers = 0
         self.bus = Bus(clock)
-        self._scans: Publisher[LaserScan] = scan_publisher(config, self.bus)
+        self._scans: Publisher[LaserScan] = scan_publisher(DeviceRole.LIDAR, config, self.bus)
         self._services = list(self._build(config))
         self.bus.listen(topics.SLAM, self._count_answer)
         self._paces = {service.name: Pace() for service in self._services if service.name in TICKS}

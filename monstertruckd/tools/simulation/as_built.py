@@ -23,7 +23,7 @@ def as_built(world: WorldConfig, config: TruckConfig) -> WorldConfig:
     lengths = ("wheelbase", "track", "wheel_radius", "length", "width", "mass")
     truck = {name: getattr(geometry, name) for name in lengths} | {"body": config.body} | _servos(config)
     found: dict[str, Any] = {"truck": truck | {"motor": _motor(config)}, "battery": _pack(config)}
-    for name in ("lidar", "camera"):
+    for name in ("lidar", "lidar_2", "camera"):
         device = devices.present().get(name)
         found[name] = {} if device is None else _place(device.mount)
     return _below(world, found)

@@ -58,6 +58,8 @@ class ConsistencyInputs:
     encoders: Mailbox[WheelEncoders] | None
     battery: Mailbox[Battery] | None
     camera: Mailbox[CompressedImage] | None
+    scan_2: Mailbox[LaserScan] | None = None
+    """Second lidar: whether it repeats a scan; only scans of the first one measure motion."""
     stand: Mailbox[StandPose] | None = None
     """Cameras over the robot; the ground truth of a simulated world is not a measure."""
 
@@ -198,6 +200,8 @@ class ConsistencyService:
                 monitor.observe_stand(seen.stamp, seen.pose)
         for battery in () if inputs.battery is None else inputs.battery.drain():
             monitor.observe_value(DeviceRole.BATTERY, "voltage", battery.stamp, battery.raw_voltage)
+        for scan in () if inputs.scan_2 is None else inputs.scan_2.drain():
+            monitor.observe_whole(DeviceRole.LIDAR_2, scan.stamp, _whole(scan))
         for image in () if inputs.camera is None else inputs.camera.drain():
             monitor.observe_whole(DeviceRole.CAMERA, image.stamp, image.data)
 
@@ -220,10 +224,7 @@ class ConsistencyService:
         async with setup.actor as actor:
             await actor.start()
             async for scan in scans:
-                seen = int((scan.codes == VALID_BEAM).sum())
-                fewest_beams = 20  # minimum number of beams with a range for comparing a scan with the previous one
-                whole = scan.ranges.tobytes() if seen >= fewest_beams else None
-                self.monitor.observe_whole(DeviceRole.LIDAR, scan.stamp, whole)
+                self.monitor.observe_whole(DeviceRole.LIDAR, scan.stamp, _whole(scan))
                 work = self._work(setup, scan)
                 if work is None:
                     self.monitor.observe_scan(StepOutput(scan.stamp, None))
@@ -294,3 +295,9 @@ class ConsistencyService:
                 standing=standing,
             )
         )
+
+
+def _whole(scan: LaserScan) -> bytes | None:
+    """Return the ranges of a scan, to be compared with the previous one; None if it has too few."""
+    fewest_beams = 20
+    return scan.ranges.tobytes() if int((scan.codes == VALID_BEAM).sum()) >= fewest_beams else None

@@ -7,6 +7,7 @@ grazing angle, and everything near the sensor, would be counted by the dozen.
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Final
 
@@ -315,16 +316,16 @@ class GridBuilder:
         return len(self._stamps)
 
     def add(self, scan: Scan, stamp: int, pose: Array, mount: Pose2, passed: Array = NONE) -> bool:
-        """Integrate a scan if the robot moved far enough since the last one; returns whether it did.
+        """Integrate a scan if the robot moved far enough since the last one of its lidar; returns whether it did.
 
         Args:
             scan: points in base.
-            stamp: ns, later than those before.
+            stamp: ns, later than those of the same lidar before.
             pose: shape (3,), base in map.
             mount: planar pose of the sensor in base.
             passed: shape (k, 2), ends in base of beams that met nothing, see ``passed_ends``.
         """
-        if not len(scan) or not self._due(stamp, pose):
+        if not len(scan) or not self._due(stamp, pose, mount):
             return False
         longest_point = 32.7  # points are kept as 16-bit millimetres, m
         near, far = (ends[np.abs(ends).max(axis=1) < longest_point] for ends in (scan.points, passed))
@@ -374,14 +375,15 @@ class GridBuilder:
         for i in range(len(self._stamps)):
             self._draw(i)
 
-    def _due(self, stamp: int, pose: Array) -> bool:
-        if not self._stamps:
+    def _due(self, stamp: int, pose: Array, mount: Pose2) -> bool:
+        last = next((i for i in reversed(range(len(self))) if self._mounts[i] == mount), None)
+        if last is None:
             return True
-        config, off = self._config, between(self._poses[-1], pose)
+        config, off = self._config, between(self._poses[last], pose)
         return bool(
             np.hypot(off[0], off[1]) >= config.spacing
             or abs(off[2]) >= config.turn
-            or stamp - self._stamps[-1] >= config.pause * SECOND
+            or stamp - self._stamps[last] >= config.pause * SECOND
         )
 
     def _draw(self, i: int) -> None:
@@ -393,9 +395,14 @@ class GridBuilder:
         self.grid.add(transform(pose, np.array([mount[:2]]))[0], points[:returns], passed)
 
     def _prune(self) -> None:
-        """Drop every other scan except in the latest quarter."""
-        count = len(self._stamps)
-        self._keep([i for i in range(count) if i % 2 == 0 or i >= 3 * count // 4])
+        """Drop every other scan of each lidar except in the latest quarter."""
+        recent, counts = 3 * len(self) // 4, Counter[Pose2]()
+        kept = []
+        for i, mount in enumerate(self._mounts):
+            if counts[mount] % 2 == 0 or i >= recent:
+                kept.append(i)
+            counts[mount] += 1
+        self._keep(kept)
 
     def _keep(self, kept: list[int]) -> None:
         self._stamps = [self._stamps[i] for i in kept]

@@ -456,6 +456,8 @@ class MappingEstimator:
         self._moved = False
         self._redrawn = False
         self._misfits = 0
+        self._drawn: tuple[Array, Pose2] | None = None
+        """Base in map and in odom at the latest scan, if it belongs to the grid."""
         self._apart: list[tuple[Scan, int, Pose2]] = []
         """Keyframes that are not on the map: scan, stamp, mount."""
         self._doubtful: list[tuple[Scan, int, Pose2]] = []
@@ -497,7 +499,10 @@ class MappingEstimator:
                 self._apart.append(keyframe)
             elif self._doubtful:
                 self._doubtful.append(keyframe)
+        self._drawn = None
         if not lost and not joined and accepted:
+            if inputs.odom is not None and self.mapper.odometry is OdometryUse.USED:
+                self._drawn = step.pose, inputs.odom
             passed = NONE if self._passed is None else passed_ends(inputs, self._passed)
             self.builder.add(step.scan, step.stamp, step.pose, inputs.mount, passed)
             if inputs.odom is not None and self.mapper.odometry is OdometryUse.USED:
@@ -525,6 +530,14 @@ class MappingEstimator:
             moved,
             self.mapper.odometry,
         )
+
+    def draw(self, scan: Scan, inputs: ScanInput) -> None:
+        """Add a scan of another lidar to the grid, where odometry since the latest scan places it."""
+        if self._drawn is not None and inputs.odom is not None:
+            pose, odom = self._drawn
+            there = compose(pose, between(np.array(odom), np.array(inputs.odom)))
+            passed = NONE if self._passed is None else passed_ends(inputs, self._passed)
+            self.builder.add(scan, inputs.stamp, there, inputs.mount, passed)
 
     def changes(self) -> tuple[list[GridPatch], bool]:
         """See ``Estimator``."""

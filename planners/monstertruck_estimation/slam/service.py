@@ -4,7 +4,7 @@ import asyncio
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -28,7 +28,7 @@ from monstertruck_runtime.actors.actor import WorkerActor
 from monstertruck_runtime.clock import SECOND, Clock
 from monstertruck_runtime.errors import DamagedFileError, WorkerError
 from monstertruck_runtime.mailbox import Mailbox
-from monstertruck_runtime.ports import EventSink, Publisher, Ready
+from monstertruck_runtime.ports import EventSink, Publisher, Ready, Subscription
 from monstertruck_schemas.base import Pose2D, Twist2D
 from monstertruck_schemas.body import Mount
 from monstertruck_schemas.event import Severity
@@ -49,6 +49,16 @@ CORRECTIONS: Final = {
 """Event text of a step that has corrected the map; {} is the number of closures."""
 
 
+@dataclass(frozen=True, slots=True)
+class OtherLidar:
+    """Second lidar: its scans complete the map; only those of the first one are matched."""
+
+    mount: Mount
+    scan: Subscription[LaserScan]
+    angles: ScanAngles | None
+    """As of the first lidar."""
+
+
 class SlamService:
     """Sends every scan to the worker with odometry at its stamp; between scans the pose follows odometry.
 
@@ -61,6 +71,7 @@ class SlamService:
         scan: lidar, bounded and counted.
         odometry: pose in odom; without it (None) the pose is published once per scan.
         angles: angles of body and mount at the time of scans, to discard hits of the ground; None without a compass.
+        other: the second lidar; None without one.
         pose: ``state/pose``.
         whole: ``state/map``.
         tiles: ``state/map_tiles``.
@@ -82,6 +93,7 @@ class SlamService:
         scan: Mailbox[LaserScan],
         odometry: Mailbox[Odometry] | None,
         angles: ScanAngles | None,
+        other: OtherLidar | None = None,
         pose: Publisher[Odometry],
         whole: Publisher[Grid],
         tiles: Publisher[Grid],
@@ -91,6 +103,8 @@ class SlamService:
     ) -> None:
         self._config, self._mount, self._body, self._run, self._clock = config, mount, body, run, clock
         self._scan, self._odometry, self._angles = scan, odometry, angles
+        self._other = other
+        self._other_sent: LaserScan | None = None
         self._motions = motion
         self._pose, self._whole, self._tiles, self._health, self._events = pose, whole, tiles, health, events
         self._history: deque[tuple[int, Pose2]] = deque(maxlen=128)  # poses of odometry kept: 2.5 s at 50 Hz
@@ -225,7 +239,7 @@ class SlamService:
             if reason is not None:
                 self._skip(reason)
                 continue
-            inputs = self._inputs(scan)
+            inputs = self._inputs(scan, self._mount, self._angles)
             start = None if self._started else Start(self._config, self._start(inputs.odom), self._body, self._run)
             async with self._one_step:
                 outputs = await self._step(worker, self._work(inputs, start))
@@ -271,14 +285,24 @@ class SlamService:
             return "no odometry yet"
         return None
 
-    def _inputs(self, scan: LaserScan) -> ScanInput:
+    def _of_other(self) -> ScanInput | None:
+        """The latest scan of the second lidar, if it was not sent yet."""
+        other = self._other
+        scan = None if other is None else other.scan.latest
+        if other is None or scan is None or scan is self._other_sent or self._unusable(scan) is not None:
+            return None
+        self._other_sent = scan
+        return self._inputs(scan, other.mount, other.angles)
+
+    def _inputs(self, scan: LaserScan, mount: Mount, angles: ScanAngles | None) -> ScanInput:
         odom, twist = self._motion(scan.stamp, scan.stamp + round(scan.time_increment * len(scan.ranges) * SECOND))
-        height = self._mount.z if self._mount.z > 0 else None
+        tilts = None if angles is None else angles.at(scan)
+        height = mount.z if mount.z > 0 else None
         return replace(
-            ScanInput.of(scan, self._mount.planar),
+            ScanInput.of(scan, mount.planar),
             odom=odom,
             twist=twist,
-            slopes=self._slopes(scan),
+            slopes=None if tilts is None else plane_slopes(*tilts, yaw=mount.yaw),
             height=height,
             ceiling=self._config.ceiling,
         )
@@ -299,10 +323,6 @@ class SlamService:
             return (x, y, yaw), (0.0, 0.0, 0.0)
         vx, vy, wz = (between(poses[0], poses[1]) / (until / SECOND)).tolist()
         return (x, y, yaw), (vx, vy, wz)
-
-    def _slopes(self, scan: LaserScan) -> tuple[float, float] | None:
-        angles = None if self._angles is None else self._angles.at(scan)
-        return None if angles is None else plane_slopes(*angles, yaw=self._mount.yaw)
 
     def _start(self, odom: Pose2 | None) -> Pose2:
         """Return the start pose of a new map: the current pose in map."""
@@ -327,7 +347,13 @@ class SlamService:
             self._due["save"] = now + round(config.save_period * SECOND)
         self._sent_instants = self._instants if "tiles" in due else ()
         return WorkerInput(
-            start=start, scan=scan, tiles="tiles" in due, whole=whole, save=save, instants=self._sent_instants
+            start=start,
+            scan=scan,
+            other=self._of_other(),
+            tiles="tiles" in due,
+            whole=whole,
+            save=save,
+            instants=self._sent_instants,
         )
 
     def _take(self, outputs: WorkerOutput, scan: LaserScan) -> None:

@@ -62,6 +62,8 @@ class SlamWorker:
                     )
                 else:
                     made = estimator.step(scan, inputs.scan)
+                    if inputs.other is not None and isinstance(estimator, MappingEstimator):
+                        estimator.draw(prepare_input(inputs.other, self._longest), inputs.other)
                     if made is not None and MappingEvent.PRUNED in made.events:
                         give_back()
         joint = estimator.finish() if inputs.finish else None

@@ -94,6 +94,8 @@ class WorkerInput:
 
     start: Start | None = None
     scan: ScanInput | None = None
+    other: ScanInput | None = None
+    """Scan of the second lidar, which is drawn but not matched."""
     tiles: bool = False
     """Return the changed tiles."""
     whole: bool = False

@@ -78,7 +78,7 @@ def make_gate(
         GateConfig(**config),
         chassis=chassis,
         footprint=Footprint(),
-        points=ScanPoints((0.14, 0.0, 0.0)),
+        points=[ScanPoints((0.14, 0.0, 0.0))],
         services=services,
         nonce=nonce,
         battery_measured=battery_measured,

@@ -30,7 +30,7 @@ COVERED = ((-30.0, 30.0, 6),)
 
 
 def guard(**config):
-    return ObstacleGuard(InForce(GateConfig(**config)), FOOTPRINT, ScanPoints((0.14, 0.0, 0.0)))
+    return ObstacleGuard(InForce(GateConfig(**config)), FOOTPRINT, [ScanPoints((0.14, 0.0, 0.0))])
 
 
 def looked(checked, *obstacles, at=NOW, ways=AHEAD, unknown=()):

@@ -149,7 +149,7 @@ def test_a_sample_may_be_so_late_and_no_later(late, valid):
     sensors = monitor()
     message = scan(10 * SECOND).model_copy(update={"received": 10 * SECOND + late * MS})
     show(sensors, message)
-    assert (sensors.scan is message) is valid
+    assert (sensors.scans[0] is message) is valid
 
 
 def test_a_sample_of_the_instant_of_the_loss_is_from_before_it():
@@ -525,7 +525,7 @@ STRAIGHT = ((1.0, 0.0, 0.0),)
 
 
 def guard(**config):
-    return ObstacleGuard(InForce(GateConfig(**config)), FOOTPRINT, ScanPoints((0.14, 0.0, 0.0)))
+    return ObstacleGuard(InForce(GateConfig(**config)), FOOTPRINT, [ScanPoints((0.14, 0.0, 0.0))])
 
 
 def free_to(wall, now=SECOND, **config):

@@ -25,7 +25,7 @@ MOUNT = (0.14, 0.0, 0.0)
 
 
 def memory(distance=2.0):
-    return ScanMemory(FOOTPRINT, MOUNT, distance, 30.0)
+    return ScanMemory(FOOTPRINT, [MOUNT], distance, 30.0)
 
 
 def drive(remembered, metres, turn=0.0, now=SECOND, speed=0.2):
@@ -214,7 +214,7 @@ def fan(stamp, beams, bearing=0.0, increment=0.1, reach=1.0):
 
 
 def test_a_scan_sees_as_far_as_its_beams_reach_and_as_wide_as_they_are():
-    remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0, 30.0)
+    remembered = ScanMemory(FOOTPRINT, [(0.0, 0.0, 0.0)], 2.0, 30.0)
     remembered.observe(fan(SECOND, 11), np.empty((0, 2)))
 
     def sees(bearing, distance):
@@ -232,7 +232,7 @@ def test_a_scan_sees_as_far_as_its_beams_reach_and_as_wide_as_they_are():
     ("mount", "point"), [((0.2, 0.1, math.pi / 2), (0.2, 1.0)), ((-0.2, 0.1, math.pi), (-1.1, 0.1))]
 )
 def test_a_scan_is_seen_from_where_its_lidar_is_mounted(mount, point):
-    remembered = ScanMemory(FOOTPRINT, mount, 2.0, 30.0)
+    remembered = ScanMemory(FOOTPRINT, [mount], 2.0, 30.0)
     remembered.observe(fan(SECOND, 3), np.empty((0, 2)))
     (x, y), (ahead_x, ahead_y) = point, (math.cos(mount[2]), math.sin(mount[2]))
     here, beyond, aside = (x, y), (x + 0.2 * ahead_x, y + 0.2 * ahead_y), (x + 0.3 * ahead_y, y + 0.3 * ahead_x)
@@ -241,14 +241,14 @@ def test_a_scan_is_seen_from_where_its_lidar_is_mounted(mount, point):
 
 @pytest.mark.parametrize("code", range(21))
 def test_beams_that_met_nothing_see_free_ground_and_those_that_say_nothing_do_not(code):
-    remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0, 30.0)
+    remembered = ScanMemory(FOOTPRINT, [(0.0, 0.0, 0.0)], 2.0, 30.0)
     message = fan(SECOND, 11, reach=math.inf)
     remembered.observe(message.model_copy(update={"codes": np.full(11, code, np.uint8)}), np.empty((0, 2)))
     assert seen(remembered, 0.9) is (code <= 2)
 
 
 def test_scans_of_different_geometry_are_remembered_each_by_its_own():
-    remembered = ScanMemory(FOOTPRINT, (0.0, 0.0, 0.0), 2.0, 30.0)
+    remembered = ScanMemory(FOOTPRINT, [(0.0, 0.0, 0.0)], 2.0, 30.0)
     for second, (beams, bearing) in enumerate([(21, 2.0), (5, 0.0), (11, math.pi / 2)], 1):
         now = second * SECOND
         remembered.observe(fan(now, beams, bearing), np.empty((0, 2)))
@@ -263,7 +263,7 @@ def test_scans_of_lidars_that_turn_the_other_way_are_remembered_as_well(turn):
     there = np.column_stack((np.tile(np.linspace(-1.5, 1.5, 13), 13), np.repeat(np.linspace(-1.5, 1.5, 13), 13)))
     found = []
     for sense in (1, -1):
-        remembered = ScanMemory(FOOTPRINT, MOUNT, 2.0, 30.0)
+        remembered = ScanMemory(FOOTPRINT, [MOUNT], 2.0, 30.0)
         ranges = 1.0 + 0.4 * np.sin(2 * np.linspace(-turn / 2, turn / 2, 181) * sense)
         message = scan(SECOND).model_copy(
             update={
@@ -314,7 +314,7 @@ def test_of_an_outline_points_are_remembered_that_are_two_centimetres_apart():
 
 def guarding(*obstacles):
     """A guard that has taken one scan."""
-    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, [ScanPoints(MOUNT)])
     guard.observe(scan(SECOND, *obstacles))
     return guard
 
@@ -441,7 +441,7 @@ def test_ground_under_the_body_is_known_though_it_is_not_known_how_it_moves(angl
 
 @pytest.mark.parametrize(("beside", "behind"), [(0.5, 0.35), (0.35, 0.5)])
 def test_sideways_the_nearer_of_what_is_seen_and_what_is_remembered_counts(beside, behind):
-    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, [ScanPoints(MOUNT)])
     guard.observe(scan(SECOND, (0.3, behind)))
     now = SECOND
     for _ in range(120):
@@ -454,7 +454,7 @@ def test_sideways_the_nearer_of_what_is_seen_and_what_is_remembered_counts(besid
 
 @pytest.mark.parametrize(("aside", "stopped"), [(0.275, True), (0.295, False)])
 def test_a_turn_grazes_nothing_that_the_lidar_has_left_behind(aside, stopped):
-    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, [ScanPoints(MOUNT)])
     now = SECOND
     for x in np.arange(0.35, -0.05, -0.004):
         now += TICK
@@ -470,7 +470,7 @@ def test_a_turn_grazes_nothing_that_the_lidar_has_left_behind(aside, stopped):
 
 def test_what_stands_beside_the_way_in_guards_the_way_out_again():
     """A truck passed a door, and touched its jamb when it backed out: 1.5 m travelled lay between."""
-    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, [ScanPoints(MOUNT)])
     guard.observe(scan(SECOND, (0.35, 0.3)))
     now = SECOND
     for speed, seconds in ((0.2, 5.0), (-0.1, 5.5)):
@@ -496,7 +496,7 @@ def test_a_turn_stops_before_the_side_of_somebody_that_the_lidar_does_not_see():
         for points in (person(*somebody, np.linspace(0.0, math.tau, 200)), seen)
     ]
     assert contacts[0] < contacts[1] - 0.01, "it is the side that is not seen"
-    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, [ScanPoints(MOUNT)])
     guard.observe(scan(SECOND, *seen))
     assert guard.free_distance((turn,)) < contacts[0]
     for twist in ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0)):
@@ -511,7 +511,7 @@ def test_ground_that_nobody_has_seen_is_not_turned_onto_next_to_something(apart,
     post = corner * (1.0 + apart / np.hypot(*corner))
     ahead = np.add(post, (0.6, 0.0))
     bearing = math.degrees(math.atan2(ahead[1], ahead[0] - 0.14))
-    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, ScanPoints(MOUNT))
+    guard = ObstacleGuard(InForce(GateConfig()), FOOTPRINT, [ScanPoints(MOUNT)])
     now = SECOND
     guard.observe(scan(now, tuple(ahead), unknown=((-120, bearing - 1, 3), (bearing + 1, 120, 3))))
     for _ in range(150):
@@ -699,7 +699,7 @@ def test_scans_of_another_place_differ_from_those_of_people_who_pass():
 
 
 def test_ground_seen_from_a_place_less_certain_counts_less_and_at_last_not_at_all():
-    remembered = ScanMemory(FOOTPRINT, MOUNT, 2.0, 30.0, 0.05)
+    remembered = ScanMemory(FOOTPRINT, [MOUNT], 2.0, 30.0, 0.05)
     see(remembered, SECOND)
     now = drive(remembered, 0.4)
 
@@ -720,7 +720,7 @@ def test_ground_seen_from_a_place_less_certain_counts_less_and_at_last_not_at_al
 
 
 def test_an_error_of_the_heading_counts_at_the_length_of_a_truck():
-    remembered = ScanMemory(FOOTPRINT, MOUNT, 2.0, 30.0, 0.05)
+    remembered = ScanMemory(FOOTPRINT, [MOUNT], 2.0, 30.0, 0.05)
     see(remembered, SECOND)
     now = drive(remembered, 0.4)
     remembered.doubt(np.array([0.0] * 8 + [0.06**2]))

@@ -54,7 +54,7 @@ def complete(sensors, at=NOW):
 
 def test_topics_and_sensors_by_the_reason_of_their_silence():
     assert {
-        topics.SCAN: Reason.SCAN_STALE,
+        **dict.fromkeys(topics.SCANS, Reason.SCAN_STALE),
         topics.COMPASS: Reason.ATTITUDE_STALE,
         topics.STEERING: Reason.STEERING_STALE,
         **dict.fromkeys(topics.DRIVES, Reason.DRIVE_STALE),
@@ -71,7 +71,7 @@ def test_topics_and_sensors_by_the_reason_of_their_silence():
 def counts(sensors, message):
     """Whether a scan is valid."""
     show(sensors, message)
-    return sensors.scan is message
+    return sensors.scans[0] is message
 
 
 def test_nothing_stops_or_slows_a_truck_whose_sensors_are_well():
@@ -103,21 +103,21 @@ def test_a_scan_without_any_range_counts_on_open_ground_only():
     blind = scan(NOW, unknown=((-120.0, 120.0, 0),))
     sensors = monitor()
     assert not counts(sensors, blind)
-    assert sensors.scan is None
+    assert sensors.scans[0] is None
     refused = sensors.staleness(Reason.SCAN_STALE, NOW).refused
     assert (refused.name, refused.value, refused.limit) == ("beams with a range", 0.0, 1.0)
     assert counts(sensors, scan(NOW))
     open_ground = monitor(obstacle={"open_ground": True})
     assert counts(open_ground, blind)
     assert counts(open_ground, scan(NOW))
-    assert open_ground.scan is not None
+    assert open_ground.scans[0] is not None
 
 
 def test_a_scan_counts_up_to_the_tilt_allowed():
     sensors = monitor()
     assert counts(sensors, level := scan(NOW, tilt=0.35))
     assert not counts(sensors, scan(NOW, tilt=0.351))
-    assert sensors.scan is level
+    assert sensors.scans[0] is level
     refused = sensors.staleness(Reason.SCAN_STALE, NOW).refused
     assert (refused.name, refused.value, refused.unit, refused.limit) == ("scan plane tilt", 0.351, "rad", 0.35)
 
