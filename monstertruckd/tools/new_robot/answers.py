@@ -24,6 +24,12 @@ Body = Literal[
 ]
 UNSTEERED: Final = ("differential", "skid_steer", "mecanum", "omni")
 """Bodies without steering servos."""
+FRONT: Final = ("ackermann", "bicycle", "tricycle")
+"""Bodies with one steering servo, at the front."""
+SERVO_BOARDS: Final = ("maestro_esc", "pca9685_esc")
+"""Controllers with outputs for speed controller and servos."""
+SERVOS: Final = (("maestro", "pca9685"), ("drive", "maestro", "pca9685"))
+"""Steering of other controllers: without, and with a servo output."""
 Drive = Literal["vesc", "arduino_bridge", "steppers", "epos", "maestro_esc", "pca9685_esc"]
 LIDARS: Final = tuple(kind.name for kind in DEVICES.of_role("lidar"))
 NONE: Final = "none"
@@ -117,13 +123,35 @@ class Answers(Schema):
     def _fits(self) -> Self:
         if self.lidar_kind not in (NONE, *LIDARS):
             raise ValueError(f"lidar {self.lidar}: expected none or one of {', '.join(LIDARS)}")
+        if self.lidar != NONE:
+            self._check_model()
+        self._check_steering()
         if self.battery == "drive" and self.drive not in ("vesc", "maestro_esc"):
             raise ValueError(f"battery drive: {self.drive} does not measure it; expected none, steering or iio")
         if self.battery == "steering" and self.steering != "maestro":
             raise ValueError("battery steering: a Maestro measures it; expected steering maestro")
-        if self.steering == "drive" and self.drive not in ("vesc", "maestro_esc", "pca9685_esc"):
-            raise ValueError(f"steering drive: {self.drive} has no servo output; expected maestro or pca9685")
         return self
+
+    def _check_model(self) -> None:
+        kind = DEVICES[self.lidar_kind]
+        if ":" in self.lidar and "model" not in kind.settings_class().model_fields:
+            raise ValueError(f"lidar {self.lidar}: {kind.name} has one model; expected {kind.name}")
+        try:
+            kind.settings_class().model_validate(self.lidar_driver, strict=False)
+        except ValidationError as error:
+            raise ValueError(f"lidar {self.lidar}: {first_mistake(error)}") from error
+
+    def _check_steering(self) -> None:
+        """Refuse steering that the body does not have, and a controller whose servo outputs are left aside."""
+        if self.body in UNSTEERED:
+            if self.steering != NONE:
+                raise ValueError(f"steering {self.steering}: body {self.body} steers nothing; expected none")
+            return
+        outputs = ("drive",) if self.drive in SERVO_BOARDS else SERVOS[self.drive == "vesc" and self.body in FRONT]
+        if self.steering not in outputs:
+            raise ValueError(
+                f"steering {self.steering}: body {self.body} with drive {self.drive} expects {' or '.join(outputs)}"
+            )
 
 
 def asked(name: str, answers: dict[str, Any]) -> bool:

@@ -12,6 +12,7 @@ from monstertruck_drivers.usb.tree import TreeSnapshot, parent_of, port_of
 from monstertruck_kinematics.chassis import Chassis, Dimensions
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.bodies import BODIES
+from monstertruck_runtime.errors import InputError
 from monstertruckd.config.device_safety import BY_CELLS, UNATTENDED
 from monstertruckd.config.load import FILE_VERSION
 from monstertruckd.gate.config import GateConfig, unattended
@@ -20,6 +21,8 @@ from monstertruckd.tools.new_robot.answers import NONE, Answers
 
 Section = dict[str, Any]
 
+MOTORS: Final = {"arduino_bridge": 2, "maestro_esc": 1, "pca9685_esc": 1}
+"""Motors of controllers that drive fewer than four."""
 WORLD: Final = "workshop"
 """Built-in world of the twin: a room of 5 m by 4 m with a store."""
 
@@ -31,8 +34,15 @@ def robot(answers: Answers, tree: TreeSnapshot, navigation: str) -> Section:
         answers: description of the robot.
         tree: USB devices of this computer, which name the ports of the kinds they can only be.
         navigation: file name of the part with mapping, planner, tracker and explorer.
+
+    Raises:
+        InputError: the controller does not drive as many motors as the body has.
     """
     chassis = _chassis(answers)
+    drives, shafts = MOTORS.get(answers.drive, 4), len(chassis.shafts)
+    if shafts > drives or (answers.drive == "arduino_bridge" and shafts != drives):
+        motors = "one motor" if drives == 1 else f"{drives} motors"
+        raise InputError(f"drive {answers.drive}: drives {motors}, body {answers.body} has {shafts}")
     found: Section = {"include": navigation} if answers.lidar != NONE else {}
     found |= {"version": FILE_VERSION, "robot": answers.name, "body": _body(answers)}
     found |= {"geometry": _geometry(answers), "devices": _with_ports(_devices(answers, chassis), tree)}

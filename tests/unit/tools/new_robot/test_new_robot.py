@@ -122,7 +122,9 @@ def test_devices_that_look_alike_are_left_to_find_port(tmp_path: Path):
     [
         ({"width": 0.1}, r"ant/robot\.yaml:\d+: geometry: .*less than the track"),
         ({"speed": 3.0, "length": 0.3}, "such a robot is impossible: "),
-        ({"drive": "vesc", "body": "truck", "lidar": "ld19"}, r"a tracker needs the devices drive and steering"),
+        ({"body": "mecanum"}, "drive arduino_bridge: drives 2 motors, body mecanum has 4"),
+        (CAR | {"steering": "maestro"}, "drive arduino_bridge: drives 2 motors, body ackermann has 1"),
+        ({"drive": "maestro_esc"}, "drive maestro_esc: drives one motor, body differential has 2"),
     ],
 )
 def test_impossible_robots_are_refused_and_nothing_is_written(tmp_path: Path, more: dict[str, object], complaint: str):
@@ -160,6 +162,21 @@ def test_the_command_takes_every_answer_as_an_option(tmp_path: Path):
         ([*options(ANT), "--drive", "hamster"], "drive: Input should be 'vesc', 'arduino_bridge'"),
         ([*options(ANT), "--speed", "fast"], "speed: Input should be a valid number"),
         ([*options(ANT), "--lidar", "sick"], "lidar sick: expected none or one of hokuyo_urg"),
+        ([*options(ANT), "--lidar", "rplidar:c9"], "lidar rplidar:c9: model: Input should be 'a1', 'a2'"),
+        ([*options(ANT), "--lidar", "hokuyo_urg:04"], "lidar hokuyo_urg:04: hokuyo_urg has one model"),
+        ([*options(ANT), "--steering", "maestro"], "steering maestro: body differential steers nothing; expected none"),
+        (
+            options(ANT | {"body": "truck", "drive": "vesc"}),
+            "steering none: body truck with drive vesc expects maestro or pca9685",
+        ),
+        (
+            options(ANT | CAR | {"drive": "pca9685_esc", "steering": "pca9685"}),
+            "steering pca9685: body ackermann with drive pca9685_esc expects drive",
+        ),
+        (
+            options(ANT | CAR | {"drive": "vesc"}),
+            "steering none: body ackermann with drive vesc expects drive or maestro or pca9685",
+        ),
     ],
 )
 def test_wrong_options_are_refused_in_one_line(tmp_path: Path, words: list[str], complaint: str):
