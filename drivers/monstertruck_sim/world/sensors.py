@@ -235,9 +235,9 @@ class SimulatedLidar:
 
     def _sigma(self, ranges: Array, sheet: RangeSheet) -> Array:
         """Standard deviations, (n,), m; 0 where there is no range."""
-        sigma: Array = np.maximum(sheet.error, sheet.relative_error * ranges) / self._config.accuracy_sigmas
-        sigma[np.isinf(sigma)] = 0.0
-        return sigma
+        met = np.where(np.isfinite(ranges), ranges, 0.0)
+        sigma = np.maximum(sheet.error, sheet.relative_error * met) / self._config.accuracy_sigmas
+        return np.where(np.isfinite(ranges), sigma, 0.0)
 
     def _held(self, board: FlatPanel, pose: Array, beams: Beams) -> Array:
         """Ranges of a board before a robot that stands, m; inf = none."""

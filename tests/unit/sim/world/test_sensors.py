@@ -307,3 +307,12 @@ def test_the_errors_of_beams_are_those_of_the_data_sheet():
     off = (first - true)[np.isfinite(true) & np.isfinite(first)]
     assert off.std() == pytest.approx(0.02, rel=0.2)
     assert np.isnan(first).mean() == pytest.approx(0.1, abs=0.04)
+
+
+def test_a_beam_that_meets_nothing_is_no_failure_whatever_the_errors_of_the_data_sheet():
+    world = World(WorldConfig(map="workshop", lidar=LidarConfig(dropout=0.0, max_range=1.0)), 1)
+    bearings, times = np.linspace(-np.pi, np.pi, 400), 10**9 + np.arange(400) * 10_000
+    for relative in (0.0, 0.01):
+        ranges = world.lidar.beams(bearings, times + round(relative * 10**11), RangeSheet(0.02, 30.0, 0.04, relative))
+        assert np.isinf(ranges).any()
+        assert not np.isnan(ranges).any()
