@@ -7,6 +7,7 @@ in 20 ends of beams that meet it head-on, each beam placed by its own time, wors
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -157,12 +158,11 @@ def hokuyo(model: Any) -> dict[str, Any]:
 
 
 ROWS: dict[str, Callable[[], dict[str, Any]]] = {
-    "ust_10lx": lambda: hokuyo("ust_10lx"),
-    "utm_30lx": lambda: hokuyo("utm_30lx"),
-    "ld19": lambda: ld19("ld19"),
-    "stl19p": lambda: ld19("stl19p"),
-    "rplidar_a1": lambda: rplidar("a1", "Express"),
-    "rplidar_a2": lambda: rplidar("a2", "Boost"),
-    "rplidar_c1": lambda: rplidar("c1", "Standard"),
-    "rplidar_s2": lambda: rplidar("s2", "DenseBoost"),
+    **{model: partial(hokuyo, model) for model in LX},
+    **{model: partial(ld19, model) for model in LD19_MODELS},
+    **{
+        f"rplidar_{model}_{mode.name.lower()}": partial(rplidar, model, mode.name)
+        for model, unit in RPLIDAR_MODELS.items()
+        for mode in unit.modes
+    },
 }
