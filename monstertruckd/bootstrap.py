@@ -50,8 +50,7 @@ FOUR = ("-n", "4")
 programs four get more of the cores than two."""
 TWO = ("-n", "2")
 """Tests on the wall clock at a time: each runs a truck and a daemon, which must not be late."""
-ALONE = ("-n", "0")
-FAILED_ALONE = (*ALONE, "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
+FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
 KERNELS: tuple[Path, str, str] = (VENV / "bin" / "python", "-m", "monstertruckd.tools.install.kernels")
 """Compiles what goals and maps need, and names each part."""
 BYTECODE = ("-m", "compileall", "-q", "-j", "2", "monstertruckd", "drivers", "planners", "schemas", "tests")
@@ -209,8 +208,7 @@ def check(arguments: list[str]) -> int:
         compiling.wait()
     return steps(
         (pytest, [*FOUR, *TESTS, "-m", "not wall and not traced and not long", *arguments]),
-        (pytest, [*TWO, *TESTS, "-m", "wall and not long and not kernel", *arguments]),
-        (pytest, [*ALONE, *TESTS, "-m", "kernel", *arguments]),
+        (pytest, [*TWO, *TESTS, "-m", "wall and not long", *arguments]),
     )
 
 

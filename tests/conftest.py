@@ -21,8 +21,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     wanted = config.getoption("markexpr")
     if "not traced" in wanted and collection_path.is_dir() and _below(collection_path) in TRACED:
         return True
-    mark = wanted.removesuffix(" and not kernel").removesuffix(" and not long")
-    if mark not in ("virtual", "wall", "kernel") or not collection_path.match("test_*.py"):
+    mark = wanted.removesuffix(" and not long")
+    if mark not in ("virtual", "wall") or not collection_path.match("test_*.py"):
         return None
     return f"mark.{mark}" not in collection_path.read_text(encoding="utf-8") or None
 

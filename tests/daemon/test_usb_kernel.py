@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-pytestmark = [pytest.mark.wall, pytest.mark.kernel, pytest.mark.timeout(800)]
+pytestmark = [pytest.mark.wall, pytest.mark.long, pytest.mark.timeout(800)]
 
 
 def test_every_situation_on_a_real_kernel():
