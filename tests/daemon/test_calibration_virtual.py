@@ -236,7 +236,12 @@ def test_an_interrupt_leaves_truck_and_file_as_they_were(tmp_path: Path):
     ("disturb", "reason", "said"),
     [
         (pull_the_drive, Reason.DRIVE_STALE, "stopped by the gate: no fresh drive feedback"),
-        (pull_the_steering, Reason.STEERING_STALE, "stopped by the gate: no fresh steering feedback"),
+        pytest.param(
+            pull_the_steering,
+            Reason.STEERING_STALE,
+            "stopped by the gate: no fresh steering feedback",
+            marks=pytest.mark.long,
+        ),
         (emergency_stop, Reason.ESTOPPED, "stopped by the gate: emergency stop is latched"),
     ],
 )

@@ -51,9 +51,9 @@ async def test_every_emulator_answers_its_probe(device: str, expected: str, tmp_
 
 
 def short_lap(folder: Path) -> Path:
-    """A demo of 1.5 m instead of a lap."""
+    """A demo of a metre instead of a lap."""
     with (ROOT / "configs" / "paths" / "loop.csv").open() as lap, (folder / "short.csv").open("w") as short:
-        csv.writer(short).writerows(row for row, _ in zip(csv.reader(lap), range(32), strict=False))
+        csv.writer(short).writerows(row for row, _ in zip(csv.reader(lap), range(22), strict=False))
     config = folder / "short.yaml"
     overlay = {"include": str(DEMO), "version": 1, "path": {"file": str(folder / "short.csv"), "closed": False}}
     config.write_text(yaml_text(overlay))

@@ -33,7 +33,7 @@ def corridor(width: float, folder: Path) -> Path:
     [
         pytest.param(0.8, "lqr", 1, {"obstacle": {"ahead": 0.01, "side_clearance": 0.01}}, marks=pytest.mark.long),
         pytest.param(0.8, "mpc", 2, {"obstacle": {"ahead": 0.01, "side_clearance": 0.01}}, marks=pytest.mark.long),
-        (0.9, "lqr", 3, {}),
+        pytest.param(0.9, "lqr", 3, {}, marks=pytest.mark.long),
     ],
 )
 def test_turning_round_in_a_corridor_touches_nothing(

@@ -77,6 +77,7 @@ def test_the_truck_turns_its_rear_to_the_dock(slam: dict | None):
     assert turn < 1.0
 
 
+@pytest.mark.long
 def test_it_leaves_the_dock_slowly():
     end, gate, truth = docked((2.5, 0.805, -math.pi / 2), [{"do": "undock", "dock": "charger"}])
     assert end.reason is Reason.MISSION_DONE, end.text

@@ -35,6 +35,7 @@ async def armed(name: str, folder: Path, *arguments: str) -> str:
     raise AssertionError("the truck could not be armed")
 
 
+@pytest.mark.long
 async def test_examples_plot_save_drive_to_a_goal_and_along_a_path_of_their_own(tmp_path: Path):
     async with robot(tmp_path, base=ROOT / "configs/goals.yaml") as made:
         await made.start_simulator()

@@ -222,6 +222,7 @@ def takes_minutes(line: Line) -> bool:
     return line.arguments[0] in ("explore", "points", "goto", "map") or line.arguments[:2] == ["calibrate", "steering"]
 
 
+@pytest.mark.long
 def test_from_unpacking_to_driving_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     spend(tmp_path, monkeypatch, lambda line: not takes_minutes(line))
     load_truck(Path("configs/truck.yaml"))  # with the ports that were found

@@ -99,13 +99,13 @@ def test_a_robot_stops_for_somebody_who_walks_across():
     }
     away = {"odometry": {"start": {"x": 2.5, "y": 2.0, "yaw": 0.0}}}
     away["sim"] = {"world": {**crossing["sim"]["world"], "start": away["odometry"]["start"]}}
-    _, contacts, _ = drive(*fleet(leader=away, second=crossing), seconds=25.0)
+    _, contacts, _ = drive(*fleet(leader=away, second=crossing), seconds=14.0)
     assert [contact for contact in contacts if contact.mover == "second"] == []
 
 
 def test_two_runs_of_a_fleet_are_the_same():
     def ends() -> list[float]:
-        rigs, *_ = drive(*fleet(), seconds=4.0)
+        rigs, *_ = drive(*fleet(), seconds=2.0)
         return [float(value) for rig in rigs for value in rig.truth.array()[-1]]
 
     assert ends() == ends()

@@ -23,17 +23,24 @@ from tests.daemon.goal_kit import Trip, assert_at, own_path, travel
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
 
-def test_a_goal_in_another_room_is_reached():
+@pytest.mark.parametrize(
+    ("goal", "least", "most"),
+    [
+        ((1.9, 3.95, 0.0), 0.85, 1.0),
+        pytest.param((2.4, 1.5, -1.57), 3.0, 3.6, marks=pytest.mark.long, id="in another room"),
+    ],
+)
+def test_a_goal_is_reached(goal: tuple[float, float, float], least: float, most: float):
     async def story(trip: Trip) -> None:
-        answer = await trip.goal(2.4, 1.5, -1.57)
+        answer = await trip.goal(*goal)
         assert answer["planned"]
-        assert 3.0 < answer["length"] < 3.6
+        assert least < answer["length"] < most
         await trip.arm()
         state = await trip.end()
         assert (state.outcome, state.number, state.source) == (Reason.GOAL_REACHED, 1, "tester")
         assert trip.reasons() == [Reason.GOAL_ACCEPTED, Reason.ROUTE_FOUND, Reason.GOAL_REACHED]
 
-    assert_at(travel(story), 2.4, 1.5, -1.57)
+    assert_at(travel(story), *goal)
 
 
 @pytest.mark.long
@@ -94,31 +101,30 @@ def test_cancel_stops_and_pause_interrupts():
         truth = trip.rig.truth
         await trip.goal(6.0, 3.9, 0.0)
         await trip.arm()
-        await trip.clock.sleep(8.0)
+        await trip.clock.sleep(4.0)
         await trip.order("cancel")
         assert (await trip.end()).outcome is Reason.CANCELLED
-        await trip.clock.sleep(4.0)
-        stopped = truth.array()[-1]
-        assert 1.5 < stopped[1] < 3.5
         await trip.clock.sleep(2.0)
+        stopped = truth.array()[-1]
+        assert 1.2 < stopped[1] < 2.0
         await trip.arm()
-        await trip.clock.sleep(4.0)
+        await trip.clock.sleep(3.0)
         assert math.dist(truth.array()[-1][1:3], stopped[1:3]) < 0.01, "no goal, no motion"
 
-        await trip.goal(5.0, 3.9, 0.0)
+        await trip.goal(2.6, 3.9, 0.0)
         await trip.arm()
-        await trip.clock.sleep(5.0)
-        await trip.order("pause")
-        await trip.clock.sleep(4.0)
-        paused = truth.array()[-1]
         await trip.clock.sleep(3.0)
+        await trip.order("pause")
+        await trip.clock.sleep(2.0)
+        paused = truth.array()[-1]
+        await trip.clock.sleep(2.0)
         assert math.dist(truth.array()[-1][1:3], paused[1:3]) < 0.01
         await trip.order("resume")
         await trip.arm()
         assert (await trip.end()).outcome is Reason.GOAL_REACHED
         assert {Reason.PAUSED, Reason.RESUMED, Reason.CANCELLED} <= set(trip.reasons())
 
-    assert_at(travel(story), 5.0, 3.9, 0.0)
+    assert_at(travel(story), 2.6, 3.9, 0.0)
 
 
 class LocalDriver(LocalOperator):
@@ -149,24 +155,24 @@ class LocalDriver(LocalOperator):
 
 def test_the_commands_follow_a_goal_and_a_path_and_tell_how_they_end(tmp_path: Path):
     file = tmp_path / "straight.csv"
-    file.write_text("x,y,yaw,direction\n" + "".join(f"{x / 10:.1f},3.95,0.0,1\n" for x in range(10, 26)))
+    file.write_text("x,y,yaw,direction\n" + "".join(f"{x / 10:.1f},3.95,0.0,1\n" for x in range(10, 17)))
 
     async def story(trip: Trip) -> None:
         driver = LocalDriver(trip)
         arrival = await follow(driver, trip.clock, load_path(file, closed=False, frame="odom"), arm=True)
         assert arrival.reason is Reason.GOAL_REACHED
-        assert arrival.length == pytest.approx(1.5)
-        arrival = await drive_to(driver, trip.clock, (3.0, 3.9, 0.0), arm=True)
+        assert arrival.length == pytest.approx(0.6)
+        arrival = await drive_to(driver, trip.clock, (2.1, 3.9, 0.0), arm=True)
         assert (arrival.reason, arrival.routes, arrival.recoveries) == (Reason.GOAL_REACHED, 1, 0)
         assert (
-            await drive_to(driver, trip.clock, (5.5, 3.9, 0.0), [(4.2, 3.7)], arm=True)
+            await drive_to(driver, trip.clock, (3.3, 3.9, 0.0), [(2.7, 3.85)], arm=True)
         ).reason is Reason.GOAL_REACHED
         assert Reason.WAYPOINT_PASSED in trip.reasons()
         with pytest.raises(RequestRefusedError, match="off the map"):
             await drive_to(driver, trip.clock, (30.0, 3.9, 0.0), arm=True)
         trip.states.drain()
         driving = asyncio.create_task(drive_to(driver, trip.clock, (8.5, 3.9, 0.0), arm=True))
-        await trip.clock.sleep(5.0)
+        await trip.clock.sleep(2.0)
         driving.cancel()
         await asyncio.wait([driving])
         assert (await trip.end()).outcome is Reason.CANCELLED

@@ -16,9 +16,9 @@ pytestmark = [pytest.mark.virtual, pytest.mark.timeout(240)]
     ("driver", "beams"),
     [
         ("kind: ld19", 450),
-        ("kind: rplidar, model: c1", 500),
+        pytest.param("kind: rplidar, model: c1", 500, marks=pytest.mark.long),
         pytest.param("kind: hokuyo_lx", 1081, marks=pytest.mark.long),
-        ("kind: sheet_lidar, beams: 720, direction: counter_clockwise", 720),
+        pytest.param("kind: sheet_lidar, beams: 720, direction: counter_clockwise", 720, marks=pytest.mark.long),
     ],
 )
 def test_the_truck_drives_its_path_with_a_lidar_of_another_maker(tmp_path, driver, beams):

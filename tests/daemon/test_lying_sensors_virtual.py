@@ -46,7 +46,7 @@ def test_a_frozen_compass():
     assert outcome.noticed < 3.0
 
 
-@pytest.mark.parametrize("slip", [0.0, 0.3])
+@pytest.mark.parametrize("slip", [pytest.param(0.0, marks=pytest.mark.long), 0.3])
 def test_the_demo_raises_no_alarm_not_even_with_wheels_that_slip(slip):
     found = quiet("demo.yaml", 20.0, {"sim": {"world": {"truck": {"motor": {"ratio": 644.0 / (1.0 - slip)}}}}})
     assert found.alarms == ()

@@ -29,11 +29,11 @@ class MissionOperator(LocalOperator):
 
 def test_a_mission_is_driven_and_followed():
     steps = [
-        {"do": "goto", "x": 2.4, "y": 3.9, "yaw": 0.0},
+        {"do": "goto", "x": 1.6, "y": 3.9, "yaw": 0.0},
         {"do": "behaviour", "name": "move", "settings": {"length": 0.2}},
         {"do": "record", "note": "in the hall"},
         {"do": "goto", "x": 99.0, "y": 99.0, "yaw": 0.0, "on_failure": "continue"},
-        {"do": "wait", "seconds": 3.0},
+        {"do": "wait", "seconds": 1.0},
         {"do": "return"},
     ]
     slides = {"do": "behaviour", "name": "move", "settings": {"length": 0.2, "bearing": 1.57}}
@@ -78,7 +78,7 @@ def test_the_shipped_missions_are_some():
 def test_a_robot_with_a_path_of_its_own_waits_where_it_is(tmp_path: Path, driven: float):
     """Armed for the mission, it would drive along the path meanwhile; one that does already stops."""
     file = own_path(tmp_path)
-    steps = [{"do": "wait", "seconds": 8.0}]
+    steps = [{"do": "wait", "seconds": 4.0}]
     mission = Mission.model_validate_json(json.dumps({"version": 2, "name": "stay", "steps": steps}))
     at: list[float] = []
 

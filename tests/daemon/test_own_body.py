@@ -24,6 +24,7 @@ def target(project: Path) -> Path:
     return installed(project, project / "site")
 
 
+@pytest.mark.long
 def test_it_drives_its_bend(project: Path, target: Path, tmp_path: Path):
     out = run_with(target, "demo", "--fast", "-c", str(project / "robot.yaml"), "-o", str(tmp_path / "run"))
     figures = dict(line.split("  ", 1) for line in out.splitlines() if "  " in line)

@@ -143,6 +143,7 @@ def test_the_route_planner_plans_and_is_a_choice_of_the_daemon(target: Path, tmp
         run_with(target, "config", "show", str(config))
 
 
+@pytest.mark.long
 def test_the_odometry_drives_the_lap_and_its_settings_count(target: Path, tmp_path: Path):
     config = tmp_path / "robot.yaml"
     config.write_text(

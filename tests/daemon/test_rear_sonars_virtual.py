@@ -81,7 +81,7 @@ def reverse(
 
 
 def test_it_reverses_to_a_wall_that_its_sonars_measure():
-    done = reverse(1.0)
+    done = reverse(1.0, seconds=10.0)
     assert done.driven > 0.8
     assert 0.03 < done.rooms[-1] < 0.15
     assert done.reasons[-1] & {Reason.UNSEEN_STOP, Reason.OBSTACLE_STOP}
@@ -99,19 +99,19 @@ def silence(at: float) -> Callable[[VirtualRig, VirtualClock, int], None]:
 
 @pytest.mark.parametrize("without", [{"sonars": False}, {"happen": silence(0.0)}])
 def test_without_an_answer_it_stands(without):
-    done = reverse(1.0, **without)
+    done = reverse(1.0, seconds=4.0, **without)
     assert done.driven < 0.1
     assert Reason.UNSEEN_STOP in done.reasons[-1]
 
 
 def test_it_stops_when_its_sonars_fall_silent():
-    done = reverse(1.5, happen=silence(3.0))
+    done = reverse(1.5, seconds=6.0, happen=silence(3.0))
     assert 0.2 < done.driven < 0.6
     assert done.rooms[-1] > 0.8
     assert Reason.UNSEEN_STOP in done.reasons[-1]
 
 
-@pytest.mark.parametrize(("behind", "side"), [(0.3, -1), (0.5, 1)])
+@pytest.mark.parametrize(("behind", "side"), [(0.3, -1), pytest.param(0.5, 1, marks=pytest.mark.long)])
 def test_it_waits_for_a_person_who_walks_in_behind_it(behind: float, side: int):
     """A person comes from beside the truck, ``behind`` m behind its tail, stands there for 4 s and walks on."""
     begins, pace, radius = 2.0, 0.8, 0.15

@@ -12,6 +12,7 @@ from tests.daemon.wall_kit import ROOT, end, robot
 pytestmark = [pytest.mark.wall, pytest.mark.timeout(180)]
 
 
+@pytest.mark.long
 async def test_what_the_loop_computed_comes_again_bit_for_bit(tmp_path: Path):
     async with robot(tmp_path, {"map": None}, base=ROOT / "configs" / "slam.yaml") as made:
         await made.start_simulator()

@@ -19,6 +19,7 @@ from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, load_robot
 from monstertruckd.tools.simulation.operator import Lap, LocalOperator, drive_lap
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+from tests.long_kit import mostly_long
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 
@@ -52,7 +53,7 @@ def test_there_is_a_robot_of_every_kind():
     assert kinds == set(BODIES)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", mostly_long(ROBOTS, {"ackermann", "differential", "independent", "synchro"}))
 def test_a_robot_drives_its_bend(name: str):
     lap, truth, odometry, rig = drive(name)
     assert lap.outcome is Reason.GOAL_REACHED

@@ -1,10 +1,13 @@
 """A motor that does not obey, in the whole daemon on the virtual clock, judged by the simulated world."""
 
+from itertools import product
+
 import pytest
 
 from benchmarks.runaway import READS_NOTHING, READS_REST
 from benchmarks.runaway_parts.trial import Moment, Outcome, Robot, run, with_speeds
 from monstertruck_schemas.state import GateMode
+from tests.long_kit import mostly_long
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(120)]
 
@@ -29,9 +32,12 @@ def is_found(outcome: Outcome, within: float = 0.5) -> None:
     assert outcome.mode is GateMode.ESTOPPED
 
 
-@pytest.mark.parametrize("line", [False, True], ids=["no line", "line"])
-@pytest.mark.parametrize("robot", NAMES, ids=NAMES.values())
-def test_a_drive_that_ignores_the_emergency_stop_is_found_and_loses_its_power_stage(robot: Robot, *, line: bool):
+@pytest.mark.parametrize(
+    ("robot", "line"),
+    mostly_long(product(NAMES, (False, True)), {(DEMO, False), (DEMO, True), (SKID_STEER, False), (STEPPERS, False)}),
+    ids=[f"{name}-{line}" for name in NAMES.values() for line in ("no line", "line")],
+)
+def test_a_drive_that_ignores_the_emergency_stop_is_found_and_loses_its_power_stage(robot: Robot, line: bool):
     outcome = tried(robot, IGNORES, Moment.ESTOP, line=line)
     assert outcome.travelled <= 0.3
     assert outcome.stopping[0] == pytest.approx(0.0, abs=0.02)
@@ -45,8 +51,14 @@ def test_a_drive_that_ignores_the_emergency_stop_is_found_and_loses_its_power_st
     assert outcome.stopping[1] >= outcome.event - 0.05, "until it stands"
 
 
-@pytest.mark.parametrize("moment", [Moment.STOP, Moment.DISARM, Moment.LEASE, Moment.ARMED])
-@pytest.mark.parametrize("robot", [DEMO, SKID_STEER, STEPPERS], ids=["demo", "skid_steer", "steppers"])
+@pytest.mark.parametrize(
+    ("robot", "moment"),
+    mostly_long(
+        product((DEMO, SKID_STEER, STEPPERS), (Moment.STOP, Moment.DISARM, Moment.LEASE, Moment.ARMED)),
+        {(DEMO, Moment.LEASE), (DEMO, Moment.ARMED), (SKID_STEER, Moment.STOP), (STEPPERS, Moment.DISARM)},
+    ),
+    ids=lambda value: NAMES.get(value, value),
+)
 def test_a_drive_that_creeps_is_found_in_every_mode(robot: Robot, moment: Moment):
     outcome = tried(robot, CREEPS, moment)
     is_found(outcome, 0.5 + (0.25 if moment is Moment.LEASE else 0.0))
@@ -74,8 +86,13 @@ def test_faster_than_ordered_the_other_way_and_a_velocity_that_lies_are_found(fa
     is_found(tried(DEMO, fault, moment))
 
 
-@pytest.mark.parametrize("moment", [Moment.ARMED, Moment.ESTOP])
-@pytest.mark.parametrize("robot", [DEMO, TRICYCLE], ids=["scans", "scans and free wheels"])
+@pytest.mark.parametrize(
+    ("robot", "moment"),
+    mostly_long(
+        product((DEMO, TRICYCLE), (Moment.ARMED, Moment.ESTOP)), {(DEMO, Moment.ARMED), (TRICYCLE, Moment.ESTOP)}
+    ),
+    ids=lambda value: {DEMO: "scans", TRICYCLE: "scans and free wheels"}.get(value, value),
+)
 def test_a_drive_that_reads_rest_while_it_turns_is_found_by_what_does_not_come_from_it(robot: Robot, moment: Moment):
     outcome = tried(robot, READS_NOTHING["drive"] + CREEPS, moment)
     is_found(outcome)
@@ -103,8 +120,14 @@ def test_a_drive_that_lies_altogether_is_found_by_the_free_wheels():
     is_found(outcome, 1.0)
 
 
-@pytest.mark.parametrize("fault", [IGNORES, CREEPS, "runaway run RUN"])
-@pytest.mark.parametrize("robot", [DEMO, FULL, SKID_STEER, STEPPERS], ids=["demo", "full", "skid_steer", "steppers"])
+@pytest.mark.parametrize(
+    ("robot", "fault"),
+    mostly_long(
+        product((DEMO, FULL, SKID_STEER, STEPPERS), (IGNORES, CREEPS, "runaway run RUN")),
+        {(DEMO, IGNORES), (FULL, "runaway run RUN"), (SKID_STEER, CREEPS), (STEPPERS, IGNORES)},
+    ),
+    ids=lambda value: NAMES.get(value, value),
+)
 def test_the_daemons_end_leaves_no_power_stage_on(robot: Robot, fault: str):
     outcome = tried(robot, fault, Moment.END)
     assert not outcome.powered
@@ -112,8 +135,20 @@ def test_the_daemons_end_leaves_no_power_stage_on(robot: Robot, fault: str):
     assert outcome.travelled <= 0.3
 
 
-@pytest.mark.parametrize("robot", NAMES, ids=NAMES.values())
-@pytest.mark.parametrize("moment", [Moment.ESTOP, Moment.DISARM, Moment.LEASE, Moment.DRIVING, Moment.END])
+@pytest.mark.parametrize(
+    ("robot", "moment"),
+    mostly_long(
+        product(NAMES, (Moment.ESTOP, Moment.DISARM, Moment.LEASE, Moment.DRIVING, Moment.END)),
+        {
+            (DEMO, Moment.END),
+            (FULL, Moment.DRIVING),
+            (ACKERMANN, Moment.DISARM),
+            (SKID_STEER, Moment.ESTOP),
+            (STEPPERS, Moment.LEASE),
+        },
+    ),
+    ids=lambda value: NAMES.get(value, value),
+)
 def test_a_drive_that_obeys_is_never_suspected(robot: Robot, moment: Moment):
     outcome = tried(robot, "runaway off", moment)
     assert outcome.event is None

@@ -90,7 +90,7 @@ QUIET = {Reason.DISARMED, Reason.DRIVE_STALE}
 """Before it is armed."""
 
 
-@pytest.mark.parametrize("model", ["beam", "cone"])
+@pytest.mark.parametrize("model", [pytest.param("beam", marks=pytest.mark.long), "cone"])
 def test_a_wall_beside_it_does_not_slow_it(model):
     seen = drive((-0.6, 3.15, 0.0), 6.0, (0.3, 0.0), model=model)
     assert seen.reasons == QUIET
@@ -106,7 +106,7 @@ def test_it_turns_on_the_spot_before_a_wall():
     assert np.unwrap(seen.truth[:, 3])[-1] < math.pi / 2 - 2.5
 
 
-@pytest.mark.parametrize("slant", [0.0, 0.3])
+@pytest.mark.parametrize("slant", [pytest.param(0.0, marks=pytest.mark.long), 0.3])
 def test_it_stops_before_a_wall(slant):
     seen = drive((0.0, 2.2, math.pi / 2 + slant), 8.0, (0.3, 0.0))
     assert seen.reasons == QUIET | {Reason.OBSTACLE_SLOW, Reason.OBSTACLE_STOP}
@@ -120,12 +120,12 @@ def test_it_stops_before_a_wall(slant):
     [
         (("dead", "f", "on"), Reason.SONAR_BLIND, False),
         (("dead", "l", "on"), Reason.SONAR_SLOW, True),
-        (("stuck", "f", "on"), Reason.SONAR_BLIND, False),
+        pytest.param(("stuck", "f", "on"), Reason.SONAR_BLIND, False, marks=pytest.mark.long),
         (("silent", "on"), Reason.SONAR_STALE, False),
     ],
 )
 def test_a_sonar_that_fails_slows_or_stops_it(fault, reason, moves):
-    seen = drive((0.0, 1.0, math.pi / 2), 6.0, (0.2, 0.0), at=[(1.0, failing(fault))])
+    seen = drive((0.0, 1.0, math.pi / 2), 4.0, (0.2, 0.0), at=[(1.0, failing(fault))])
     assert reason in seen.reasons
     assert seen.truth[-1, 4] == pytest.approx(0.1 if moves else 0.0, abs=0.01)
     assert not seen.truth[:, 5].any()
@@ -175,7 +175,10 @@ def test_the_fusion_turns_with_the_imu_and_leaves_out_one_with_the_wrong_sign():
     assert turned(seen) < 0.1, "what it reported before it was noticed is taken back"
 
 
-@pytest.mark.parametrize("fault", ["inverted", "unplugged", pytest.param("silent", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "fault",
+    [pytest.param("inverted", marks=pytest.mark.long), "unplugged", pytest.param("silent", marks=pytest.mark.long)],
+)
 def test_an_imu_that_fails_leaves_the_heading_to_the_wheels(fault):
     def act(rig):
         if fault == "unplugged":

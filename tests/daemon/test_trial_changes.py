@@ -5,13 +5,12 @@ from pathlib import Path
 import pytest
 
 from benchmarks.house import PLACES
-from tests.long_kit import mostly_long
 from tests.trial_changes import TRIALS
 
-pytestmark = [pytest.mark.virtual, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.virtual, pytest.mark.long, pytest.mark.timeout(180)]
 
 
-@pytest.mark.parametrize("kind", mostly_long(TRIALS, {"motor_controller"}))
+@pytest.mark.parametrize("kind", TRIALS)
 def test_it_works_and_changes_few_files(kind: str, tmp_path: Path):
     trial = TRIALS[kind]()
     trial.run(tmp_path)

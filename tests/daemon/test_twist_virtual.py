@@ -93,7 +93,7 @@ def assert_odometry_agrees(seen: Seen) -> None:
     ("name", "side"),
     mostly_long(
         product(("differential", "skid_steer", "omni", "mecanum", "independent"), (1, -1)),
-        {("differential", 1), ("skid_steer", -1), ("omni", 1), ("mecanum", -1), ("independent", 1)},
+        {("differential", 1), ("skid_steer", -1), ("independent", 1)},
     ),
 )
 def test_turning_on_the_spot(name: str, side: int):
@@ -109,9 +109,7 @@ def test_turning_on_the_spot(name: str, side: int):
 
 @pytest.mark.parametrize(
     ("name", "side"),
-    mostly_long(
-        product(("omni", "mecanum", "independent"), (1, -1)), {("omni", 1), ("mecanum", 1), ("independent", -1)}
-    ),
+    mostly_long(product(("omni", "mecanum", "independent"), (1, -1)), {("omni", 1), ("independent", -1)}),
 )
 def test_moving_sideways(name: str, side: int):
     seen = drive(name, (5.0, (0.0, 0.1 * side, 0.0)), unseen="slow")
@@ -129,7 +127,8 @@ def test_sideways_a_robot_stops_before_ground_that_no_scan_has_seen():
     assert abs(seen.moved[1]) < 0.03
 
 
-@pytest.mark.parametrize("name", mostly_long(["mecanum", "independent"], {"independent"}))
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["mecanum", "independent"])
 def test_one_motion_after_the_other(name: str):
     seen = drive(name, (4.0, (0.12, 0.0, 0.0)), (4.0, (0.0, 0.0, 0.4)), (4.0, (0.0, -0.1, 0.0)), (1.0, (0.0, 0.0, 0.0)))
     assert not seen.truth[:, 5].any()
@@ -172,7 +171,7 @@ def test_the_truck_drives_a_curve_by_twist_and_one_too_tight_is_clipped():
 
 
 def test_a_wall_stops_sideways_motion_before_contact():
-    seen = drive("mecanum", (20.0, (0.0, -0.1, 0.0)), unseen="slow")
+    seen = drive("mecanum", (14.0, (0.0, -0.1, 0.0)), unseen="slow")
     assert Reason.OBSTACLE_STOP in {reason for state in seen.states for reason in state.reasons}
     assert not seen.truth[:, 5].any()
     assert seen.moved[1] < -0.1
