@@ -69,8 +69,24 @@ def test_lines_of_other_programs_are_known(line: Line):
         assert (ROOT / "systemd" / "monstertruckd.service").is_file()
 
 
+@pytest.mark.parametrize("line", ours(), ids=lambda line: line.text)
+def test_its_command_and_options_are_there(line: Line):
+    _look_up(line.text)
+
+
+def drives(line: Line) -> bool:
+    """Whether it drives a simulated truck, which takes seconds."""
+    return line.arguments[0] in {"demo", "drill"}
+
+
 @pytest.mark.parametrize(
-    "line", [line for line in ours() if not needs_truck(line) and not starts_truck(line)], ids=lambda line: line.text
+    "line",
+    [
+        pytest.param(line, marks=pytest.mark.long if drives(line) else ())
+        for line in ours()
+        if not needs_truck(line) and not starts_truck(line)
+    ],
+    ids=lambda line: line.text,
 )
 def test_it_runs(line: Line, desk: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(desk)

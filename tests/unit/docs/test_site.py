@@ -19,7 +19,7 @@ from monstertruckd.tools.drill.unrevealed import UNREVEALED
 from tests.unit.docs.command_lines import commands_of
 
 ROOT = Path(__file__).resolve().parents[3]
-pytestmark = pytest.mark.timeout(180)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(180)]
 
 BUILD = ROOT / "docs" / "site" / "build.py"
 

@@ -41,10 +41,12 @@ def test_names_are_kept_in_their_order_and_an_exchange_is_one(tmp_path: Path):
     assert set(outcomes) == {frozenset({"f/a"}), frozenset({"g/a"}), frozenset({"g/a", "f/b"}), frozenset({"f/b"})}
 
 
-def test_kills_lose_no_message_that_is_old_enough(tmp_path: Path):
-    assert kills((SUBJECT,), 12, 5, tmp_path) == {"recordings": {"kills": 12, "faults": 0}}
+@pytest.mark.parametrize("count", [4, pytest.param(12, marks=pytest.mark.long)])
+def test_kills_lose_no_message_that_is_old_enough(tmp_path: Path, count: int):
+    assert kills((SUBJECT,), count, 5, tmp_path) == {"recordings": {"kills": count, "faults": 0}}
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-def test_power_cuts_lose_no_message_that_is_old_enough(tmp_path: Path):
-    assert cuts((SUBJECT,), 24, 5, tmp_path) == {"recordings": {"cuts": 24, "faults": 0}}
+@pytest.mark.parametrize("count", [8, pytest.param(24, marks=pytest.mark.long)])
+def test_power_cuts_lose_no_message_that_is_old_enough(tmp_path: Path, count: int):
+    assert cuts((SUBJECT,), count, 5, tmp_path) == {"recordings": {"cuts": count, "faults": 0}}

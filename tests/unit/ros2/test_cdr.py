@@ -122,7 +122,7 @@ def plain(message):
 
 @pytest.mark.parametrize("name", SHARED)
 def test_messages_are_encoded_as_by_rosbags_and_read_back(name):
-    @settings(max_examples=15, deadline=None, database=None)
+    @settings(max_examples=5, deadline=None, database=None)
     @given(values(name))
     def check(message):
         data = encode(name, message)

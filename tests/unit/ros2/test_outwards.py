@@ -53,7 +53,7 @@ ROWS = {topic: number for number, (topic, _) in enumerate(face(Recorder())._rows
 
 @pytest.mark.parametrize("topic", ROWS, ids=lambda topic: topic.name)
 def test_every_message_of_a_topic_is_converted(topic):
-    @settings(max_examples=15, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=5, deadline=None, database=None, suppress_health_check=list(HealthCheck))
     @given(messages.of(topic))
     def check(message):
         recorder = Recorder()

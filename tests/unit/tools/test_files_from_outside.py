@@ -15,7 +15,8 @@ def test_a_sound_file_is_read(tmp_path: Path, name: str):
 
 
 @pytest.mark.timeout(600)
-def test_mutated_files_are_read_or_refused(tmp_path: Path):
-    figures = files.run_apart(200, 11, tmp_path / "work")
+@pytest.mark.parametrize("count", [len(files.kinds()), pytest.param(200, marks=pytest.mark.long)])
+def test_mutated_files_are_read_or_refused(tmp_path: Path, count: int):
+    figures = files.run_apart(count, 11, tmp_path / "work")
     assert {name: row["faults"] for name, row in figures.items()} == dict.fromkeys(files.kinds(), 0)
-    assert sum(row["files"] for row in figures.values()) == 200
+    assert sum(row["files"] for row in figures.values()) == count

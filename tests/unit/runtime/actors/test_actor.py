@@ -162,9 +162,12 @@ def test_a_kind_that_ends_its_process_harms_no_other():
 
 
 @pytest.mark.timeout(300)
-def test_the_server_of_all_workers_of_a_robot_keeps_one_thread():
+@pytest.mark.parametrize(
+    "targets", [(SCAN_ODOMETRY, READER), pytest.param((*WORKERS, SCAN_ODOMETRY, READER), marks=pytest.mark.long)]
+)
+def test_the_server_of_all_workers_of_a_robot_keeps_one_thread(targets: tuple[str, ...]):
     """A fork of several threads may hang."""
-    for target in (*WORKERS, SCAN_ODOMETRY, READER):
+    for target in targets:
         process = WorkerProcess("any", target)
         process.receive()
         process.kill()

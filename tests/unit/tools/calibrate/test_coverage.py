@@ -5,11 +5,12 @@ import math
 import pytest
 
 from tests.calibration_light import HALF_WIDTHS, LIGHT, coverage
+from tests.long_kit import mostly_long
 
 FITS = {"odometry": 12, "steering": 10, "lidar": 40, "sonar": 4, "camera": 4}
 
 
-@pytest.mark.parametrize("wizard", LIGHT)
+@pytest.mark.parametrize("wizard", mostly_long(LIGHT, LIGHT.keys() - {"camera", "odometry", "sonar"}))
 def test_intervals_hold_and_are_narrow(wizard: str):
     fits = FITS.get(wizard, 60)
     found = coverage(wizard, fits)
