@@ -234,6 +234,7 @@ async def test_topics_have_ros_s_frames_stamps_and_values_and_reach_who_comes_la
     async with scene(FaceOptions(prefix="t1/")) as found:
         put = {
             t.SCAN: scan(5 * SECOND),
+            t.SCAN_2: scan(6 * SECOND).model_copy(update={"frame": "lidar_2"}),
             t.ODOMETRY: odometry(3).model_copy(update={"frame": "odom"}),
             t.TRANSFORMS: Transforms(
                 stamp=9,
@@ -249,11 +250,13 @@ async def test_topics_have_ros_s_frames_stamps_and_values_and_reach_who_comes_la
         }  # fmt: skip
         reader = Reader(found)
         try:
-            reader.follow("/scan", "sensor_msgs/msg/LaserScan")
+            for name in ("/scan", "/scan_2"):
+                reader.follow(name, "sensor_msgs/msg/LaserScan")
             await asyncio.sleep(0.3)
             for topic, message in put.items():
                 found.robot.bus.publisher(topic, topic.writer).put(message)
-            await found.until(lambda: "/scan" in reader.messages)
+            await found.until(lambda: len(reader.messages) == 2)
+            assert reader.messages["/scan_2"]["header"]["frame_id"] == "t1/laser_2"
             ros = reader.messages["/scan"]
             assert ros["header"] == {"stamp": {"sec": 1_000_005, "nanosec": 0}, "frame_id": "t1/laser"}
             assert ros["ranges"][:2].tolist() == [1.0, math.inf]
@@ -264,7 +267,7 @@ async def test_topics_have_ros_s_frames_stamps_and_values_and_reach_who_comes_la
                 "/robot_description": "std_msgs/msg/String",
             }.items():
                 reader.follow(topic, interface)
-            await found.until(lambda: len(reader.messages) == 4)
+            await found.until(lambda: len(reader.messages) == 5)
             assert reader.messages["/map"]["data"].tolist() == [0, 100, -1, 0]
             frames = {
                 (row["header"]["frame_id"], row["child_frame_id"])

@@ -17,6 +17,7 @@ from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.stations import own_source
+from monstertruck_schemas import topics
 from monstertruck_schemas.base import Pose2D
 from monstertruck_schemas.req import Order, Role
 from monstertruck_schemas.roles import AccessRole
@@ -27,7 +28,7 @@ from monstertruckd.station import commands, frames
 from monstertruckd.station import feed as feed_module
 from monstertruckd.station.address import RobotAddress
 from monstertruckd.station.commands import GiveOrder, Heartbeat
-from monstertruckd.station.feed import MapStore, RobotFeed
+from monstertruckd.station.feed import SHOWN, MapStore, RobotFeed
 from monstertruckd.station.pilot import MOST_ASKED, DelayWatch, Pilot
 from monstertruckd.station.server import PAGE, Place
 from monstertruckd.station.users import StationUsers, add_user
@@ -91,6 +92,8 @@ def test_a_scan_travels_as_millimetres_and_beams_without_a_range_as_zero():
     assert np.frombuffer(payload, "<u2").tolist() == [500, 0, 1234, 0]
     assert head["kind"] == "scan"
     assert head["start"] == -1.0
+    shown = next(row for row in SHOWN if row.topic is topics.SCAN_2)
+    assert head_and_payload(shown.encode(scan))[0] == head | {"kind": "scan_2"}
 
 
 async def test_a_map_is_announced_fetched_and_changed_by_tiles():
