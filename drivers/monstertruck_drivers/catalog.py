@@ -333,7 +333,7 @@ class DeviceKind(Plugin):
 
 
 RESERVED: Final = frozenset(
-    {*map(str, ServiceName), "at_present", "controller", "measures", "present", "shafts", "steers"}
+    {*map(str, ServiceName), "at_present", "controller", "lidars", "measures", "present", "shafts", "steers"}
 )
 """Names refused for roles of other distributions: services that are not devices, and keys of a configuration section
 besides its roles (a test compares)."""

@@ -33,11 +33,11 @@ MORE_DRIVES: Final = ("drive_2", "drive_3", "drive_4")
 DRIVES: Final = ("drive", *MORE_DRIVES)
 """Roles of controllers of one motor."""
 SERIAL: Final = (
-    *("drive", "steering", "lidar", "compass", "stabiliser"),
+    *("drive", "steering", "lidar", "lidar_2", "compass", "stabiliser"),
     *(*MORE_DRIVES, "wheels", "actuators", "sonar", "imu"),
 )
 """Roles of devices whose kinds are on a serial line, most of them."""
-VITAL: Final = ("drive", "steering", "lidar", "compass", *MORE_DRIVES, "wheels", "actuators", "sonar")
+VITAL: Final = ("drive", "steering", "lidar", "lidar_2", "compass", *MORE_DRIVES, "wheels", "actuators", "sonar")
 """The robot stops when one of these sends nothing; the sonars where they guard it, without a lidar."""
 SHORT_WRITES: Final = 19
 """Maximum number of consecutive writes cut in half."""
