@@ -5,13 +5,18 @@ import os
 import pty
 import re
 import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
+from textwrap import indent
 
 import pytest
 
+from monstertruck_runtime.mailbox import latest
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.topics import GOAL, ODOMETRY
 from monstertruckd.tools.simulation.config import load_simulated
-from tests.daemon.wall_kit import ROOT, Robot, command, robot
+from tests.daemon.wall_kit import ROOT, Robot, command, planner_ready, robot
 from tests.unit.docs.command_lines import INSTEAD, Line, needs_truck, ours, starts_truck
 
 NOT_YET = {
@@ -42,6 +47,41 @@ async def test_every_line_on_a_running_truck(tmp_path: Path):
         for line in ours():
             if needs_truck(line):
                 await _follow(line, made)
+
+
+async def test_samples_of_clients_drive(tmp_path: Path):
+    page = (ROOT / "docs" / "zenoh.md").read_text(encoding="utf-8")
+    samples = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    async with robot(tmp_path, base=ROOT / "configs/goals.yaml") as made:
+        (steered,) = [text for text in samples if "async with TruckClient" in text]
+        (called,) = [text for text in samples if "with Truck(" in text]
+        await made.start_simulator()
+        await made.start_daemon()
+        async with made.client() as client:
+            await planner_ready(client)
+            program = f"import asyncio\nasync def main():\n{indent(steered, ' ' * 4)}\nasyncio.run(main())"
+            with client.subscribe(ODOMETRY, latest()) as odometry:
+                async with _running(program, made), asyncio.timeout(60):
+                    while (await odometry.next()).twist.vx < 0.05:
+                        pass
+            with client.subscribe(GOAL, latest()) as goals:
+                async with _running(called, made) as process, asyncio.timeout(60):
+                    assert process.stdout is not None
+                    assert float(await process.stdout.readline()) > 20
+                    while (await goals.next()).number == 0:
+                        pass
+
+
+@asynccontextmanager
+async def _running(sample: str, made: Robot) -> AsyncIterator[asyncio.subprocess.Process]:
+    assert "tcp/192.168.1.7:7447" in sample
+    code = sample.replace("tcp/192.168.1.7:7447", made.endpoint)
+    process = await asyncio.create_subprocess_exec(sys.executable, "-u", "-c", code, stdout=asyncio.subprocess.PIPE)
+    try:
+        yield process
+    finally:
+        process.kill()
+        await process.wait()
 
 
 async def _follow(line: Line, made: Robot) -> None:

@@ -18,8 +18,11 @@ PAGES = (
     ROOT / "CONTRIBUTING.md",
     *(page for page in sorted((ROOT / "docs").rglob("*.md")) if "site" not in page.parent.parts),
 )
-PROGRAMS = r"(?:[\w./]*/)?(?:monstertruckd|mkdocs|pip|python3?|systemctl|journalctl|pre-commit|lint-imports)"
-SHELL = re.compile(rf"(?:sudo )?{PROGRAMS} (?=[\w-])(?:[^ ].*)")
+PROGRAMS = (
+    r"(?:[\w./]*/)?(?:monstertruckd|mkdocs|pip|python3?|systemctl|journalctl|pre-commit|lint-imports"
+    r"|podman|git|cd|export|ros2|rviz2)"
+)
+SHELL = re.compile(rf"(?:sudo )?{PROGRAMS} (?=[\w/-])(?:[^ ].*)")
 INLINE = re.compile(r"`((?:monstertruckd [^`]+)|(?:(?:python )?benchmarks/[^`]+))`")
 
 
@@ -220,6 +223,40 @@ FOREIGN = {
     "pip install '.[view]'": "needs a package index; the extra is looked up",
     "systemctl status monstertruckd": "needs an installed service; the unit's name is looked up",
     "journalctl -u monstertruckd -f": "needs an installed service; the unit's name is looked up",
+    "export PYTHONPATH=$PWD/plugins": "test_writing_pages.py runs it in the page's own package",
+    **dict.fromkeys(
+        (
+            "podman build --tag monstertruckd --file systemd/container/Dockerfile .",
+            "podman run --rm --network host monstertruckd",
+            "podman run --rm --network host monstertruckd status",
+            "podman run --network host --device /dev/ttyACM0 --device /dev/ttyUSB0 --group-add keep-groups "
+            "--volume ./configs:/etc/monstertruckd:ro --volume truck:/var/lib/monstertruckd "
+            "--entrypoint python3 monstertruckd /opt/monstertruckd/systemd/supervise.py "
+            "monstertruckd run --config /etc/monstertruckd/truck.yaml "
+            "-- python3 /opt/monstertruckd/systemd/neutral.py /dev/ttyUSB0",
+        ),
+        "needs podman; benchmarks/container.py builds and runs the image; its files and commands are looked up",
+    ),
+    **dict.fromkeys(
+        (
+            "export RMW_IMPLEMENTATION=rmw_zenoh_cpp "
+            """ZENOH_CONFIG_OVERRIDE='connect/endpoints=["tcp/127.0.0.1:7448"]'""",
+            "ros2 daemon stop",
+            "ros2 topic list",
+            "rviz2 -d robot.rviz",
+            "ros2 run foxglove_bridge foxglove_bridge",
+            "ros2 bag record /scan /odom /tf /tf_static /map",
+            "ros2 service call /truck/arm std_srvs/srv/Trigger",
+            "ros2 run teleop_twist_keyboard teleop_twist_keyboard --ros-args -p speed:=0.2",
+            "ros2 action send_goal -f /navigate_to_pose nav2_msgs/action/NavigateToPose "
+            '"{pose: {header: {frame_id: map}, pose: {position: {x: 1.0}, orientation: {w: 1.0}}}}"',
+            "ros2 launch nav2_bringup navigation_launch.py",
+            "ros2 service call /truck/estop std_srvs/srv/Trigger",
+        ),
+        "needs ROS 2, which the page lists as not tried; tests/daemon/test_ros2_wall.py calls the same interfaces",
+    ),
+    "git -C /opt/monstertruckd worktree add /opt/monstertruckd_2 v2": "needs an installed service",
+    "cd /opt/monstertruckd_2 && python3 -m monstertruckd.bootstrap sync": "the same",
 }
 """Lines that are no command of ours: why they are not run."""
 
@@ -257,13 +294,18 @@ def lines_of(page: Path) -> list[Line]:
 
 
 def _code(text: str) -> Iterator[tuple[int, str]]:
-    """Numbered lines of indented blocks and of blocks between fences."""
-    fenced = False
+    """Numbered lines of indented blocks and of blocks between fences; those that end in a backslash go on."""
+    fenced, begun = False, ""
     for number, line in enumerate(text.splitlines(), 1):
         if line.startswith("```"):
             fenced = not fenced
         elif fenced or line.startswith("    "):
-            yield number, line.strip()
+            begun += line.strip()
+            if begun.endswith("\\"):
+                begun = begun.removesuffix("\\")
+            else:
+                yield number, begun
+                begun = ""
 
 
 def inline() -> list[tuple[str, str]]:

@@ -65,6 +65,12 @@ def test_lines_of_other_programs_are_known(line: Line):
     if extra := re.search(r"'\.\[(\w+)\]'", line.text):
         project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
         assert extra[1] in project["optional-dependencies"]
+    if within := re.search(r" (monstertruckd [a-z][^/]*?)(?: /| -- |$)", line.text):
+        _look_up(within[1].removesuffix(" --config"))
+    for place in re.findall(
+        r"(?: |/opt/monstertruckd/)((?:systemd|benchmarks|docs)/[\w/]+(?:\.py|/Dockerfile))", line.text
+    ):
+        assert (ROOT / place).is_file(), line.place
     if "ctl " in line.text:
         assert (ROOT / "systemd" / "monstertruckd.service").is_file()
 

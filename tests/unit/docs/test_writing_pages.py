@@ -36,17 +36,40 @@ def commands(page: str) -> list[str]:
 def test_the_package_is_built_and_found_by_the_commands_of_the_page(page: str, tmp_path: Path):
     lines = commands(page)
     first = lines[: lines.index("monstertruckd plugins") + 1]
+    assert ROWS[page] in followed(first, project(page, tmp_path))
+
+
+@pytest.mark.long  # demos drive their laps
+@pytest.mark.parametrize("page", PAGES)
+def test_all_commands_of_the_page_run(page: str, tmp_path: Path):
+    lines = commands(page)
+    if page == "driver":
+        *lines, emulate, probe = lines
+        link = emulate.split()[-1]
+        # The page has the emulator run in another terminal until Ctrl-C.
+        lines += [
+            f"{emulate} & emulator=$!",
+            f"until [ -e {link} ]; do sleep 0.1; done",
+            probe,
+            "kill -INT -- -$emulator",
+            "wait",
+        ]
+    assert "Traceback" not in followed(lines, project(page, tmp_path))
+
+
+def followed(lines: list[str], folder: Path) -> str:
+    """Run lines in a shell whose ``monstertruckd`` is this tree's, and return their output."""
     program = f'monstertruckd() {{ PYTHONPATH="$PYTHONPATH:{":".join(PLACES)}" python -m monstertruckd "$@"; }}'
     ended = subprocess.run(
-        ["bash", "-ec", "\n".join((program, *first))],
-        cwd=project(page, tmp_path),
+        ["bash", "-emc", "\n".join((program, *lines))],
+        cwd=folder,
         env=os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
         capture_output=True,
         text=True,
         check=False,
     )
-    assert ended.returncode == 0, ended.stderr
-    assert ROWS[page] in ended.stdout
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return ended.stdout
 
 
 @pytest.mark.long  # mypy reads the whole project without its cache
