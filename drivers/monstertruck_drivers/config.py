@@ -116,6 +116,7 @@ class Device(Schema, Generic[C]):
     """One device: its port, its mount, its driver."""
 
     port: AnyPort
+    """Where the device is connected."""
     mount: Mount = Mount()
     restart: RestartPolicy = RestartPolicy(max_delay=0.5)
     driver: C

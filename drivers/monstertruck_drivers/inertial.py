@@ -17,12 +17,15 @@ class ImuCorrection(Schema):
     rate_x: float = 0.0
     """Bias of the angular velocity, rad/s"""
     rate_y: float = 0.0
+    """Bias about y, rad/s"""
     rate_z: float = 0.0
+    """Bias about z, rad/s"""
     rate_scale: Annotated[float, Field(ge=0.5, le=2)] = 1.0
     """Factor on the angular velocity about z, its bias taken out"""
     force_x: float = 0.0
     """Bias of the specific force, m/s^2"""
     force_y: float = 0.0
+    """Bias along y, m/s^2"""
 
 
 def mean(vectors: Sequence[Xyz]) -> Xyz:

@@ -16,11 +16,15 @@ class ServoPulses(Schema):
     centre_us: Microseconds = 1439.2
     """Pulse that steers straight ahead."""
     scale_us_per_deg: Annotated[float, Field(gt=0)] = 10.48
+    """Change of the pulse for each degree of servo angle (us)."""
     direction: Literal[-1, 1] = -1
     """+1 where a longer pulse steers left, -1 where it steers right; a matter of how the servo is mounted."""
     min_us: Microseconds = 1088.0
+    """Shortest pulse commanded (us)."""
     max_us: Microseconds = 1840.0
+    """Longest pulse commanded (us)."""
     max_angle_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
+    """Largest servo angle commanded to either side (degrees)."""
 
     @model_validator(mode="after")
     def _centre_within_limits(self) -> Self:

@@ -72,6 +72,7 @@ class ZenohConfig(Schema):
     """The robot's Zenoh sessions; the default is reachable from this machine only."""
 
     mode: Literal["router", "peer"] = "router"
+    """Zenoh's mode: a router also connects stations with each other."""
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     """Endpoints stations connect to."""
     listen_pilots: tuple[str, ...] = ()

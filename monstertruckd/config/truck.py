@@ -112,7 +112,9 @@ class PlacementConfig(Schema):
     local_planner: Literal["loop", "worker", "remote"] = "worker"
     """As `planner`"""
     tracker: Literal["loop", "worker", "remote"] = "loop"
+    """As `planner`."""
     explorer: Literal["loop", "worker", "remote"] = "worker"
+    """As `planner`."""
     slowness: Annotated[float, Field(gt=0, le=1000)] | Board | None = None
     """Study, virtual clock only: all computations take so many times as long. `xu4` (5) and `pi2` (20) are estimates;
     null = declared latencies alone, and runs are reproducible"""
@@ -151,6 +153,7 @@ class TruckConfig(Schema):
     odometry: AnyOdometry = OdometryConfig()
     """Dead reckoning, or the fusion of wheels, compass and scans"""
     tracker: AnyTracker | None = None
+    """Tracker of paths; null: the robot follows none."""
     planner: PlannerConfig | None = None
     """How goals are reached; null = the robot follows paths only"""
     explorer: AnyExplorer | None = None

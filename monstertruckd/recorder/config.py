@@ -28,6 +28,7 @@ class RecorderConfig(Schema):
     directory: str = "logs"
     """Folder of the log files; created if missing."""
     compression: Compression = Compression.LZ4
+    """Compression of the chunks."""
     chunk_size: Bytes = 256 * 1024
     """Maximum chunk size (bytes)."""
     chunk_seconds: Annotated[float, Field(gt=0, le=0.5)] = 0.5

@@ -60,6 +60,7 @@ class RestartPolicy(Schema):
     first_delay: Annotated[float, Field(ge=0)] = 0.1
     """Seconds before the first retry."""
     factor: Annotated[float, Field(ge=1)] = 1.6
+    """Growth of the delay from one retry to the next."""
     max_delay: Annotated[float, Field(gt=0)] = 1.0
     """Maximum time between two attempts (s): a replugged device is back within this time."""
     jitter: Annotated[float, Field(ge=0, le=0.5)] = 0.1
@@ -69,6 +70,7 @@ class RestartPolicy(Schema):
     budget: Annotated[int, Field(ge=1)] | None = None
     """Restarts allowed within ``window`` seconds before the service is given up; None for no limit."""
     window: Annotated[float, Field(gt=0)] = 60.0
+    """Time in which ``budget`` is counted (s)."""
 
 
 HealthSink = Callable[[ServiceHealth], None]

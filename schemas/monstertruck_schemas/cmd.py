@@ -20,6 +20,7 @@ class DriveCommand(Message):
     """Drive motor command."""
 
     action: DriveAction
+    """Action of the drive."""
     speed: float
     """Wheel speed over ground, m/s."""
     motor_velocity: float
@@ -32,9 +33,11 @@ class SteeringCommand(Message):
     front: float
     """Angle of the equivalent bicycle's axle, rad, left positive; 0 for a motion that no bicycle makes."""
     rear: float
+    """Angle of the rear axle, likewise."""
     front_servo: float
     """Servo angle, rad, left positive, 0 = straight ahead."""
     rear_servo: float
+    """Servo angle of the rear axle, likewise."""
     front_right_servo: float | None = None
     """Servo of the front right wheel, if every wheel has one; ``front_servo`` is then the front left one."""
     rear_right_servo: float | None = None

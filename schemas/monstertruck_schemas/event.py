@@ -23,10 +23,13 @@ class Event(Message):
     """A decision, refusal, fault or recovery, with its stable reason."""
 
     reason: Reason
+    """Reason code."""
     severity: Severity
+    """Severity."""
     source: str
     """Service or device it happened to."""
     text: str = ""
+    """Event in words."""
     values: dict[str, float | int | str | bool | None] = {}
     """Measurements behind the decision."""
 
@@ -54,6 +57,7 @@ class Measurement(Schema):
     """One figure behind a stop."""
 
     name: str
+    """Name of the quantity."""
     value: float | None = None
     """None if never measured, or out of range."""
     unit: str = ""
@@ -68,11 +72,13 @@ class Cause(Schema):
     """One link of the chain that led to a stop."""
 
     reason: Reason
+    """Reason code."""
     source: str
     """Device, service, program or person it happened to or came from."""
     since: Nanoseconds
     """When it began."""
     text: str
+    """Cause in words."""
     measurements: tuple[Measurement, ...] = ()
     because: Annotated[int, Field(ge=0)] | None = None
     """Index of the cause behind this one; None if unknown."""
@@ -98,6 +104,7 @@ class Stop(Message):
     holder: str | None = None
     """Source that was driving."""
     role: Role | None = None
+    """Role of the holder."""
     speed: float | None = None
     """Measured speed at its start (m/s); None if unknown."""
     stopping_distance: float = 0.0
@@ -124,8 +131,12 @@ class LogRecord(Message):
     """One line of the daemon's journal."""
 
     level: LogLevel
+    """Level of the record."""
     name: str
     """Logger: the module it came from."""
     text: str
+    """Message."""
     file: str = ""
+    """Source file."""
     line: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    """Line in the source file."""

@@ -23,10 +23,15 @@ class ServiceHealth(Schema):
     """One row of the health table."""
 
     name: str
+    """Name of the service."""
     state: ServiceState
+    """State of the service."""
     since: Nanoseconds
+    """Time of the last change of the state."""
     restarts: Annotated[int, Field(ge=0)] = 0
+    """Restarts since the daemon's start."""
     reason: Reason = Reason.OK
+    """Reason of the state."""
     detail: str = ""
     """Last error in words; empty when there was none."""
 
@@ -41,6 +46,7 @@ class CalibrationState(Schema):
     """Calibration by one wizard: value, quality and expiry."""
 
     wizard: str
+    """Wizard that measured it."""
     grade: Literal["A", "B", "C"]
     """Grade by the width of its intervals: A within the goal, B at most twice as wide, C wider."""
     date: str
@@ -67,10 +73,13 @@ class LoopHealth(Message):
     """Punctuality of the control tick over the last second and since the start."""
 
     ticks: int
+    """Number of ticks behind the figures."""
     lateness_p50: float
     """Seconds late against the 50 Hz schedule."""
     lateness_p99: float
+    """99th percentile of the ticks' lateness, s."""
     lateness_max: float
+    """Maximum lateness of a tick, s."""
     drops: int = 0
     """Messages lost in bounded queues since the start."""
 
@@ -86,12 +95,17 @@ class RecorderHealth(Message):
     """Recorder status."""
 
     recording: bool
+    """Whether messages are written now."""
     path: str | None = None
+    """Current log file; None if there is none."""
     bytes_written: int = 0
+    """Bytes of messages since the start."""
     messages: int = 0
+    """Messages since the start."""
     drops: int = 0
     """Messages that are not in the log since the start."""
     reason: Reason = Reason.OK
+    """Why recording has stopped; OK while it has not."""
 
     @property
     def lost(self) -> str:
@@ -147,6 +161,7 @@ class SlamHealth(Message):
     """Fit of the latest scan to the map, and counts since the start."""
 
     standing: LocalisationStatus
+    """Status of the localisation."""
     accepted: bool
     """Whether the scan corrected the pose; otherwise odometry alone moved it."""
     overlap: Annotated[float, Field(ge=0, le=1)]
@@ -172,6 +187,7 @@ class SlamHealth(Message):
     offset: float | None = None
     """Lead of odometry over the scans (s), if significant."""
     odometry: OdometryUse = OdometryUse.NONE
+    """Use of odometry by the mapper."""
 
 
 class OdometryHealth(Message):
@@ -219,7 +235,9 @@ class LinkHealth(Message):
     interface: str | None = None
     """Checked interface, or None."""
     medium: LinkMedium | None = None
+    """Medium of the link."""
     level: LinkLevel
+    """Judgement of the link."""
     signal: float | None = None
     """Smoothed signal level, dBm; None on a cable or while disconnected."""
     raw_signal: float | None = None
@@ -242,6 +260,7 @@ class HostHealth(Message):
     load: float
     """Mean number of runnable processes over the last minute."""
     cores: Annotated[int, Field(ge=1)]
+    """Number of cores."""
     cpu: float | None = None
     """Busy share of all cores since the last message, 0..1."""
     temperature: float | None = None

@@ -42,6 +42,7 @@ class Path(Message):
     halts: bool = False
     """It only brings the robot to rest; once that is disarmed nothing is left of it to be followed."""
     name: str = ""
+    """Name of the path; empty if it has none."""
 
 
 class AxleResponse(Schema):
@@ -63,6 +64,7 @@ class AxleDeviation(Schema):
     """How one axle steers against its calibration, as a tracker has learnt it."""
 
     axle: Literal["front", "rear"]
+    """Axle that the values describe."""
     gain: float
     """Angle for each requested angle."""
     gain_deviation: Annotated[float, Field(ge=0)]
@@ -85,6 +87,7 @@ class TrackerState(Message):
     """How well the tracker follows its path."""
 
     path: str = ""
+    """Name of the path."""
     cross_track: float
     """Signed distance from the path, left positive, m."""
     heading_error: float
@@ -155,6 +158,7 @@ class GoalState(Message):
     """Who requested it."""
     goal: Pose2D | None = None
     phase: GoalPhase = GoalPhase.IDLE
+    """Current phase."""
     outcome: Reason = Reason.OK
     """DRIVING while it is pursued, then GOAL_REACHED, CANCELLED, or why it was given up."""
     text: str = ""
@@ -202,9 +206,11 @@ class BehaviourState(Message):
     behaviour: str = ""
     """Its name in the configuration."""
     kind: str = ""
+    """Kind of the behaviour."""
     source: str = ""
     """Who started it."""
     running: bool = False
+    """Whether it runs now."""
     phase: str = ""
     """Current phase; each kind has its own names."""
     outcome: Reason = Reason.OK
@@ -247,9 +253,11 @@ class ExplorationState(Message):
     number: Annotated[int, Field(ge=0)] = 0
     """Number of explorations since the start of the daemon."""
     kind: str = ""
+    """Kind of the explorer."""
     source: str = ""
     """Who requested it."""
     phase: ExplorationPhase = ExplorationPhase.IDLE
+    """Current phase."""
     outcome: Reason = Reason.OK
     """DRIVING while it runs, then EXPLORED, BUDGET_SPENT, CHARGE_SPENT, CANCELLED, or why it was given up."""
     text: str = ""
@@ -296,6 +304,7 @@ class MissionLine(Schema):
     depth: Annotated[int, Field(ge=0)]
     """Number of steps that contain it"""
     text: str
+    """Step in words."""
     active: bool = False
     """Whether the current step is this one or within it"""
 
@@ -306,14 +315,17 @@ class MissionState(Message):
     number: Annotated[int, Field(ge=0)] = 0
     """Number of missions since the start of the daemon."""
     name: str = ""
+    """Name of the mission."""
     source: str = ""
     """Who requested it."""
     running: bool = False
+    """Whether it runs now."""
     resumable: bool = False
     """Whether an interrupted mission can be resumed."""
     step: Annotated[int, Field(ge=0)] = 0
     """Number of the current step, from 1, nested steps not counted; 0 if none runs."""
     steps: Annotated[int, Field(ge=0)] = 0
+    """Number of steps, nested steps not counted."""
     node: str = ""
     """Position of the current step among those within others, such as 2.1"""
     lines: tuple[MissionLine, ...] = ()

@@ -26,12 +26,15 @@ class PointOfInterest(Schema):
     """One point of interest, in map."""
 
     name: PointName
+    """Name of the point."""
     kind: PointKind
+    """Kind of the point."""
     tag: Annotated[int, Field(ge=0)] | None = None
     """Number of the tag."""
     x: float
     """m; of a tag its middle."""
     y: float
+    """m; of a tag its middle."""
     z: float = 0.0
     """Over the ground, m."""
     yaw: float
@@ -65,6 +68,7 @@ class TagPose(Schema):
     x: float
     """Centre (m)."""
     y: float
+    """Centre (m)."""
     z: float
     """Height above base (m)."""
     yaw: float

@@ -34,6 +34,7 @@ class Request(Message):
     source: Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.@:-]+$")]
     """Name of the asking program or person, shown to everybody; the daemon replaces it by the one in the key."""
     role: Role
+    """Role of the sender, which gives its priority."""
     lease: Annotated[float, Field(gt=0, le=2.0)]
     """Seconds this request stands; the gate caps it by its own limit for the role."""
     nonce: Annotated[str, Field(max_length=64)]
@@ -166,6 +167,7 @@ class ControlRequest(Request):
     """Arm, disarm, emergency stop, its reset, give up driving, ask for it, or hand it over."""
 
     order: Order
+    """Requested action."""
     hold: bool = False
     """With an order to arm: planners do not drive until the truck is armed without it."""
     calibrates: bool = False
@@ -231,6 +233,7 @@ class GoalControl(Request):
     """Interrupt, resume or cancel the current goal."""
 
     order: GoalOrder
+    """Requested action."""
     own: bool = False
     """Only a goal that the same program sent."""
 
@@ -335,7 +338,9 @@ class MapRequest(Request):
     resolution: Annotated[float, Field(gt=0)]
     """Metres per cell."""
     width: Annotated[int, Field(gt=0, le=2048)]
+    """Number of columns."""
     height: Annotated[int, Field(gt=0, le=2048)]
+    """Number of rows."""
     origin: Pose2D
     """Pose of the outer corner of cell (0, 0); its yaw is 0."""
     packed: bytes

@@ -111,9 +111,11 @@ class DriveFeedback(Message):
     current: float | None = None
     """Motor current, A; None in messages that did not read it."""
     mode: DriveMode
+    """State of the controller."""
     fault_code: int | None = None
     """Latest entry of the controller's error history while in fault."""
     supply_voltage: float | None = None
+    """Voltage at the controller, V; None in messages that did not read it."""
 
 
 class SteeringFeedback(Message):
@@ -157,7 +159,9 @@ class Battery(Message):
     raw_voltage: float
     """Latest single sample (V)."""
     cells: int
+    """Cells in series."""
     level: BatteryLevel
+    """Judgement of the voltage."""
     rest_voltage: float | None = None
     """Filtered voltage the pack would show without the motor's current, V; None while the sensor is at fault."""
     cell_voltage: float | None = None
@@ -176,6 +180,7 @@ class SonarEcho(Schema):
     """One sonar of an array. Its frame is ``sonar_<name>``, x along the axis of its cone."""
 
     name: str
+    """Name of the sonar in its array."""
     answered: bool = True
     """False if the sonar is dead or lost; the space in front of it is then unknown."""
     range: Annotated[float, Field(gt=0)] | None = None
@@ -281,6 +286,7 @@ class StabiliserJoint(Schema):
     """One servo of the lidar's mount; signs follow the joint angle. Absent unit: measurements are None."""
 
     torque: TorqueState
+    """State of the unit's torque."""
     error: Annotated[int, Field(ge=0, le=255)] = 0
     """Error bits of the unit's latest answer (in its own encoding)."""
     velocity: float | None = None

@@ -25,6 +25,7 @@ class Odometry(Message):
     """Pose of ``child`` in ``frame`` with velocity and covariance."""
 
     child: FrameId = "base"
+    """Frame whose pose this is."""
     pose: Pose2D
     twist: Twist2D
     pose_covariance: Covariance
@@ -81,8 +82,11 @@ class Transform(Schema):
     """Pose of ``child`` in ``parent``."""
 
     parent: FrameId
+    """Frame in which the pose is given."""
     child: FrameId
+    """Frame whose pose is given."""
     stamp: Nanoseconds
+    """Time of the pose."""
     translation: tuple[float, float, float]
     """Metres."""
     rotation: tuple[float, float, float, float]
@@ -101,7 +105,9 @@ class Grid(Message):
     resolution: Annotated[float, Field(gt=0)]
     """Metres per cell."""
     width: Annotated[int, Field(gt=0)]
+    """Number of columns."""
     height: Annotated[int, Field(gt=0)]
+    """Number of rows."""
     origin: Pose2D
     """Pose of the outer corner of cell (0, 0)."""
     cells: Int8Array
@@ -122,7 +128,9 @@ class Ground(Message):
     resolution: Annotated[float, Field(gt=0)]
     """Metres per cell."""
     width: Annotated[int, Field(gt=0)]
+    """Number of columns."""
     height: Annotated[int, Field(gt=0)]
+    """Number of rows."""
     origin: Pose2D
     """Pose of the outer corner of cell (0, 0)."""
     tilt: UInt8Array
@@ -135,6 +143,7 @@ class ClockOffset(Message):
     """Real time = daemon time + offset."""
 
     offset: Nanoseconds
+    """Real time minus daemon time."""
     stepped: Nanoseconds = 0
     """Size of the step since the message before; 0 when none."""
 
@@ -163,6 +172,7 @@ class Doubt(Schema):
     sensor: str
     """Role of the device."""
     kind: DoubtKind
+    """Kind of contradiction."""
     since: Nanoseconds
     """When it was found."""
     text: str
@@ -249,11 +259,13 @@ class GateState(Message):
     """State of the safety gate: driver, limits and their reasons. Retained; also acknowledges requests."""
 
     mode: GateMode
+    """State of the gate."""
     nonce: str
     """Changes at every start of the daemon; requests must carry it."""
     holder: str | None = None
     """Source that is driving."""
     role: Role | None = None
+    """Role of the holder."""
     lease_left: float | None = None
     """Seconds until the holder's lease runs out."""
     last_seq: int | None = None

@@ -34,11 +34,13 @@ class UsbNode(Schema):
     serial: str | None = None
     """Serial number that it states; None if it states none, or was never there."""
     hub: bool = False
+    """Whether it is a hub."""
     tty: str | None = None
     """Serial node at this moment, e.g. ``ttyUSB0``."""
     role: str | None = None
     """Place in the configuration's ``devices``."""
     state: UsbState
+    """State of the place."""
     replugs: Annotated[int, Field(ge=0)] = 0
     """Times it came back since the daemon started."""
     over_current: Annotated[int, Field(ge=0)] = 0

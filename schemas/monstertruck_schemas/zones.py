@@ -25,6 +25,7 @@ class ZoneArea(Schema):
     """A polygon in map with its rule; the even-odd rule decides what lies inside."""
 
     kind: Literal["keepout", "speed"]
+    """Rule: no entry, or a speed limit."""
     corners: Annotated[Corners, Field(min_length=3)]
     """Corners of the polygon (m)."""
     limit: Positive | None = None
@@ -52,10 +53,13 @@ class ZoneMask(Schema):
     resolution: Positive
     """Side of a cell (m)."""
     width: Annotated[int, Field(gt=0, lt=2**31)]
+    """Number of columns."""
     height: Annotated[int, Field(gt=0, lt=2**31)]
+    """Number of rows."""
     x: float
     """Outer corner of cell (0, 0) (m)."""
     y: float
+    """Outer corner of cell (0, 0) (m)."""
     limits: Annotated[tuple[float, ...], Field(strict=False)]
     """Maximum speed by level - 1 (m/s); 0 = keepout. Cells of level 0 have no limit."""
     runs: Annotated[tuple[Whole, ...], Field(strict=False)]
@@ -66,7 +70,9 @@ class Zone(Schema):
     """One zone as it is in force: a polygon or a mask."""
 
     name: Name
+    """Name of the zone."""
     kind: Literal["keepout", "speed"]
+    """Rule: no entry, or a speed limit."""
     corners: Corners = ()
     """Corners of the polygon (m); empty for a mask."""
     mask: ZoneMask | None = None

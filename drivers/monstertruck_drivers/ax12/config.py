@@ -15,10 +15,13 @@ class JointConfig(Schema):
     """One unit: ``position = zero + direction * angle / step``."""
 
     id: Annotated[int, Field(ge=0, le=252)]
+    """Id of the unit on its bus."""
     zero: Steps
     """Position at joint angle 0."""
     min_position: Steps
+    """Smallest position commanded (steps)."""
     max_position: Steps
+    """Largest position commanded (steps)."""
     direction: Literal[-1, 1] = 1
     """+1 where a rising position (shaft counter-clockwise) turns the joint positively (REP 103)."""
 
@@ -46,6 +49,7 @@ class AlarmConfig(Schema):
     rest: Seconds = 3.0
     """Seconds a joint rests after an alarm; doubled while it trips again."""
     rest_max: Positive = 60.0
+    """Maximum rest (s)."""
     settled_after: Positive = 30.0
     """Time of holding after which the next rest starts from ``rest`` again (s)."""
     cool_below: Annotated[int, Field(ge=0, le=100)] = 60

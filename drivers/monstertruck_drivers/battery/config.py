@@ -20,6 +20,7 @@ class PackConfig(Schema):
     """
 
     cells: Annotated[int, Field(ge=1, le=14)] = 6
+    """Cells in series."""
     capacity_ah: Annotated[float, Field(gt=0, le=100)] = 5.0
     """Capacity of the pack in the truck, Ah: 3.7, 4.0 or 5.0"""
     resistance: Annotated[float, Field(ge=0, le=1)] = 0.06
@@ -30,22 +31,31 @@ class PackConfig(Schema):
     smoothing: Seconds = 5.0
     """Time constant of the published voltages."""
     low: Volts = 22.0
+    """Voltage below which the pack is low."""
     low_after: Seconds = 10.0
+    """Time below ``low`` before it is reported (s)."""
     clear: Volts = 22.4
     """Low and critical end above this."""
     clear_after: Seconds = 30.0
+    """Time above ``clear`` before low and critical end (s)."""
     critical: Volts = 21.0
+    """Voltage below which the pack is critical."""
     critical_after: Seconds = 10.0
+    """Time below ``critical`` before it is reported (s)."""
     collapsed: Volts = 19.8
     """Critical too, after a shorter time."""
     collapsed_after: Seconds = 2.0
+    """Time below ``collapsed`` before it is reported (s)."""
     overcharged: Volts = 25.3
+    """Voltage above which the pack is overcharged."""
     overcharged_after: Seconds = 2.0
+    """Time above ``overcharged`` before it is reported (s)."""
     overcharged_clear: Volts = 25.2
     """Overcharged ends below this."""
     plausible_min: Volts = 15.0
     """Outside the plausible range the sensor is at fault, not the battery."""
     plausible_max: Volts = 26.0
+    """Upper end of the plausible range."""
 
     @model_validator(mode="after")
     def _thresholds_in_order(self) -> Self:

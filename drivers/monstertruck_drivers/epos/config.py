@@ -27,6 +27,7 @@ class EposConfig(Schema):
     max_motor_rpm: Annotated[int, Field(gt=0, le=100_000)] = 18_000
     """Set points are limited to this; also written to the controller as its own limit."""
     acceleration_rpm_s: RpmPerSecond = 60_000
+    """Acceleration of the motor (rpm/s)."""
     deceleration_rpm_s: RpmPerSecond = 200_000
     """2.4 m/s^2, below the limit of the slipper clutch; the wheels follow the motor some 0.1 s later."""
     quick_stop_deceleration_rpm_s: RpmPerSecond = 240_000
@@ -40,7 +41,9 @@ class EposConfig(Schema):
     rate: Annotated[float, Field(ge=1, le=25)] = 20.0
     """Feedback per second; one cycle needs four exchanges of 10 to 13 ms at 38400 baud."""
     status_period: Seconds = 0.1
+    """Interval between readings of the controller's status (s)."""
     current_period: Annotated[float, Field(gt=0, le=2)] = 0.2
+    """Interval between readings of the motor current (s)."""
     command_timeout: Seconds = 0.25
     """Age of the last command at which the target becomes 0 (s)."""
     quick_stop_after: Seconds = 1.0
@@ -51,6 +54,7 @@ class EposConfig(Schema):
     fault_resets: Annotated[int, Field(ge=0, le=10)] = 3
     """Fault resets tried within ``fault_reset_window`` before the drive is given up."""
     fault_reset_window: Seconds = 10.0
+    """Time in which ``fault_resets`` are counted (s)."""
     fault_reset_pause: Seconds = 0.3
     """Pause between two fault resets."""
 

@@ -24,9 +24,11 @@ class HostHealthConfig(Schema):
     hot: Celsius = 80.0
     """Degree Celsius of the hottest thermal zone"""
     hot_clear: Celsius = 75.0
+    """Temperature below which the heat has ended (degrees Celsius)."""
     busy: Share = 0.95
     """Busy share of all cores"""
     busy_clear: Share = 0.85
+    """Busy share below which the load has ended."""
     busy_after: Seconds = 10.0
     """Like ``after``, for a busy processor: planning may use all of it for a while"""
     slow: Share = 0.8
@@ -34,9 +36,11 @@ class HostHealthConfig(Schema):
     memory: Share = 0.1
     """Available share of the memory"""
     memory_clear: Share = 0.15
+    """Available share above which the shortage of memory has ended."""
     disk: Bytes = 1_000_000_000
     """Free bytes of the file system that holds ``disk_path``"""
     disk_clear: Bytes = 1_500_000_000
+    """Free bytes above which the shortage of disk space has ended."""
     disk_path: Path = Path("runs")
     """Folder of the logs; it need not exist yet"""
 

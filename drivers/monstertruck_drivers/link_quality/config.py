@@ -23,7 +23,9 @@ class LinkQualityConfig(Schema):
     excellent: Dbm = -50.0
     """Minimum excellent signal (dBm)"""
     good: Dbm = -67.0
+    """Minimum good signal (dBm)."""
     fair: Dbm = -75.0
+    """Minimum fair signal (dBm)."""
     poor: Dbm = -85.0
     """Below it the link is unusable"""
     hysteresis: Annotated[float, Field(ge=0, le=20)] = 3.0

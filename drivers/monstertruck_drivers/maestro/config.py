@@ -17,6 +17,7 @@ class ServoConfig(ServoPulses):
     """Steering servo on a channel."""
 
     channel: Channel
+    """Channel of the servo controller."""
     speed: Annotated[int, Field(ge=0, le=0x3FFF)] = 100
     """Speed limit of the pulse (0.25 us per 10 ms); 0 = unlimited."""
     acceleration: Annotated[int, Field(ge=0, le=255)] = 0
@@ -40,6 +41,7 @@ class CurrentInputConfig(Schema):
     """Current into the pack by a Hall sensor on an analog input; the default is an ACS712 of 20 A."""
 
     channel: Channel = 4
+    """Analog input of the servo controller."""
     zero: float = 2.5
     """Voltage at no current (V)"""
     volts_per_amp: Annotated[float, Field(gt=0)] = 0.1
@@ -57,9 +59,11 @@ class BatteryInputConfig(PackConfig):
     """Pack voltage through a divider on an analog input."""
 
     channel: Channel = 5
+    """Analog input of the servo controller."""
     volts_per_count: Annotated[float, Field(gt=0)] = 5.0 * 10 / ADC_MAX
     """The reference is the USB 5 V rail (5 % tolerance) behind a 1:10 divider: calibrate with a multimeter."""
     gain: Annotated[float, Field(gt=0)] = 1.0
+    """Calibrated factor on the voltage."""
     offset: float = 0.0
     """Volts added after the gain."""
     current: CurrentInputConfig | None = None

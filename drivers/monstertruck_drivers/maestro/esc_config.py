@@ -14,6 +14,7 @@ class EscConfig(EscPulses):
     """Speed controller on a channel."""
 
     channel: Channel = 2
+    """Channel of the servo controller."""
 
     def quarters(self, rate: float) -> int:
         """Target in quarter microseconds for a rate, rad/s, forward positive, held within the limits."""

@@ -21,9 +21,13 @@ class IronConfig(Schema):
     hard_x: float = 0.0
     """Microtesla, in the unit's own scale"""
     hard_y: float = 0.0
+    """Along y, likewise"""
     soft_xx: Positive = 1.0
+    """Element (x, x) of ``soft``"""
     soft_xy: float = 0.0
+    """Elements (x, y) and (y, x) of ``soft``"""
     soft_yy: Positive = 1.0
+    """Element (y, y) of ``soft``"""
 
     @model_validator(mode="after")
     def _keeps_directions_apart(self) -> Self:

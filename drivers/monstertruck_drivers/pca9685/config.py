@@ -17,12 +17,14 @@ class Pca9685Servo(ServoPulses):
     """Steering servo on a channel."""
 
     channel: Channel = 0
+    """Channel of the board."""
 
 
 class Pca9685Esc(EscPulses):
     """Speed controller on a channel."""
 
     channel: Channel = 1
+    """Channel of the board."""
 
 
 class Pca9685Config(Schema):

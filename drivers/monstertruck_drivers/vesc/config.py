@@ -33,7 +33,9 @@ class VescServoConfig(Schema):
     direction: Literal[-1, 1] = -1
     """+1 where a greater position steers left, -1 where it steers right"""
     min: Position = 0.15
+    """Smallest position commanded."""
     max: Position = 0.85
+    """Largest position commanded."""
     dead_time: Annotated[float, Field(ge=0, le=1)] | None = None
     """Dead time from a steering command to the first movement of the wheels (s); null if it was not measured"""
     lag: Annotated[float, Field(ge=0, le=1)] | None = None

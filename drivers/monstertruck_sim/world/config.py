@@ -44,6 +44,7 @@ class ServoModelConfig(Schema):
     left_stop_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
     """Angle of the arm's mechanical stop on the left."""
     right_stop_deg: Annotated[float, Field(gt=0, le=180)] = 45.0
+    """Angle of the arm's mechanical stop on the right."""
 
 
 class MotorConfig(Schema):
@@ -246,6 +247,7 @@ class BatteryModelConfig(Schema):
     cells: Annotated[int, Field(ge=1, le=14)] = 6
     """Cells in series."""
     capacity_ah: Positive = 5.0
+    """Capacity, Ah."""
     charge: Fraction = 0.95
     """Initial charge as a fraction of the capacity."""
     resistance: NotNegative = 0.08
@@ -397,6 +399,7 @@ class RoofTag(Schema):
     """An AprilTag lying on the robot, upper edge towards the front; visible in three dimensions only."""
 
     tag: Annotated[int, Field(ge=0, le=586)]
+    """Number of the tag in its family."""
     x: float = 0.0
     """Distance of the tag's centre ahead of the geometric centre, m."""
     y: float = 0.0
@@ -417,8 +420,11 @@ class Iron(Schema):
     hard_z: float = 0.0
     """Hard-iron offset in z, mG."""
     soft_x: float = 1.0
+    """Scale of the field in x."""
     soft_y: float = 1.0
+    """Scale of the field in y."""
     soft_z: float = 1.0
+    """Scale of the field in z."""
     soft_xy: float = 0.0
     """Fraction of the x field measured in y, and of the y field in x."""
 
@@ -441,6 +447,7 @@ class CompassModelConfig(Schema):
     motor_field: float = 5.0
     """Field along the device's y per ampere of motor current, mG/A (1.1 degrees at 1 A)."""
     temperature_c: float = 25.0
+    """Temperature that the device reports, degrees Celsius."""
     iron: Iron = Iron()
 
 
@@ -488,6 +495,7 @@ class SonarModelConfig(Schema):
     """
 
     model: Literal["beam", "cone"] = "cone"
+    """Model of the echoes."""
     field_of_view: Annotated[float, Field(gt=0, lt=3)] = 0.87
     """Full opening angle of the cone, rad."""
     range_min: NotNegative = 0.15
@@ -535,6 +543,7 @@ class ImuModelConfig(Schema):
     acceleration_bias: NotNegative = 0.1
     """Maximum fixed error of each acceleration, m/s^2."""
     temperature_c: float = 30.0
+    """Temperature that the device reports, degrees Celsius."""
 
 
 class GroundTilt(Schema):
@@ -624,6 +633,7 @@ class Hills(Schema):
     wavelength: Annotated[float, Field(ge=0.15)] = 2.0
     """Shortest wavelength, m."""
     seed: Annotated[int, Field(ge=0)] = 1
+    """Seed of the ground."""
     flat: NotNegative = 0.5
     """Radius of level ground around the start of every robot in the world, m."""
 
@@ -639,6 +649,7 @@ class Slope(Schema):
     direction: float = 0.0
     """Uphill direction, rad."""
     angle_deg: Annotated[float, Field(ge=-40, le=40)] = 10.0
+    """Angle of the slope, uphill positive, degrees."""
     length: Positive = 2.0
     """Horizontal length, m."""
 
@@ -692,11 +703,13 @@ class Rubble(Schema):
     width: Positive = 2.0
     """Width along y, m."""
     count: Annotated[int, Field(ge=1, le=200)] = 40
+    """Number of stones."""
     height: Positive = 0.04
     """Height of the highest stone, m."""
     size: Positive = 0.25
     """Longest side, m."""
     seed: Annotated[int, Field(ge=0)] = 1
+    """Seed of the stones."""
 
 
 class HeightImage(Schema):
@@ -731,6 +744,7 @@ class WorldConfig(Schema):
     engine: Literal["plane", "mujoco"] = "plane"
     """Physics engine: kinematics in the plane, or rigid bodies in three dimensions (extra sim3d)."""
     noise: bool = True
+    """Whether the sensors have noise."""
     truck: SimTruckConfig = SimTruckConfig()
     mechanics: MechanicsConfig = MechanicsConfig()
     battery: BatteryModelConfig = BatteryModelConfig()
@@ -743,6 +757,7 @@ class WorldConfig(Schema):
     sonar: SonarModelConfig = SonarModelConfig()
     imu: ImuModelConfig = ImuModelConfig()
     tilt: TiltConfig = GroundTilt()
+    """Tilt of the body"""
     rough: Annotated[tuple[RoughPatch, ...], Field(strict=False)] = ()
     """Patches of rough ground"""
     ground: Annotated[tuple[GroundFeature, ...], Field(strict=False)] = ()

@@ -47,7 +47,9 @@ def ros2(
             help="zenoh: the wire of rmw_zenoh, without ROS 2 here; rclpy: any middleware, by the ROS 2 here.",
         ),
     ] = Face.ZENOH,
-    domain: Annotated[int, typer.Option("--domain", envvar="ROS_DOMAIN_ID", min=0, max=232)] = 0,
+    domain: Annotated[
+        int, typer.Option("--domain", envvar="ROS_DOMAIN_ID", min=0, max=232, help="Domain of the ROS 2 nodes.")
+    ] = 0,
     namespace: Annotated[
         str, typer.Option("--namespace", help="Before all relative topics, such as /truck1: for several robots.")
     ] = "/",

@@ -92,6 +92,7 @@ class SlamConfig(Schema):
     save: Path | None = None
     """Folder for saving the map at the end and every ``save_period`` seconds; null to save nothing"""
     save_period: Positive = 60.0
+    """Interval between saves of the map (s)."""
     front: Literal["planar", "kiss"] = "planar"
     """Scan matcher"""
     mapper: MapperConfig = MapperConfig()

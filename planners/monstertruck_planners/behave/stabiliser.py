@@ -61,6 +61,7 @@ class StabiliserConfig(Schema):
     pitch_limit: Limit = math.radians(30)
     """Maximum joint angle to either side, rad."""
     roll_limit: Limit = math.radians(30)
+    """Maximum joint angle to either side, rad."""
     max_rate: Positive = 3.0
     """Maximum rate of change of a goal, rad/s."""
     lead: Annotated[float, Field(ge=0, le=0.5)] = 0.036

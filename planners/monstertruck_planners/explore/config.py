@@ -58,9 +58,13 @@ class AuthorConfig(ExplorerConfig):
 
     kind: Literal["author"] = "author"
     size_weight: NotNegative = 0.15
+    """Weight of the frontier's size."""
     distance_weight: NotNegative = 0.45
+    """Weight of the distance."""
     angle_weight: NotNegative = 0.5
+    """Weight of the turn towards the frontier."""
     visits_weight: NotNegative = 0.3
+    """Weight of the number of times that the frontier was chosen."""
     near: Positive = 0.2
     """Maximum distance between places treated as one (m)."""
     patience: Positive = 30.0

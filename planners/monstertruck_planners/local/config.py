@@ -78,6 +78,7 @@ class RsbandConfig(LocalPlannerConfig):
 
     kind: Literal["rsband"] = "rsband"
     strategy: Strategy = "start_to_next"
+    """How the path joins the poses of the band."""
     sub_goal: Positive = 0.6
     """Length of band to the goal of ``start_to_next``, m."""
     spacing: Positive = 0.4
@@ -93,7 +94,9 @@ class PublishedConfig(LocalPlannerConfig):
 
     kind: Literal["rsband-as-published"] = "rsband-as-published"
     strategy: Strategy = "start_to_next"
+    """How the path joins the poses of the band."""
     sub_goal: Positive = 0.6
+    """Length of band to the goal of ``start_to_next``, m."""
     radius: Positive = 1.0
     """Turning radius, m."""
     inflation: Positive = 0.3
@@ -113,6 +116,7 @@ class TebConfig(LocalPlannerConfig):
     clearance: Positive = 0.1
     """Preferred between footprint and obstacles, m."""
     obstacle_weight: Positive = 30.0
+    """Weight of clearances below ``clearance``."""
     steering_weight: Positive = 200.0
     """Weight of axle angles beyond their limits."""
     rate_weight: Positive = 1.0

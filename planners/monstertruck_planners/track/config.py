@@ -114,6 +114,7 @@ class FuzzyConfig(TrackerConfig):
 
     kind: Literal["fuzzy"]
     rules: Literal["published", "corrected"] = "corrected"
+    """Rules as published, or with their mistakes corrected."""
     sub_goal: Positive = 0.6
     """Distance along the path to the target pose, m."""
     near: Positive = 0.2

@@ -34,7 +34,9 @@ class SpeedMaskConfig(Schema):
     type: Literal["percent", "absolute"] = "percent"
     """Unit of the limit: percent of `gate.speed` (type 1 of Nav2; none above 100), or m/s (type 2)"""
     base: float = 0.0
+    """Constant term of the limit."""
     multiplier: float = 1.0
+    """Factor on the value of a cell."""
 
 
 class ZonesConfig(Schema):

@@ -45,9 +45,6 @@ SHORTENED = ("full3d", "slam")
 """Configurations whose demo drives 0.7 m instead of a lap."""
 
 INSTEAD = {
-    "monstertruckd security router ann/security bob/security --address 192.168.1.2": Instead(
-        None, "needs the folders of two authorities; tests/unit/bus/test_router.py makes them"
-    ),
     "monstertruckd log view logs/run-000001-000.mcap": Instead(
         "monstertruckd log view logs/run-000001-000.mcap --save shown.rrd", "opens a window and stays"
     ),
@@ -106,23 +103,8 @@ INSTEAD = {
     "monstertruckd behave start line_left --robot sonar --arm": Instead(
         None, "needs the robot with sonars; tests/daemon/test_sonar_robot_virtual.py has it"
     ),
-    "monstertruckd station --users users.yaml --add-user ann --role pilot": Instead(None, "asks for a password"),
     "monstertruckd station --host 0.0.0.0 --certificate station.pem --key station.key --users users.yaml "
     "--name station.local": Instead(None, "serves until it is stopped; tests/unit/station/test_login.py logs in"),
-    **{
-        f"monstertruckd map build {rest}": Instead(
-            None, "needs the bag; tests/unit/tools/logs/test_bags.py writes some"
-        )
-        for rest in (
-            "drive.bag -o runs/map --png map.png",
-            "rosbag2_2026_05_01 -o runs/map --png map.png",
-            "drive.bag -o runs/map --topic /scan --topic /wheel_odometry",
-            "drive.bag -o runs/map --trajectory poses.txt --trajectory-format kitti",
-        )
-    },
-    "monstertruckd map show runs/map --g2o graph.g2o": Instead(
-        None, "needs a map; tests/unit/tools/cli/test_maps.py builds one"
-    ),
     "monstertruckd map save hall.yaml": Instead(None, "needs a robot that maps"),
     "monstertruckd stand print runs/stand/print --tags 0-3,100-125": Instead(
         "monstertruckd stand print print --tags 0-3", "fewer prints"

@@ -25,6 +25,7 @@ from tests.unit.docs.command_lines import (
     resolve,
     starts_truck,
 )
+from tests.unit.tools.logs.bag_kit import ROS1, ROS2, RosMessages, drive, write_ros1, write_ros2
 
 pytestmark = pytest.mark.timeout(180)  # the first route of a computer compiles
 
@@ -46,6 +47,16 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # For lines that add stations, whichever line is first.
     authority = CliRunner().invoke(app, ["security", "init", "--folder", str(folder / "security")])
     assert authority.exit_code == 0, authority.output
+    for robot in ("ann", "bob"):
+        for words in (["init", "--robot", robot], ["add", "desk"]):
+            made = CliRunner().invoke(app, ["security", *words, "--folder", str(folder / robot / "security")])
+            assert made.exit_code == 0, made.output
+    rows = drive(RosMessages(ROS1))
+    rows += [("/wheel_odometry", time, message) for topic, time, message in rows if topic == "/odom"]
+    write_ros1(folder / "drive.bag", rows)
+    write_ros2(folder / "rosbag2_2026_05_01", drive(RosMessages(ROS2)))
+    built = CliRunner().invoke(app, ["map", "build", str(folder / "drive.bag"), "-o", str(folder / "runs" / "map")])
+    assert built.exit_code == 0, built.output
     way = (ROOT / "configs" / "paths" / "loop.csv").read_text().splitlines(keepends=True)[:16]
     (folder / "short.csv").write_text("".join(way))
     for name in SHORTENED:
@@ -101,7 +112,7 @@ def test_it_runs(line: Line, desk: Path, monkeypatch: pytest.MonkeyPatch):
         _look_up(line.text)
         return
     arguments = Line(line.place, instead.line).arguments if instead and instead.line else line.arguments
-    done = CliRunner().invoke(app, arguments)
+    done = CliRunner().invoke(app, arguments, input="a long password\n" * 2)
     assert not isinstance(done.exception, Exception), done.exception
     if instead is not None and instead.code is None:
         assert done.exit_code in {reason.exit_code for reason in Reason} - {Reason.INTERNAL.exit_code}, done.output
