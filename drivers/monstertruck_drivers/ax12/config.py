@@ -51,7 +51,7 @@ class AlarmConfig(Schema):
     rest_max: Positive = 60.0
     """Maximum rest (s)."""
     settled_after: Positive = 30.0
-    """Time of holding after which the next rest starts from ``rest`` again (s)."""
+    """Holding time that resets the next rest to ``rest`` (s)."""
     cool_below: Annotated[int, Field(ge=0, le=100)] = 60
     """Degrees Celsius a joint must have reached."""
 
@@ -85,7 +85,7 @@ class Ax12Config(Schema):
     usb_latency: Annotated[float, Field(ge=0, le=0.255)] = 0.016
     """Latency timer of the adapter, s; 0.001 only where that is confirmed."""
     command_timeout: Annotated[float, Field(gt=0, le=5)] = 0.5
-    """Age at which joint goals are stale (s): they are ignored and the joints hold."""
+    """Age of stale joint goals (s): they are ignored and the joints hold."""
     alarm: AlarmConfig = AlarmConfig()
 
     @model_validator(mode="after")
