@@ -6,6 +6,7 @@ matched: at the edge of the map they are no evidence for or against a pose.
 """
 
 import math
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import Submap, merged
-from monstertruck_estimation.slam.global_search import GlobalLocaliser
+from monstertruck_estimation.slam.global_search import LEVELS, GlobalLocaliser
+from monstertruck_estimation.slam.line_search import best_along
 from monstertruck_estimation.slam.map_evidence import EvidenceGrid
 from monstertruck_estimation.slam.mapping import LOST_AFTER, estimate, fits, status_of
 from monstertruck_estimation.slam.motion import (
@@ -93,7 +95,8 @@ class LocalisationEstimator:
         self._published_covariance = self._covariance
         """Published covariance: the predicted motion's for invalid matches and along a match's weak direction."""
         self._unmeasured = np.zeros(2)
-        """Displacement in map since a match last measured the whole position, shape (2,) (m)."""
+        """Standard deviation in map of the displacement since a match last measured the whole position, shape (2,) (m):
+        its errors do not average out, since wheels slip all along a corridor, and a velocity may have changed."""
         self._stamp: int | None = None
         self._misfits = 0
         """Number of invalid matches in a row."""
@@ -151,7 +154,7 @@ class LocalisationEstimator:
                 events = ("refuted",)
         alone = odom is None or self.odometry is not OdometryUse.USED
         moved = self._scan_odometry.take(stamp, match, match.pose, alone=alone)
-        self._unmeasured = self._unmeasured + match.pose[:2] - self._pose[:2]
+        self._unmeasured = self._unmeasured + self._unmeasured_step(match, dt)
         self._pose, self._covariance = match.pose, match.covariance
         if match.information is not None and not self._misfits:
             if not match.degenerate:
@@ -162,7 +165,7 @@ class LocalisationEstimator:
             self._offset.add(stamp, float(match.pose[2]), inputs.odom[2])
         odom_now = self._motion.odom
         correction = None if odom is None or odom_now is None else compose(self._pose, inverse(odom_now))
-        placed = (self._pose, self._with_scale_error(published), correction)
+        placed = (self._pose, self._with_unmeasured(published), correction)
         return estimate(stamp, placed, match, status, events, self._offset.offset, moved, self.odometry)
 
     def changes(self) -> tuple[list[GridPatch], bool]:
@@ -222,11 +225,9 @@ class LocalisationEstimator:
 
     def _matched_alone(self, scan: Scan, delta: Array, predicted: Predicted, mount: Pose2) -> tuple[ScanMatch, bool]:
         """Match all beams: the motion is not known well enough to select those that end on mapped ground."""
-        match = self._front.match(scan, delta, *predicted[:2], self._submap)
+        match = self._match(scan, delta, predicted)
         contradiction = self._evidence.judge(match.pose, scan.points, np.array(mount[:2])).contradiction
-        if not (fits(match) and contradiction <= MAX_CONTRADICTION):
-            return match, False
-        return without_weak_direction(match, predicted[0], predicted[2]), True
+        return match, fits(match) and contradiction <= MAX_CONTRADICTION
 
     def _matched(self, scan: Scan, delta: Array, predicted: Predicted, mount: Pose2) -> tuple[ScanMatch, bool]:
         """Match the beams that end on mapped ground; return the match and whether it is valid."""
@@ -238,30 +239,51 @@ class LocalisationEstimator:
             return rejected(guess, covariance, MatchStatus.EMPTY), False
         whole = share >= 0.95  # minimum share of beams on mapped ground for matching all beams
         seen = scan if whole else scan.chosen(mapped)
-        match = self._front.match(seen, delta, guess, covariance, self._submap)
+        match = self._match(seen, delta, predicted)
         contradiction = self._evidence.judge(match.pose, seen.points, sensor).contradiction
         # Minimum overlap of the beams on mapped ground if others end elsewhere, and of a match far from the motion.
         partial_overlap = 0.8
         # Maximum share of these beams that contradict the saved grid: a few walls fit in many places.
         partial_contradiction = 0.15
         clear = match.overlap >= partial_overlap and contradiction <= partial_contradiction
-        if _far(match.pose, guess, published):
+        if _far(match.pose, guess, self._with_unmeasured(published)):
             good = clear and whole and not match.degenerate
         else:
             good = contradiction <= MAX_CONTRADICTION and (clear or whole)
-        if not (good and fits(match)):
-            return match, False
-        return without_weak_direction(match, guess, published), True
+        return match, good and fits(match)
 
-    def _with_scale_error(self, covariance: Array) -> Array:
-        """Return ``covariance``, shape (3, 3), plus the covariance of the scale of an unmatched displacement.
+    def _unmeasured_step(self, match: ScanMatch, dt: float) -> Array:
+        """Return the standard deviation of the latest displacement, shape (2,) (m), by wheels or without them."""
+        if self.odometry is OdometryUse.USED:
+            return self._config.odometry_distance * (match.pose[:2] - self._pose[:2])
+        if not match.degenerate or not match.accepted:
+            return np.zeros(2)
+        along = self._config.blind_speed[0] * dt * np.array((math.cos(match.direction), math.sin(match.direction)))
+        return along if along @ self._unmeasured >= 0 else -along
 
-        Its errors do not average out: wheels that slip do so all along a corridor.
-        """
+    def _with_unmeasured(self, covariance: Array) -> Array:
+        """Return ``covariance``, shape (3, 3), plus that of the displacement which no match has measured."""
         result = covariance.copy()
-        shift = self._config.odometry_distance * self._unmeasured
-        result[:2, :2] += np.outer(shift, shift)
+        result[:2, :2] += np.outer(self._unmeasured, self._unmeasured)
         return result
+
+    def _match(self, scan: Scan, delta: Array, predicted: Predicted) -> ScanMatch:
+        """Match ``scan``; along its weak direction, wherever the prediction allows it to fit best.
+
+        The match is degenerate if another place there fits as well.
+        """
+        guess, covariance, published = predicted
+        match = self._front.match(scan, delta, guess, covariance, self._submap)
+        if not match.accepted:
+            return match
+        prior = self._with_unmeasured(published)
+        place = best_along(self._submap.grid(LEVELS), scan.points, match, guess, prior)
+        if place is not None and place.only and place.apart:
+            other = self._front.match(scan, delta, place.pose, covariance, self._submap)
+            match = other if other.accepted else replace(match, degeneracy=0.0)
+        elif place is not None and not place.only:
+            match = replace(match, degeneracy=0.0)
+        return without_weak_direction(match, guess, published)
 
     def _search_anew(self) -> GlobalLocaliser:
         return GlobalLocaliser(self._submap, self._evidence, self._config)

@@ -1,0 +1,68 @@
+"""Search along the direction that a match constrains least: is its place the only one that the prediction allows?
+
+A pillar of a corridor fits at the next one, and a wall ahead at every recess. The information of a match does not say
+so, because it takes the pairs of points as they are.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from monstertruck_estimation.slam.correlation import RESOLUTION, LikelihoodGrid
+from monstertruck_estimation.slam.scan_matcher import ScanMatch
+from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import transform
+
+
+class Place(NamedTuple):
+    """Best place on the line."""
+
+    pose: Array
+    """Base in map, shape (3,)."""
+    apart: bool
+    """Whether it is another one than the match's."""
+    only: bool
+    """Whether all others fit clearly worse."""
+
+
+def best_along(grid: LikelihoodGrid, points: Array, match: ScanMatch, guess: Array, covariance: Array) -> Place | None:
+    """Return where ``points`` fit best along the weak direction of ``match``.
+
+    Args:
+        grid: likelihoods of surfaces in map.
+        points: ends of beams in base, shape (n, 2) (m).
+        match: an accepted match.
+        guess: predicted pose, shape (3,).
+        covariance: its covariance, shape (3, 3); it limits the search to three standard deviations.
+
+    Returns:
+        None if the prediction allows no other place.
+    """
+    direction = np.array((math.cos(match.direction), math.sin(match.direction)))
+    half = 3.0 * math.sqrt(float(direction @ covariance[:2, :2] @ direction))
+    same_place = 0.25  # three standard deviations of the likelihood round a surface, m
+    if half <= same_place:
+        return None
+    middle = float(direction @ (guess - match.pose)[:2])
+    count = math.floor(half / RESOLUTION)
+    offsets = np.append(middle + RESOLUTION * np.arange(-count, count + 1), 0.0)
+    likelihoods = _likelihoods(grid, transform(match.pose, points), offsets[:, None] * direction)
+    sums = likelihoods.sum(axis=1)
+    best = -1 if sums[-1] >= sums.max() else int(sums.argmax())
+    gains = likelihoods[best] - likelihoods
+    # Standard deviations by which the best place fits better, if every point may be wrong independently of the others.
+    sigmas = gains.sum(axis=1) / np.maximum(np.sqrt(np.square(gains).sum(axis=1)), 1e-9)
+    others = np.abs(offsets - offsets[best]) > same_place
+    sure = 3.0  # standard deviations
+    pose = match.pose + offsets[best] * np.array((*direction, 0.0))
+    return Place(pose, bool(abs(offsets[best]) > same_place), bool((sigmas[others] >= sure).all()))
+
+
+def _likelihoods(grid: LikelihoodGrid, ends: Array, shifts: Array) -> Array:
+    """Likelihoods 0..1, shape (m, n), of points ``ends``, (n, 2) (m), that are moved by each of ``shifts``, (m, 2)."""
+    level = grid.levels[0]
+    cells = np.floor((ends[None] + shifts[:, None] - grid.origin) / RESOLUTION).astype(np.int64)
+    columns, rows = cells[..., 0], cells[..., 1]
+    inside = (columns >= 0) & (columns < level.shape[1]) & (rows >= 0) & (rows < level.shape[0])
+    return np.where(inside, level[np.where(inside, rows, 0), np.where(inside, columns, 0)] / 255.0, 0.0)
