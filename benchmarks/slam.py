@@ -4,7 +4,8 @@
 
 DIR holds the files of the manifest in slam_parts/logs.py; their sha256 is checked first. Logs: intel1 (the first
 1088 s), intel4 (those cut to 4 m), intel (joined), aces, csail; parts: thinned (whole logs, and every 2nd to 20th scan
-of them), crowds (people who walk in drawn logs; with --quick one seed of each map), exp2 (whole daemon), localise
+of them), crowds (people who walk in drawn logs; with --quick one seed of each map), mounts (lidars that are
+turned, mirrored or late in drawn logs; the same), exp2 (whole daemon), localise
 (starts by seed in maps of a part of Intel; with --quick 20, not 100), map_edge (robots that leave such maps of Intel
 and CSAIL), kidnap (cuts drawn by seed; with --quick 4 in the first 2500 scans of Intel), wrong_odometry (five faults;
 with --quick of those scans), costs, world (odometry by every subset of sensors in the emulators' world; with --quick
@@ -43,6 +44,7 @@ Result = tuple[dict[str, float], dict[str, float], bool]
 RUNS: dict[str, Callable[[argparse.Namespace], Result]] = {
     "thinned": lambda asked: _part("thinned").run(asked.data, asked.logs or _part("thinned").LOGS),
     "crowds": lambda asked: _part("crowds").run(asked.data, quick=asked.quick),
+    "mounts": lambda asked: _part("mounts").run(asked.data, quick=asked.quick),
     "exp2": lambda _: _part("exp2").run(OUT / "exp2.png"),
     "localise": lambda asked: _part("localisation").run(asked.data, quick=asked.quick),
     "map_edge": lambda asked: _part("map_edge").run(asked.data, quick=asked.quick),

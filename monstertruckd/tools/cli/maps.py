@@ -143,12 +143,12 @@ def build(
     Exit code 90 (`pose_lost`) if more than a tenth of the path is lost; the map is written even so.
     """
     from monstertruck_estimation.slam.config import SlamConfig
+    from monstertruck_estimation.slam.mount import mount_of
     from monstertruck_estimation.slam.worker import SlamWorker
     from monstertruck_estimation.slam.worker_io import WorkerInput
     from monstertruck_runtime.errors import InputError
     from monstertruck_schemas.reasons import Reason
     from monstertruckd.tools.logs.map_quality import PathQuality
-    from monstertruckd.tools.logs.mount_check import MountCheck
     from monstertruckd.tools.logs.trajectory import LINES, write_trajectory
 
     scans = _read(log, options)
@@ -173,7 +173,7 @@ def build(
         "lost_share": quality.lost_share,
         "lost_poses": int(quality.lost.sum()),
     }
-    mount = MountCheck.of(scans.scans, done.trajectory)
+    mount = mount_of(scans.scans, done.trajectory)
     if mount is not None:
         facts |= {"lidar_yaw_off": mount.yaw, "lidar_yaw_deviation": mount.deviation}
         if mount.fault is not None:

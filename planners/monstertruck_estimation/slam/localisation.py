@@ -19,12 +19,12 @@ from monstertruck_estimation.slam.line_search import best_along
 from monstertruck_estimation.slam.map_evidence import EvidenceGrid
 from monstertruck_estimation.slam.mapping import LOST_AFTER, estimate, fits, status_of
 from monstertruck_estimation.slam.motion import (
-    ClockOffsetEstimator,
     MotionPredictor,
     ScanOdometry,
     constrained,
     without_weak_direction,
 )
+from monstertruck_estimation.slam.mount import LidarCheck
 from monstertruck_estimation.slam.registration import Cloud
 from monstertruck_estimation.slam.scan_matcher import (
     MatchStatus,
@@ -103,7 +103,7 @@ class LocalisationEstimator:
         self._blind = False
         """Whether the last match was degenerate."""
         self._published = False
-        self._offset = ClockOffsetEstimator()
+        self._check = LidarCheck()
         self._scan_odometry = ScanOdometry()
         self.counts = {"scans": 0, "keys": 0, "closures": 0, "rejected": 0, "searches": int(start is None)}
 
@@ -161,12 +161,14 @@ class LocalisationEstimator:
                 self._unmeasured = np.zeros(2)
             published = np.linalg.inv(constrained(match, match.information) + np.linalg.inv(published))
         self._published_covariance = published
-        if inputs.odom is not None and match.accepted:
-            self._offset.add(stamp, float(match.pose[2]), inputs.odom[2])
+        if match.accepted and not match.degenerate and not events:
+            self._check.add(stamp, match.pose, odom, self.odometry)
+        else:
+            self._check.interrupt()
         odom_now = self._motion.odom
         correction = None if odom is None or odom_now is None else compose(self._pose, inverse(odom_now))
         placed = (self._pose, self._with_unmeasured(published), correction)
-        return estimate(stamp, placed, match, status, events, self._offset.offset, moved, self.odometry)
+        return estimate(stamp, placed, match, status, events, self._check, moved, self.odometry)
 
     def changes(self) -> tuple[list[GridPatch], bool]:
         """See ``Estimator``: a saved map never changes, but is published once."""

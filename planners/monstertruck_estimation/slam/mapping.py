@@ -17,12 +17,12 @@ from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.grid import NONE, GridBuilder, passed_ends
 from monstertruck_estimation.slam.keyframes import LOOSENED, KeyframeMap, Trajectory
 from monstertruck_estimation.slam.motion import (
-    ClockOffsetEstimator,
     MotionPredictor,
     ScanOdometry,
     velocity,
     without_weak_direction,
 )
+from monstertruck_estimation.slam.mount import LidarCheck
 from monstertruck_estimation.slam.movers import MoverDetector
 from monstertruck_estimation.slam.relocation import (
     OFF_MOTION,
@@ -462,7 +462,7 @@ class MappingEstimator:
         """Keyframes that are not on the map: scan, stamp, mount."""
         self._doubtful: list[tuple[Scan, int, Pose2]] = []
         """Keyframes on the map by a join that is in doubt."""
-        self._offset = ClockOffsetEstimator()
+        self._check = LidarCheck()
         self._scan_odometry = ScanOdometry()
 
     @property
@@ -505,8 +505,9 @@ class MappingEstimator:
                 self._drawn = step.pose, inputs.odom
             passed = NONE if self._passed is None else passed_ends(inputs, self._passed)
             self.builder.add(step.scan, step.stamp, step.pose, inputs.mount, passed)
-            if inputs.odom is not None and self.mapper.odometry is OdometryUse.USED:
-                self._offset.add(step.stamp, float(step.pose[2]), inputs.odom[2])
+            self._check.add(step.stamp, step.pose, odom, self.mapper.odometry)
+        else:
+            self._check.interrupt()
         if parted:
             self._withdraw_parted()
         if joined:
@@ -514,6 +515,8 @@ class MappingEstimator:
         if not self.mapper.map.doubtful:
             self._doubtful.clear()
         closed = MappingEvent.CLOSED in step.events or joined or parted
+        if closed:
+            self._check.interrupt()
         moved = self._scan_odometry.take(step.stamp, step.match, step.pose, alone=alone, corrected=closed)
         status = (
             LocalisationStatus.LOST
@@ -526,7 +529,7 @@ class MappingEstimator:
             step.match,
             status,
             tuple(map(str, step.events)),
-            self._offset.offset,
+            self._check,
             moved,
             self.mapper.odometry,
         )
@@ -608,7 +611,7 @@ def estimate(
     match: ScanMatch,
     status: LocalisationStatus,
     events: tuple[str, ...],
-    offset: float | None,
+    check: LidarCheck,
     moved: ScanIncrement | None = None,
     odometry: OdometryUse = OdometryUse.NONE,
 ) -> SlamEstimate:
@@ -628,7 +631,8 @@ def estimate(
         direction=match.direction,
         verdict=str(match.verdict),
         events=events,
-        offset=offset,
+        offset=check.offset,
+        mount_fault=check.mount_fault,
         moved=moved,
         odometry=odometry,
     )

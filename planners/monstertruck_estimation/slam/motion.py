@@ -481,19 +481,31 @@ def find_offset(stamps: Array, matched: Array, odom: Array) -> float | None:
     if len(turning) < OFFSET_LEAST_SCANS // 2 or turning.std() < LEAST_EXCITATION:
         return None
     likeness = np.array([_correlation(turning, times, wheel, lag, inside) for lag in offset_lags])
-    best, still = int(np.argmax(likeness)), likeness[np.argmin(np.abs(offset_lags))]
-    if (
-        abs(offset_lags[best]) < 0.09  # smaller offsets are within the noise, s
-        or likeness[best] < 0.8  # minimum correlation at the offset
-        or likeness[best] - still < 0.08  # minimum gain over zero offset
-    ):
+    best = int(np.argmax(likeness))
+    if not 0 < best < len(offset_lags) - 1 or likeness[best] < 0.8:  # minimum correlation at the offset
         return None
-    return -float(offset_lags[best])
+    before, peak, after = likeness[best - 1 : best + 2].tolist()
+    step = float(offset_lags[1] - offset_lags[0])
+    lag = float(offset_lags[best]) + step * (before - after) / (2.0 * (before - 2.0 * peak + after))
+    at, sooner, later = (_turning(times, wheel, shifted, inside) for shifted in (lag, lag - step, lag + step))
+    gain = float((turning - turning.mean()) @ (at - at.mean())) / max(float(at.var()) * len(at), 1e-9)
+    residuals = turning - turning.mean() - gain * (at - at.mean())
+    slopes = gain * (later - sooner) / (2.0 * step)
+    # Errors of neighbouring scans are correlated, those of blocks are not.
+    blocks = np.add.reduceat(residuals * slopes, np.arange(0, len(slopes), 20))
+    deviation = float(np.linalg.norm(blocks)) / max(float(slopes @ slopes), 1e-9)
+    # Interpolation between scans smooths odometry, which makes shifts by half of their period likely.
+    smoothing = float(np.median(np.diff(times))) / 2.0
+    return -lag if abs(lag) > max(smoothing, 3.0 * deviation) else None
+
+
+def _turning(times: Array, wheel: Array, lag: float, inside: NDArray[np.bool_]) -> Array:
+    """Return the yaw rates of ``wheel`` between the ``times`` that are ``inside``, all shifted by ``lag`` (s)."""
+    return np.asarray((np.diff(np.interp(times + lag, times, wheel)) / np.diff(times))[inside])
 
 
 def _correlation(turning: Array, times: Array, wheel: Array, lag: float, inside: NDArray[np.bool_]) -> float:
-    shifted = np.interp(times + lag, times, wheel)
-    turned = np.diff(shifted)[inside] / np.diff(times)[inside]
+    turned = _turning(times, wheel, lag, inside)
     spread = turned.std()
     if spread < LEAST_EXCITATION:
         return 0.0

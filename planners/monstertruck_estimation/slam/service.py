@@ -119,6 +119,7 @@ class SlamService:
         self._refused: str | None = None
         self._left_out = 0
         self._offset_reported = False
+        self._mount_reported = False
         self._due = {"tiles": 0, "whole": 0, "save": clock.now() + round(config.save_period * SECOND)}
         self._changed = False
         self._under_way: asyncio.Task[Any] | None = None
@@ -399,6 +400,9 @@ class SlamService:
             self._offset_reported = True
             text = f"odometry runs {estimate.offset:+.2f} s ahead of the scans"
             self._events(Reason.TIME_OFFSET, Severity.WARNING, self.name, text, offset=estimate.offset)
+        if estimate.mount_fault is not None and not self._mount_reported:
+            self._mount_reported = True
+            self._events(Reason.LIDAR_TURNED, Severity.WARNING, self.name, estimate.mount_fault)
         if estimate.odometry is not self._use:
             previous, self._use = self._use, estimate.odometry
             if estimate.odometry in {OdometryUse.CONTRADICTED, OdometryUse.MISSING}:

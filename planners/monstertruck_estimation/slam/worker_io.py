@@ -143,6 +143,8 @@ class SlamEstimate:
     events: tuple[str, ...] = ()
     offset: float | None = None
     """Lead of odometry over the scans (s); None if none was found."""
+    mount_fault: str | None = None
+    """Fault of the lidar's mount; None if none is certain."""
     moved: ScanIncrement | None = None
     """Motion since the last match; None for the first scan, and after rejected matches."""
     odometry: OdometryUse = OdometryUse.NONE

@@ -32,6 +32,8 @@ class FakeWorker:
     """Status of each scan to come."""
     happened: ClassVar[list[tuple[str, ...]]] = []
     """Events of each scan to come."""
+    fault: ClassVar[str | None] = None
+    """Fault of the lidar's mount."""
 
     def __init__(self, name: str, target: str, clock: VirtualClock, **settings: float) -> None:
         FakeWorker.tasks, FakeWorker.at_once = [], 0
@@ -58,7 +60,9 @@ class FakeWorker:
         counts = {"scans": 1, "keys": 1, "closures": 0, "rejected": 0}
         status, pose = self.statuses.pop(0), (0.0, 0.0, 0.0)
         events = self.happened.pop(0) if self.happened else ()
-        made = SlamEstimate(task.scan.stamp, pose, (0.0,) * 9, None, status, 1.0, 0.0, 0.0, 0.0, "", events)
+        made = SlamEstimate(
+            task.scan.stamp, pose, (0.0,) * 9, None, status, 1.0, 0.0, 0.0, 0.0, "", events, mount_fault=self.fault
+        )
         return WorkerOutput(made, saved=saved, counts=counts)
 
 
@@ -139,6 +143,18 @@ def test_a_join_that_is_undone_is_a_warning_of_its_own(monkeypatch, tmp_path: Pa
     said = events_of(story, monkeypatch, tmp_path)
     assert [reason for reason, _ in said] == [Reason.LOOP_CLOSED, Reason.JOIN_UNDONE, Reason.POSE_LOST]
     assert said[1][1] == "what was seen since then contradicts it"
+
+
+def test_a_fault_of_the_lidars_mount_is_reported_once(monkeypatch, tmp_path: Path):
+    FakeWorker.statuses[:] = [LocalisationStatus.MAPPING] * 3
+    monkeypatch.setattr(FakeWorker, "fault", "the lidar is turned")
+
+    async def story(clock, scans, service):
+        while FakeWorker.statuses:
+            scans.put(scan(clock))
+            await clock.sleep(0.2)
+
+    assert events_of(story, monkeypatch, tmp_path) == [(Reason.LIDAR_TURNED, "the lidar is turned")]
 
 
 def test_with_scans_it_is_saved_once_with_the_next_one(monkeypatch, tmp_path: Path):

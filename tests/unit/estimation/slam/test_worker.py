@@ -188,16 +188,17 @@ def test_scans_with_a_few_beams_more_or_less_are_matched():
     assert np.hypot(*(np.array(output.estimate.pose[:2]) - pose_at(29)[:2])) < 0.05
 
 
-def test_an_offset_between_wheels_and_scans_is_found_and_none_invented():
+@pytest.mark.parametrize("rates", [(1.1, 2.7), (0.5, 1.2)])
+def test_an_offset_between_wheels_and_scans_is_found_to_10_ms_and_none_invented(rates: tuple[float, float]):
     rng = np.random.default_rng(4)
     times = np.arange(0, 20, 0.1)
 
     def yaw(t: np.ndarray) -> np.ndarray:
-        return 0.6 * np.sin(t * 1.1) + 0.3 * np.sin(t * 2.7)
+        return 0.6 * np.sin(t * rates[0]) + 0.3 * np.sin(t * rates[1])
 
     stamps = (times * SECOND).astype(np.int64)
     scans = yaw(times) + rng.normal(0, 0.002, len(times))
-    assert find_offset(stamps, scans, yaw(times + 0.2)) == pytest.approx(0.2, abs=0.06)
+    assert find_offset(stamps, scans, yaw(times + 0.2)) == pytest.approx(0.2, abs=0.01)
     assert find_offset(stamps, scans, yaw(times)) is None
     assert find_offset(stamps, rng.normal(0, 0.001, len(times)), np.zeros(len(times))) is None
 
