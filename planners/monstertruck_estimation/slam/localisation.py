@@ -257,7 +257,7 @@ class LocalisationEstimator:
     def _unmeasured_step(self, match: ScanMatch, dt: float) -> Array:
         """Return the standard deviation of the latest displacement, shape (2,) (m), by wheels or without them."""
         if self.odometry is OdometryUse.USED:
-            return self._config.odometry_distance * (match.pose[:2] - self._pose[:2])
+            return np.asarray(self._config.odometry_distance * (match.pose[:2] - self._pose[:2]))
         if not match.degenerate or not match.accepted:
             return np.zeros(2)
         along = self._config.blind_speed[0] * dt * np.array((math.cos(match.direction), math.sin(match.direction)))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from monstertruck_estimation.slam.motion import ClockOffsetEstimator
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.elementary import Array
-from monstertruck_kinematics.se2 import between
+from monstertruck_kinematics.se2 import between, wrap
 from monstertruck_schemas.health import OdometryUse
 
 LEAST_YAW: Final = math.radians(1.5)
@@ -124,7 +124,9 @@ def estimated(by_wheels: Array, by_scans: Array) -> MountEstimate:
     if mirrored:
         by_scans = by_scans * (1.0, -1.0, -1.0)
     seen = by_scans[:, 0] + 1j * by_scans[:, 1]
-    levers = np.column_stack((by_wheels[:, 0] + 1j * by_wheels[:, 1], np.exp(1j * by_scans[:, 2]) - 1.0))
+    # The turn is taken from the scans, which measure it best: half of it turns the chord of a stretch.
+    driven = (by_wheels[:, 0] + 1j * by_wheels[:, 1]) * np.exp(0.5j * wrap(by_scans[:, 2] - by_wheels[:, 2]))
+    levers = np.column_stack((driven, np.exp(1j * by_scans[:, 2]) - 1.0))
     displaced = 0.05  # standard deviation of the lidar's displacement from its mount, m
     weights, found, normal = np.ones(len(seen)), np.zeros(2, complex), np.eye(2, dtype=complex)
     errors, noise = seen, 0.01  # standard deviation of a stretch's motion before it is known, m
