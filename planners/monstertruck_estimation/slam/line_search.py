@@ -15,18 +15,20 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import transform
 
 
-class Place(NamedTuple):
-    """Best place on the line."""
+class LinePeak(NamedTuple):
+    """Best pose on the line."""
 
     pose: Array
     """Base in map, shape (3,)."""
     apart: bool
-    """Whether it is another one than the match's."""
+    """Whether it is not the match's place."""
     only: bool
-    """Whether all others fit clearly worse."""
+    """Whether all other places fit clearly worse."""
 
 
-def best_along(grid: LikelihoodGrid, points: Array, match: ScanMatch, guess: Array, covariance: Array) -> Place | None:
+def best_along(
+    grid: LikelihoodGrid, points: Array, match: ScanMatch, guess: Array, covariance: Array
+) -> LinePeak | None:
     """Return where ``points`` fit best along the weak direction of ``match``.
 
     Args:
@@ -51,12 +53,12 @@ def best_along(grid: LikelihoodGrid, points: Array, match: ScanMatch, guess: Arr
     sums = likelihoods.sum(axis=1)
     best = -1 if sums[-1] >= sums.max() else int(sums.argmax())
     gains = likelihoods[best] - likelihoods
-    # Standard deviations by which the best place fits better, if every point may be wrong independently of the others.
+    # Gain of the best place in standard deviations, with independent errors of the points.
     sigmas = gains.sum(axis=1) / np.maximum(np.sqrt(np.square(gains).sum(axis=1)), 1e-9)
     others = np.abs(offsets - offsets[best]) > same_place
     sure = 3.0  # standard deviations
     pose = match.pose + offsets[best] * np.array((*direction, 0.0))
-    return Place(pose, bool(abs(offsets[best]) > same_place), bool((sigmas[others] >= sure).all()))
+    return LinePeak(pose, bool(abs(offsets[best]) > same_place), bool((sigmas[others] >= sure).all()))
 
 
 def _likelihoods(grid: LikelihoodGrid, ends: Array, shifts: Array) -> Array:

@@ -264,7 +264,7 @@ class LocalisationEstimator:
         return along if along @ self._unmeasured >= 0 else -along
 
     def _with_unmeasured(self, covariance: Array) -> Array:
-        """Return ``covariance``, shape (3, 3), plus that of the displacement which no match has measured."""
+        """Return ``covariance``, shape (3, 3), plus the variance of the unmeasured displacement."""
         result = covariance.copy()
         result[:2, :2] += np.outer(self._unmeasured, self._unmeasured)
         return result

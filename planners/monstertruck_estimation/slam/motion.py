@@ -491,7 +491,7 @@ def find_offset(stamps: Array, matched: Array, odom: Array) -> float | None:
     gain = float((turning - turning.mean()) @ (at - at.mean())) / max(float(at.var()) * len(at), 1e-9)
     residuals = turning - turning.mean() - gain * (at - at.mean())
     slopes = gain * (later - sooner) / (2.0 * step)
-    # Errors of neighbouring scans are correlated, those of blocks are not.
+    # Neighbouring scans have correlated errors, blocks of them do not.
     blocks = np.add.reduceat(residuals * slopes, np.arange(0, len(slopes), 20))
     deviation = float(np.linalg.norm(blocks)) / max(float(slopes @ slopes), 1e-9)
     # Interpolation between scans smooths odometry, which makes shifts by half of their period likely.

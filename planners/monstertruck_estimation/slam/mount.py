@@ -1,4 +1,4 @@
-"""Mount of the lidar, estimated beside the map from the motions by odometry and by the scans.
+"""Estimate of the lidar's mount beside the map: motions of the wheels against those of the scans.
 
 Wheels measure motion in the robot's axes, scans in the axes of the lidar. A lidar that is turned by an angle against
 its mount sees every motion turned by that angle the other way, and the map is none the worse for it; one that hangs
@@ -107,14 +107,14 @@ class LidarCheck:
     def add(self, stamp: int, pose: Array, odom: Array | None, use: OdometryUse) -> None:
         """Take base in map by the scan at ``stamp`` (ns), and in odom, shape (3,) each, and what odometry is used for.
 
-        Odometry that scans contradict may do so because of the mount.
+        A wrong mount contradicts odometry, too.
         """
         self._mount.add(odom, pose)
         if odom is not None and use is OdometryUse.USED:
             self._clocks.add(stamp, float(pose[2]), float(odom[2]))
 
     def interrupt(self) -> None:
-        """Begin anew where a pose was corrected, or is no measurement."""
+        """Begin a new stretch after a corrected or unmeasured pose."""
         self._mount.interrupt()
 
 
@@ -136,7 +136,7 @@ def estimated(by_wheels: Array, by_scans: Array) -> MountEstimate:
         errors = seen - levers @ found
         noise = max(1.48 * float(np.median(np.abs(errors))) / math.sqrt(2.0), 1e-6)  # 1.48: of a normal distribution
         weights = 1.0 / (1.0 + np.square(np.abs(errors) / (2.0 * noise)))
-    # Errors of neighbouring stretches are correlated, those of blocks are not.
+    # Neighbouring stretches have correlated errors, blocks of them do not.
     scores = (levers.conj() * (weights * errors)[:, None]) @ np.linalg.inv(normal)[0]
     blocks = np.add.reduceat(scores, np.arange(0, len(scores), 5)) / found[0]
     yaw = -float(np.angle(found[0])) * (-1.0 if mirrored else 1.0)
