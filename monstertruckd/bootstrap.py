@@ -18,6 +18,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import urllib.parse
 import urllib.request
 import zipfile
@@ -48,8 +49,11 @@ would take as long as a thousand tests."""
 FOUR = ("-n", "4")
 """Tests at a time on the two cores of a small computer: some wait for a process or a time-out, and next to busy
 programs four get more of the cores than two."""
-TWO = ("-n", "2")
-"""Tests on the wall clock at a time: each runs a truck and a daemon, which must not be late."""
+WALL = ("-n", "2", *TESTS, "-m", "wall and not long", "-o", "cache_dir=.pytest_cache/wall")
+"""Tests on the wall clock, two at a time: each runs a truck and a daemon, which must not be late. Those that failed are
+kept apart from those of the other tests, beside which they run."""
+LESS_URGENT = (Path("nice"), "-n", "5")
+"""Start of the command that runs the tests beside those on the wall clock."""
 FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
 KERNELS: tuple[Path, str, str] = (VENV / "bin" / "python", "-m", "monstertruckd.tools.install.kernels")
 """Compiles what goals and maps need, and names each part."""
@@ -176,9 +180,9 @@ def run(program: Path, *arguments: str) -> int:
 
 
 def check(arguments: list[str]) -> int:
-    """All checks but the long tests, fastest first; stops at the first failure.
+    """All checks but the long tests, fastest first; stops at the first failure, but for the last two steps.
 
-    ``arguments`` go to pytest.
+    ``arguments`` go to pytest. Tests on the wall clock mostly wait: they run beside those that only compute.
 
     Failed tests are run once more, one at a time: on a busy computer some miss a time-out while others run.
     Both results are printed; one that fails again fails the check.
@@ -206,21 +210,43 @@ def check(arguments: list[str]) -> int:
     finally:
         compiling.kill()
         compiling.wait()
-    return steps(
-        (pytest, [*FOUR, *TESTS, "-m", "not wall and not traced and not long", *arguments]),
-        (pytest, [*TWO, *TESTS, "-m", "wall and not long", *arguments]),
-    )
+    return both(pytest, [*WALL, *arguments], [*FOUR, *TESTS, "-m", "not wall and not traced and not long", *arguments])
+
+
+def both(pytest: Path, wall: list[str], others: list[str]) -> int:
+    """Run the tests on the wall clock and all others at once, then what failed, alone; the exit code, or 0.
+
+    What the tests on the wall clock print is shown at their end.
+    """
+    with tempfile.TemporaryFile() as output:
+        beside = subprocess.Popen([str(pytest), *wall], cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
+        try:
+            nice, *niceness = LESS_URGENT
+            code = step(nice, [*niceness, str(pytest), *others])
+            print(f"==> pytest {' '.join(wall)}", flush=True)
+            wall_code = beside.wait()
+        finally:
+            beside.terminate()
+            beside.wait()
+            output.seek(0)
+            print(output.read().decode(errors="replace"), flush=True)
+    return retried(pytest, others, code) or retried(pytest, wall, wall_code)
 
 
 def steps(*programs: tuple[Path, list[str]]) -> int:
     """Run one check after the other; returns the exit code of the first that fails, or 0."""
     for program, arguments in programs:
-        code = step(program, arguments)
-        if program.name == "pytest" and code == 1:  # exit code of pytest; others mean that it did not run them
-            code = step(program, [*arguments, *FAILED_ALONE])
+        code = retried(program, arguments, step(program, arguments))
         if code:
             return code
     return 0
+
+
+def retried(program: Path, arguments: list[str], code: int) -> int:
+    """Run the tests that failed once more, alone, if ``code`` says that some did; the exit code."""
+    if program.name == "pytest" and code == 1:  # exit code of pytest; others mean that it did not run them
+        return step(program, [*arguments, *FAILED_ALONE])
+    return code
 
 
 def step(program: Path, arguments: list[str]) -> int:

@@ -3,7 +3,9 @@
 import ast
 import subprocess
 import urllib.error
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -160,6 +162,8 @@ def steps(monkeypatch: pytest.MonkeyPatch):
     codes: list[int] = []
 
     def run(program: Path, *arguments: str) -> int:
+        if program.name == "nice":
+            program, arguments = Path(arguments[2]), arguments[3:]
         if program.name != "pytest":
             return 0
         ran.append(arguments)
@@ -167,7 +171,7 @@ def steps(monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setattr(bootstrap, "find_uv", lambda: "uv")
     monkeypatch.setattr(bootstrap, "run", run)
-    monkeypatch.setattr(bootstrap.subprocess, "Popen", Compiling)
+    monkeypatch.setattr(bootstrap.subprocess, "Popen", lambda *words, **more: Beside.started(ran, *words, **more))
     return ran, codes
 
 
@@ -175,9 +179,6 @@ class Compiling:
     """The process that compiles the kernels."""
 
     code, waited, killed = 0, False, False
-
-    def __init__(self, command: tuple[str, ...], **_: object) -> None:
-        assert command == bootstrap.KERNELS
 
     def wait(self) -> int:
         type(self).waited = True
@@ -187,12 +188,60 @@ class Compiling:
         type(self).killed = True
 
 
+class Beside:
+    """The process that runs the tests on the wall clock beside the others."""
+
+    code, ended = 0, 0
+
+    @classmethod
+    def started(cls, ran: list[tuple[str, ...]], command: Sequence[str], **more: Any) -> "Compiling | Beside":
+        if command == bootstrap.KERNELS:
+            return Compiling()
+        assert Path(command[0]).name == "pytest"
+        ran.append(tuple(command[1:]))
+        more["stdout"].write(b"those on the wall clock\n")
+        return cls()
+
+    def wait(self) -> int:
+        return self.code
+
+    def terminate(self) -> None:
+        type(self).ended += 1
+
+
 def test_tests_that_failed_beside_others_are_run_once_more_alone(steps):
     ran, codes = steps
     codes += [0, 1, 0]
     assert bootstrap.check([]) == 0
     assert len(ran) == 4
-    assert ran[2] == (*ran[1], *bootstrap.FAILED_ALONE)
+    assert ran[3] == (*ran[2], *bootstrap.FAILED_ALONE)
+
+
+@pytest.mark.parametrize(("again", "code"), [(0, 0), (1, 1)])
+def test_so_are_those_on_the_wall_clock_which_run_beside_the_others_and_are_shown_behind(
+    steps, again: int, code: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+):
+    ran, codes = steps
+    monkeypatch.setattr(Beside, "code", 1)
+    codes += [0, 0, again]
+    assert bootstrap.check([]) == code
+    assert ran[1] == bootstrap.WALL
+    assert ran[3] == (*bootstrap.WALL, *bootstrap.FAILED_ALONE)
+    lines = [line.partition(" -")[0] for line in capfd.readouterr().out.splitlines()]
+    assert lines[-5:] == ["==> nice", "==> pytest", "those on the wall clock", "", "==> pytest"]
+
+
+def test_those_on_the_wall_clock_end_with_the_check(steps, monkeypatch: pytest.MonkeyPatch):
+    def interrupt(program: Path, *_: str) -> int:
+        if program.name == "nice":
+            raise KeyboardInterrupt
+        return 0
+
+    monkeypatch.setattr(Beside, "ended", 0)
+    monkeypatch.setattr(bootstrap, "run", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        bootstrap.check([])
+    assert Beside.ended == 1
 
 
 @pytest.mark.parametrize("again", [1, 5])
