@@ -46,12 +46,13 @@ TESTS = ("--dist", "worksteal", "--hypothesis-profile", "ci", "--assert", "plain
 """Neighbours run in one process, which caches their shared data; property tests have the same examples every time, and
 no time limit. Plain pytest draws new ones. Values of local variables stand for those in assertions, whose rewriting
 would take as long as a thousand tests."""
-FOUR = ("-n", "4")
-"""Tests at a time on the two cores of a small computer: some wait for a process or a time-out, and next to busy
-programs four get more of the cores than two."""
-WALL = ("-n", "2", *TESTS, "-m", "wall and not long", "-o", "cache_dir=.pytest_cache/wall")
-"""Tests on the wall clock, two at a time: each runs a truck and a daemon, which must not be late. Those that failed are
-kept apart from those of the other tests, beside which they run."""
+TWO = ("-n", "2")
+"""Tests at a time on the two cores of a small computer: one more process would import everything once more, and trucks
+and daemons on the wall clock would be late."""
+THREE = ("-n", "3")
+"""Other tests at a time: some wait for a process or a time-out."""
+WALL = (*TWO, *TESTS, "-m", "wall and not long", "-o", "cache_dir=.pytest_cache/wall")
+"""Tests on the wall clock. Those that failed are kept apart from those of the other tests, beside which they run."""
 LESS_URGENT = (Path("nice"), "-n", "5")
 """Start of the command that runs the tests beside those on the wall clock."""
 FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
@@ -198,7 +199,7 @@ def check(arguments: list[str]) -> int:
             (tools / "ruff", ["format", "--check", "."]),
             (tools / "lint-imports", []),
             (tools / "mypy", []),
-            (pytest, [*FOUR, *TESTS, "-m", "traced and not wall", "--cov", "--cov-report=", *TRACED]),
+            (pytest, [*TWO, *TESTS, "-m", "traced and not wall", "--cov", "--cov-report=", *TRACED]),
             (tools / "coverage", ["report"]),
         )
         if code:
@@ -210,7 +211,7 @@ def check(arguments: list[str]) -> int:
     finally:
         compiling.kill()
         compiling.wait()
-    return both(pytest, [*WALL, *arguments], [*FOUR, *TESTS, "-m", "not wall and not traced and not long", *arguments])
+    return both(pytest, [*WALL, *arguments], [*THREE, *TESTS, "-m", "not wall and not traced and not long", *arguments])
 
 
 def both(pytest: Path, wall: list[str], others: list[str]) -> int:

@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import inspect
+import re
 from collections.abc import AsyncIterator, Callable, Generator
 from functools import cache, lru_cache
 from pathlib import Path
@@ -13,7 +14,8 @@ import uvloop
 UNIT = Path(__file__).parent / "unit"
 TRACED = (("schemas",), ("gate",), ("runtime", "wire"))
 """Folders of unit tests."""
-WIRE_FORMATS = ("protocol", "parser", "codec")
+WIRE_FORMATS = re.compile(r"(?:/|def test_|class Test)\w*(?:protocol|parser|codec)")
+"""In the place of a file below the drivers' tests, or in a line of it: tests of wire formats."""
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -21,6 +23,12 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     wanted = config.getoption("markexpr")
     if "not traced" in wanted and collection_path.is_dir() and _below(collection_path) in TRACED:
         return True
+    if (
+        wanted.startswith("traced")
+        and collection_path.match("test_*.py")
+        and _below(collection_path)[:1] == ("drivers",)
+    ):
+        return not WIRE_FORMATS.search(f"{collection_path}\n{collection_path.read_text(encoding='utf-8')}") or None
     mark = wanted.removesuffix(" and not long")
     if mark not in ("virtual", "wall") or not collection_path.match("test_*.py"):
         return None
@@ -47,7 +55,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if inspect.iscoroutinefunction(getattr(item, "obj", None)):
             item.fixturenames.insert(0, "no_leaked_tasks")  # type: ignore[attr-defined]  # others have no loop
         below = _below(item.path)
-        wire_format = below[:1] == ("drivers",) and any(word in item.nodeid for word in WIRE_FORMATS)
+        place = f"/{item.nodeid.partition('[')[0].replace('::test_', '::def test_').replace('::Test', '::class Test')}"
+        wire_format = below[:1] == ("drivers",) and WIRE_FORMATS.search(place) is not None
         if wire_format or any(below[: len(folder)] == folder for folder in TRACED):
             item.add_marker("traced")
 
