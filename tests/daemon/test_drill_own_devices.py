@@ -7,7 +7,7 @@ import pytest
 
 from tests.plugin_kit import run_with, written
 
-pytestmark = [pytest.mark.virtual, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.virtual, pytest.mark.long, pytest.mark.timeout(240)]
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 MODULE = """

@@ -111,11 +111,11 @@ def test_an_obstacle_is_kept_at_a_distance():
 
 
 def short_demo(folder: Path, seed: int) -> str:
-    """Digest of a run along the first metre of the lap."""
+    """Digest of a run along the first half metre of the lap."""
     folder.mkdir()
     whole = (DEMO.parent / "paths" / "loop.csv").read_text().splitlines()
     path = folder / "short.csv"
-    path.write_text("\n".join(whole[:21]) + "\n")
+    path.write_text("\n".join(whole[:11]) + "\n")
     file = folder / "short.yaml"
     overlay = {"include": str(DEMO), "version": 1, "path": {"file": str(path), "closed": False}}
     file.write_text(yaml_text(overlay))

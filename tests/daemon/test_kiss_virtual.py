@@ -9,6 +9,7 @@ from tests.daemon.slam_kit import CONFIGS, driven, lap
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(300)]
 
 
+@pytest.mark.long
 def test_the_demos_lap_is_mapped_by_kiss_icp():
     assert "front: kiss" in (CONFIGS / "kiss.yaml").read_text()
     drive = driven("kiss.yaml", lap(16))

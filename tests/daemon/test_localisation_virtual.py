@@ -95,6 +95,7 @@ def test_before_it_has_found_itself_it_takes_no_goal_and_no_mission():
     travel(story, slam={"mode": "localisation", "map": CONFIGS / "worlds" / "rooms.yaml"})
 
 
+@pytest.mark.long
 def test_a_goal_ends_when_the_truck_is_carried_to_where_it_does_not_know_its_place():
     """It drove on by odometry, along a route that was somewhere else."""
 
@@ -112,6 +113,7 @@ def test_a_goal_ends_when_the_truck_is_carried_to_where_it_does_not_know_its_pla
     travel(story, slam={"mode": "localisation", "map": CONFIGS / "worlds" / "rooms.yaml"})
 
 
+@pytest.mark.long
 def test_the_truck_is_outside_of_another_places_map():
     drive = localised_in("rooms.yaml")
     assert not PLACED & {message.standing for message in drive.health}

@@ -33,6 +33,7 @@ def test_it_drives_its_bend(project: Path, target: Path, tmp_path: Path):
     assert {"sensor/drive", "sensor/drive_2"} <= {line.split()[0] for line in out.splitlines() if line.strip()}
 
 
+@pytest.mark.long
 def test_it_is_listed_and_its_settings_are_checked(project: Path, target: Path):
     rows = {row["name"]: row for row in json.loads(run_with(target, "plugins", "--json"))}
     assert (rows["tracked"]["origin"], rows["tracked"]["error"]) == ("truck-tracked 1.0", None)

@@ -40,7 +40,7 @@ def messages(log: Path, topic: str) -> list[dict[str, Any]]:
 @pytest.mark.virtual
 def test_it_is_driven_and_recorded(project: Path, target: Path, tmp_path: Path):
     points = (ROOT / "configs" / "paths" / "loop.csv").read_text().splitlines()
-    (tmp_path / "begin.csv").write_text("\n".join(points[:61]) + "\n")
+    (tmp_path / "begin.csv").write_text("\n".join(points[:41]) + "\n")
     config = tmp_path / "begin.yaml"
     path = {"file": str(tmp_path / "begin.csv"), "closed": False}
     config.write_text(yaml_text({"include": str(project / "robot.yaml"), "version": 1, "path": path}))

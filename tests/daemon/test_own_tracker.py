@@ -47,6 +47,7 @@ def test_it_drives_the_lap_in_the_loop_and_in_a_worker_and_its_settings_count(
     assert centimetres(lap(target, slack, tmp_path / "far")) > 1.3 * centimetres(near)
 
 
+@pytest.mark.long
 def test_it_is_listed_and_its_settings_are_checked(project: Path, target: Path):
     rows = {row["name"]: row for row in json.loads(run_with(target, "plugins", "--json"))}
     assert rows["linear"]["origin"] == "truck-linear 1.0"

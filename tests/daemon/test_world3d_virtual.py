@@ -62,7 +62,7 @@ def test_it_stops_before_a_thing_that_is_put_in_its_way():
         world, clock = truck.rig.world, truck.clock
         await clock.sleep(2.0)
         world.add(clock.now(), Disc(world.truth(clock.now()).x + 1.0, -1.7, 0.1))
-        await clock.sleep(16.0)
+        await clock.sleep(9.0)
         state = world.truth(clock.now())
         assert not state.stuck
         assert state.v == pytest.approx(0.0, abs=0.01)
@@ -73,7 +73,7 @@ def test_it_stops_before_a_thing_that_is_put_in_its_way():
 def test_two_runs_of_a_seed_are_the_same_and_another_seed_makes_another():
     def driven(seed: int) -> bytes:
         async def test(truck: DrillTruck) -> bytes:
-            await truck.clock.sleep(3.0)
+            await truck.clock.sleep(1.0)
             return truck.rig.truth.array().tobytes()
 
         return driving(test, {"sim": {"seed": seed}})
@@ -87,7 +87,7 @@ def test_the_stabilised_truck_runs_as_well():
     """All devices of the full configuration on the rigid body."""
 
     async def test(truck: DrillTruck) -> None:
-        await truck.clock.sleep(5.0)
+        await truck.clock.sleep(3.0)
         assert truck.rig.world.truth(truck.clock.now()).x > 0.3
 
     driving(test, file="full3d.yaml")
