@@ -62,7 +62,7 @@ def test_it_stops_before_a_thing_that_is_put_in_its_way():
         world, clock = truck.rig.world, truck.clock
         await clock.sleep(2.0)
         world.add(clock.now(), Disc(world.truth(clock.now()).x + 1.0, -1.7, 0.1))
-        await clock.sleep(9.0)
+        await clock.sleep(16.0)
         state = world.truth(clock.now())
         assert not state.stuck
         assert state.v == pytest.approx(0.0, abs=0.01)
