@@ -52,9 +52,9 @@ and daemons on the wall clock would be late."""
 THREE = ("-n", "3")
 """Other tests at a time: some wait for a process or a time-out."""
 WALL = (*TWO, *TESTS, "-m", "wall and not long", "-o", "cache_dir=.pytest_cache/wall")
-"""Tests on the wall clock. Those that failed are kept apart from those of the other tests, beside which they run."""
+"""Tests on the wall clock. They run together with the other tests, and need a cache of their own for failed tests."""
 LESS_URGENT = (Path("nice"), "-n", "5")
-"""Start of the command that runs the tests beside those on the wall clock."""
+"""Start of the command of the other tests: tests on the wall clock get the processor first."""
 FAILED_ALONE = ("-n", "0", "--last-failed", "--last-failed-no-failures", "none", "--cov-append", "--assert", "rewrite")
 KERNELS: tuple[Path, str, str] = (VENV / "bin" / "python", "-m", "monstertruckd.tools.install.kernels")
 """Compiles what goals and maps need, and names each part."""
@@ -183,7 +183,7 @@ def run(program: Path, *arguments: str) -> int:
 def check(arguments: list[str]) -> int:
     """All checks but the long tests, fastest first; stops at the first failure, but for the last two steps.
 
-    ``arguments`` go to pytest. Tests on the wall clock mostly wait: they run beside those that only compute.
+    ``arguments`` go to pytest. Tests on the wall clock mostly wait: they run together with the tests that compute.
 
     Failed tests are run once more, one at a time: on a busy computer some miss a time-out while others run.
     Both results are printed; one that fails again fails the check.
@@ -215,20 +215,20 @@ def check(arguments: list[str]) -> int:
 
 
 def both(pytest: Path, wall: list[str], others: list[str]) -> int:
-    """Run the tests on the wall clock and all others at once, then what failed, alone; the exit code, or 0.
+    """Run the tests on the wall clock and all others at once, then failed tests alone; return the exit code, or 0.
 
-    What the tests on the wall clock print is shown at their end.
+    The output of the tests on the wall clock is printed at their end.
     """
     with tempfile.TemporaryFile() as output:
-        beside = subprocess.Popen([str(pytest), *wall], cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
+        other = subprocess.Popen([str(pytest), *wall], cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
         try:
             nice, *niceness = LESS_URGENT
             code = step(nice, [*niceness, str(pytest), *others])
             print(f"==> pytest {' '.join(wall)}", flush=True)
-            wall_code = beside.wait()
+            wall_code = other.wait()
         finally:
-            beside.terminate()
-            beside.wait()
+            other.terminate()
+            other.wait()
             output.seek(0)
             print(output.read().decode(errors="replace"), flush=True)
     return retried(pytest, others, code) or retried(pytest, wall, wall_code)
@@ -244,7 +244,7 @@ def steps(*programs: tuple[Path, list[str]]) -> int:
 
 
 def retried(program: Path, arguments: list[str], code: int) -> int:
-    """Run the tests that failed once more, alone, if ``code`` says that some did; the exit code."""
+    """Run failed tests once more, alone, if ``code`` is that of failed tests; return the exit code."""
     if program.name == "pytest" and code == 1:  # exit code of pytest; others mean that it did not run them
         return step(program, [*arguments, *FAILED_ALONE])
     return code
