@@ -102,7 +102,7 @@ class Ld19Driver(ScannerDriver[Ld19Config]):
                         self._events(Reason.DEVICE_READY, Severity.INFO, self.name, MODELS[config.model].title)
                     due, first, usable = self._clock.now() + round(config.stale * SECOND), False, False
                     stamp = self._watch.stamp(mapping, packets[-1].stamp, stream.arrival, link.name)
-                    publish(turn, stamp - samples.elapsed, stream.arrival, sheet, config, self.name, self._out)
+                    publish(turn, stamp - samples.elapsed, stream.arrival, sheet, config, self._out, self.name)
                 if self._clock.now() >= due:
                     raise self._stale(link.name, usable)
                 packets = await stream.next(config.silence)

@@ -159,7 +159,7 @@ class RplidarDriver(ScannerDriver[RplidarConfig]):
                         self._report_ready(unit, mode)
                     due, first, measured = clock.now() + round(config.stale * SECOND), False, False
                     patience = config.silence
-                    publish(turn, begin, stream.arrival, sheet, config, self.name, self._out)
+                    publish(turn, begin, stream.arrival, sheet, config, self._out, self.name)
             if clock.now() >= due:
                 if measured:
                     raise DeviceTimeoutError(f"{self._port.name}: samples, but no whole revolution")

@@ -9,6 +9,7 @@ from monstertruck_drivers.scanning.config import TurningHeadConfig
 from monstertruck_drivers.scanning.turns import HeadTurn, codes_of
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.ports import Publisher
+from monstertruck_schemas.roles import DeviceRole
 from monstertruck_schemas.sensor import LaserScan
 
 
@@ -18,8 +19,8 @@ def publish(
     received: int,
     sheet: RangeSheet,
     config: TurningHeadConfig,
-    name: str,
     out: Publisher[LaserScan],
+    name: str = DeviceRole.LIDAR,
 ) -> None:
     """Publish a revolution of a head that turns clockwise.
 
@@ -29,8 +30,8 @@ def publish(
         received: arrival time of its last sample (ns).
         sheet: ranges and noise of the scanner.
         config: settings of the scanner.
-        name: name of its service.
         out: publisher of the scans.
+        name: name of its service, which names the frame where the settings do not.
     """
     start = math.pi - math.tau * turn.first
     count = len(turn.ranges)

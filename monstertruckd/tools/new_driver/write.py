@@ -34,10 +34,14 @@ def write_driver(kind: DriverKind, name: str, parent: Path) -> Path:
         parent: gets the folder, named as the driver.
 
     Raises:
-        InputError: a bad name; or the folder exists or cannot be made.
+        InputError: a bad name, or a taken one; or the folder exists or cannot be made.
     """
+    from monstertruck_drivers.catalog import DEVICES  # noqa: PLC0415  # `--help` does without
+
     if not _NAME.fullmatch(name):
         raise InputError(f"{name}: expected a name of small letters, digits and single _, such as acme_l5")
+    if name in DEVICES or name in DEVICES.roles:
+        raise InputError(f"{name}: a device kind or role has this name; expected another, such as acme_{name}")
     folder = parent / name
     if folder.exists():
         raise InputError(f"{folder}: exists; expected a new name, or --folder with another place")

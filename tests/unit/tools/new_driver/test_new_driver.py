@@ -85,6 +85,9 @@ def test_nothing_is_overwritten_and_odd_names_are_refused(tmp_path: Path):
     for name in ("Acme", "../acme", "5x", "a__b", ""):
         with pytest.raises(InputError, match="expected a name of small letters"):
             write_driver(DriverKind.LIDAR, name, tmp_path)
+    for name in ("ld19", "lidar"):
+        with pytest.raises(InputError, match=f"has this name; expected another, such as acme_{name}"):
+            write_driver(DriverKind.LIDAR, name, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["acme"]
 
 
