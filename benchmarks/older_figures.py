@@ -1,14 +1,15 @@
-"""List the files of ``docs/figures`` that are older than the code that they measure.
+"""List the figures and pictures of the documentation that are older than the code that they measure or show.
 
     python benchmarks/older_figures.py
 
-The last line is JSON. The site says the same below every table.
+``docs/pictures/sources.json`` names what each picture shows. The last line is JSON. The site has the number of later
+commits below every table.
 """
 
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -45,17 +46,40 @@ def commits_since(commit: str, measures: Sequence[str]) -> int:
     raise LookupError(f"no commit {commit}")
 
 
-def main() -> int:
-    """Print a line for each file whose measured paths have changed since its commit."""
-    changes = {}
+def picture_commit(picture: Path) -> str:
+    """Return the latest commit that changed ``picture``.
+
+    Raises:
+        LookupError: no commit did.
+    """
+    name = picture.relative_to(ROOT).as_posix()
+    for commit, paths in _history():
+        if name in paths:
+            return commit
+    raise LookupError(f"no commit of {name}")
+
+
+def rows() -> Iterator[tuple[str, str, Sequence[str], str]]:
+    """Yield name, commit, paths and command of every file of figures and every picture."""
     for file in sorted((ROOT / "docs" / "figures").glob("*.json")):
         found = json.loads(file.read_text(encoding="utf-8"))
-        changes[file.stem] = commits_since(found["commit"], found["measures"])
-        if changes[file.stem]:
-            print(f"{file.stem}: {changes[file.stem]} commits since {found['commit']}; run {found['command']}")
-    older = sum(count > 0 for count in changes.values())
-    print(json.dumps({"bench": "older_figures", "figures": {"older": older}, "goals": {"older": 0}, "met": not older}))
-    return 0 if not older else 1
+        yield file.stem, found["commit"], found["measures"], found["command"]
+    pictures = ROOT / "docs" / "pictures"
+    for pattern, source in json.loads((pictures / "sources.json").read_text(encoding="utf-8")).items():
+        for picture in sorted(pictures.glob(pattern)):
+            yield picture.name, picture_commit(picture), source["shows"], source["command"]
+
+
+def main() -> int:
+    """Print a line for each row whose paths have changed since its commit."""
+    older = {"figures": 0, "pictures": 0}
+    for name, commit, paths, command in rows():
+        if changes := commits_since(commit, paths):
+            older["pictures" if "." in name else "figures"] += 1
+            print(f"{name}: {changes} commits since {commit[:8]}; run {command}")
+    met = not any(older.values())
+    print(json.dumps({"bench": "older_figures", "figures": older, "goals": dict.fromkeys(older, 0), "met": met}))
+    return 0 if met else 1
 
 
 if __name__ == "__main__":
