@@ -47,13 +47,7 @@ def test_all_commands_of_the_page_run(page: str, tmp_path: Path):
         *lines, emulate, probe = lines
         link = emulate.split()[-1]
         # The page has the emulator run in another terminal until Ctrl-C.
-        lines += [
-            f"{emulate} & emulator=$!",
-            f"until [ -e {link} ]; do sleep 0.1; done",
-            probe,
-            "kill -INT -- -$emulator",
-            "wait",
-        ]
+        lines += [f"{emulate} & trap 'kill -INT -- -'$! EXIT", f"until [ -e {link} ]; do sleep 0.1; done", probe]
     assert "Traceback" not in followed(lines, project(page, tmp_path))
 
 
