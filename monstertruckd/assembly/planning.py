@@ -382,4 +382,5 @@ def _deformation(
         grid=bus.subscribe(topics.MAP, latest()) if mapped else None,
         events=bus.event_sink(),
         zones=None if config.zones is None else bus.subscribe(topics.ZONES, latest()),
+        odometry=bus.subscribe(topics.ODOMETRY, latest()) if mapped else None,
     )

@@ -258,7 +258,7 @@ class DeformStep:
         (sensor,) = placed(np.array([setup.lidar]), pose)
         ends = points_placed(points, pose)
         mapped = self._mapped(setup, task, ends)
-        walkers, walking = self._walkers(setup, task, ends, mapped, sensor[:2])
+        walkers, walking = self._walkers(setup, task, points, mapped)
         self._window.add_scan((sensor[0], sensor[1]), pose[:2], ends, ~walking)
         before = self._window.obstacles
         beams = _beams(points_relative(before, tuple(sensor)), task.scan)
@@ -274,14 +274,17 @@ class DeformStep:
         return np.asarray(self._walls.lookup(ends) <= tolerance)
 
     def _walkers(
-        self, setup: Setup, task: DeformTask, ends: Array, mapped: NDArray[np.bool_], sensor: Array
+        self, setup: Setup, task: DeformTask, points: Array, mapped: NDArray[np.bool_]
     ) -> tuple[tuple[Walker, ...], NDArray[np.bool_]]:
-        """Return the people who walk, and the points of those who are no obstacles where they are."""
-        none = np.zeros(len(ends), np.bool_)
+        """Return the people who walk, and the points in base of those who are no obstacles where they are."""
+        none = np.zeros(len(points), np.bool_)
         if self._people is None:
             return (), none
-        walkers, walking = self._people.observe(task.scan.stamp, ends, mapped, sensor)
-        return walkers, walking if self._waits(setup, task) else none
+        base = task.odometry or task.pose
+        (sensor,) = points_placed(np.array([setup.lidar[:2]]), base)
+        walkers, walking = self._people.observe(task.scan.stamp, points_placed(points, base), mapped, sensor)
+        placed_in_map = tuple(walker.carried(base, task.pose) for walker in walkers)
+        return placed_in_map, walking if self._waits(setup, task) else none
 
     def _waits(self, setup: Setup, task: DeformTask) -> bool:
         people, since = setup.config.local.people, self._yielding

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Final
 
+from monstertruck_kinematics.se2 import Pose2, integrate
 from monstertruck_planners.goals.exchange import (
     DeformAnswer,
     DeformTask,
@@ -43,6 +44,7 @@ class RouteDeformation:
         pose: pose of the truck in the frame of the routes.
         grid: map; None for the configured map.
         zones: zones of the map; None without zones.
+        odometry: pose of the truck in the odometry frame; None if ``pose`` is in that frame.
         events: event sink.
     """
 
@@ -59,10 +61,11 @@ class RouteDeformation:
         grid: Subscription[Grid] | None,
         events: EventSink,
         zones: Subscription[Zones] | None = None,
+        odometry: Subscription[Odometry] | None = None,
     ) -> None:
         self._setup, self._local, self._clock, self._actor = setup, setup.config.local, clock, actor
         self._scan, self._pose, self._grid, self._events = scan, pose, grid, events
-        self._zones = zones
+        self._zones, self._odometry = zones, odometry
         self._fresh = True
         self._sent_grid: Grid | None = None
         self._sent_zones: Zones | None = None
@@ -200,9 +203,17 @@ class RouteDeformation:
             stamp=odometry.stamp,
             twist=twist_of(odometry),
             zones=zones if self._fresh else changed(zones, self._sent_zones),
+            odometry=self._in_odometry(odometry),
         )
         self._fresh, self._sent_grid, self._sent_zones = False, grid, zones
         return task
+
+    def _in_odometry(self, pose: Odometry) -> Pose2 | None:
+        """Return the pose of the base in the odometry frame when it had ``pose``."""
+        latest = None if self._odometry is None else self._odometry.latest
+        if latest is None:
+            return None
+        return integrate(pose_of(latest), *twist_of(latest), (pose.stamp - latest.stamp) / SECOND)
 
     def _note(self, answer: DeformAnswer) -> None:
         now = self._clock.now()

@@ -140,6 +140,8 @@ class DeformTask:
     """Vx, vy (m/s), wz (rad/s) of the base since the scan."""
     zones: Zones | None = None
     """Zones of the map, if newer than with the previous scan."""
+    odometry: Pose2 | None = None
+    """Pose of the base in the odometry frame at ``stamp``; None if ``pose`` is in that frame."""
 
 
 Finding = Literal["idle", "free", "kept", "new", "blocked", "yields"]

@@ -7,13 +7,14 @@ scan. It counts as a walker once it moves. Everything else stays an obstacle whe
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.se2 import Pose2, points_placed, points_relative, to_world
 from monstertruck_planners.collision import Footprint, rectangle_distance
 from monstertruck_planners.local.config import PeopleConfig
 from monstertruck_runtime.clock import SECOND
@@ -38,6 +39,12 @@ class Walker:
     def at(self, times: Array) -> Array:
         """Return the predicted centres at times from now (s), shape (n, 2), m."""
         return np.asarray(np.array(self.place) + times[:, None] * self.velocity)
+
+    def carried(self, base: Pose2, other: Pose2) -> "Walker":
+        """Return the person in another frame, from the poses of the base in this frame and in the other one."""
+        (place,) = points_placed(points_relative(np.array([self.place]), base), other).tolist()
+        turn = other[2] - base[2]
+        return replace(self, place=(place[0], place[1]), velocity=to_world(turn, *self.velocity))
 
 
 @dataclass(eq=False)
@@ -83,7 +90,8 @@ class PeopleTracker:
 
         Args:
             stamp: stamp of the scan (ns).
-            points: returns in the frame of the map, in the order of the beams, shape (n, 2), m.
+            points: returns in the odometry frame, in the order of the beams, shape (n, 2), m. In the map frame a
+                correction of the robot's pose would look like people who walk.
             mapped: whether the map explains each point, shape (n,).
             sensor: place of the lidar, shape (2,), m.
 

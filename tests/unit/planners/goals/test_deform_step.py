@@ -240,3 +240,16 @@ def test_its_patience_ends_and_then_a_person_is_an_obstacle():
     assert findings.count("yields") <= 6
     after = findings[findings.index("yields") :]
     assert {"new", "blocked"} & set(after), "the person was no obstacle any more"
+
+
+def test_a_jump_of_the_localisation_makes_no_post_walk():
+    """The pose in the map jumps 0.2 m towards the post; odometry says that the robot stands."""
+    step, first = begun()
+    box = (0.65, -0.75, 0.8, -0.6)
+    findings = []
+    step.step(first)
+    for i in range(25):
+        pose = (0.0, 0.2 if i >= 12 else 0.0, 0.0)
+        seen = scan_of(ORIGIN, box).model_copy(update={"stamp": SECOND + i * SECOND // 10})
+        findings.append(step.step(DeformTask(seen, pose, odometry=(3.0, 1.0, 2.0))).finding)
+    assert "yields" not in findings

@@ -14,7 +14,7 @@ from monstertruck_planners.goals.deformation import RouteDeformation, event_of
 from monstertruck_planners.goals.exchange import DeformAnswer, DeformTask, Finding, RouteAnswer, Setup
 from monstertruck_planners.local.config import RsbandConfig
 from monstertruck_planners.pose_path import PosePath
-from monstertruck_runtime.clock import VirtualClock, run_virtual
+from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_runtime.errors import WorkerError
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.base import Pose2D, Twist2D
@@ -58,12 +58,13 @@ class Stage:
         self.clock, self.actor = clock, Elsewhere()
         self.scans: Mailbox[LaserScan] = Mailbox(latest())
         self.poses: Mailbox[Odometry] = Mailbox(latest())
+        self.odometry: Mailbox[Odometry] = Mailbox(latest())
         self.reported: list[tuple[Finding, Finding]] = []
         self.events: list[Reason] = []
         self.deformation = RouteDeformation(
             Setup(PlannerConfig(local_planner=RsbandConfig()), FourWheelSteering(), Footprint()),
             clock, self.actor, scan=self.scans, pose=self.poses, grid=None,
-            events=lambda reason, *_, **__: self.events.append(reason),
+            events=lambda reason, *_, **__: self.events.append(reason), odometry=self.odometry,
         )  # fmt: skip
 
     async def scan(self, count: int = 1, tilt: float | None = None) -> None:
@@ -114,6 +115,20 @@ def test_setup_and_route_are_sent_once_and_again_after_a_failure():
         assert len(stage.events) == 1
 
     assert play(story).reported == [("idle", "free"), ("free", "free"), ("free", "free")]
+
+
+def test_the_pose_in_the_odometry_frame_is_the_one_at_the_stamp_of_the_pose_in_the_map():
+    async def story(stage: Stage) -> None:
+        await stage.scan()
+        assert stage.actor.tasks[-1].odometry is None, "before the first odometry"
+        at = stage.poses.latest
+        assert at is not None
+        moved = {"pose": Pose2D(x=1.0, y=2.0, yaw=0.5), "twist": Twist2D(vx=0.0, vy=0.0, wz=-0.1)}
+        stage.odometry.put(at.model_copy(update={"stamp": stage.clock.now() - SECOND // 50, **moved}))
+        await stage.scan()
+        assert stage.actor.tasks[-1].odometry == pytest.approx((1.0, 2.0, 0.498), abs=1e-6)
+
+    play(story)
 
 
 def test_tilted_scans_say_nothing():

@@ -76,6 +76,13 @@ def test_what_the_map_explains_does_not_walk():
         assert tracker.observe(i * SECOND // 10, points, np.ones(len(points), np.bool_), SENSOR)[0] == ()
 
 
+def test_a_walker_is_carried_into_another_frame():
+    walker = Walker((2.0, 1.0), (0.5, 0.0), 0.2).carried((1.0, 1.0, 0.0), (4.0, 0.0, math.pi / 2))
+    assert walker.place == pytest.approx((4.0, 1.0))
+    assert walker.velocity == pytest.approx((0.0, 0.5))
+    assert walker.radius == 0.2
+
+
 @pytest.mark.parametrize(
     ("place", "velocity", "expected"),
     [
