@@ -72,7 +72,7 @@ class ReplayedPlanner(_Replayed):
 
     async def step(self, task: PlanTask) -> RouteAnswer:
         """Answer just before the tick that shows the recorded answer; never, if the log ends before."""
-        end = self._record.decided(self._clock.now())
+        end = self._record.decided()
         answer: RouteAnswer = await self._inner.step(task)
         if end is None:
             await asyncio.Event().wait()

@@ -236,6 +236,8 @@ class Chain:
         await self._catch_up(outputs[0].log_time)
         for output in outputs:
             await self._take_unseen_turns(output.log_time)
+            if output.topic == topics.GOAL.name:
+                self._goal_record.replayed = output.sequence
             if (call := self._calls.get(output.sequence)) is not None and output.topic == topics.GOAL.name:
                 await self._call(call, output.stamp)
             elif (service := self._writer_of(output)) in self._paces and not self._is_start(output):

@@ -77,6 +77,8 @@ class GoalRecord:
     """Stamps of requests to stand still, ns."""
     asked: list[int] = field(default_factory=list)
     """When requests came by topic, ns."""
+    replayed: int = -1
+    """Number of the latest report that the replay has reached."""
 
     def note(self, entry: LogMessage) -> None:
         """Take in a message of the log."""
@@ -105,14 +107,15 @@ class GoalRecord:
         return self.reports[0].state.stamp if self.reports else None
 
     def ticks(self, period: int) -> list[int]:
-        """Instants of the ticks that show."""
+        """Instants of the ticks that show: the earliest stamp of each one's outputs, which is nearest to its start."""
         calls = self.calls(period)
         stamps = [one.state.stamp for one in self.reports if one.sequence not in calls] + self.planner_requests
         shown: list[int] = []
         for stamp in sorted(stamps):
             if not shown or stamp - shown[-1] > TOGETHER:
                 shown.append(stamp)
-        return shown
+        own = [path.stamp for path in self.paths if re.fullmatch(DEFORMED, path.name) is None]
+        return [min((stamp for stamp in own if 0 <= tick - stamp <= TOGETHER), default=tick) for tick in shown]
 
     def unseen_ticks(self, period: int) -> list[int]:
         """Instants of those between them that left nothing while a goal was pursued, so that no report was due."""
@@ -145,10 +148,13 @@ class GoalRecord:
         goals = {number for number, call in self.calls(period).items() if isinstance(call.what, Pose2D)}
         return any(one.sequence in goals and one.state.waypoints for one in self.reports)
 
-    def decided(self, since: int) -> int | None:
-        """Time of the route planner's answer to the request at ``since``, ns; None if it was dropped."""
+    def decided(self) -> int | None:
+        """Time of the route planner's answer to a request made now, ns; None if it was dropped.
+
+        Reports of the turn that made the request are stamped later than its first output.
+        """
         for before, after in itertools.pairwise(self.reports):
-            if after.state.stamp > since and _answered(before.state, after.state):
+            if after.sequence > self.replayed and _answered(before.state, after.state):
                 return after.state.stamp
         return None
 

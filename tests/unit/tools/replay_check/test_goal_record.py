@@ -1,10 +1,11 @@
 """What a log tells of goals beforehand."""
 
+import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.base import Pose2D
-from monstertruck_schemas.plan import GoalPhase, GoalState
+from monstertruck_schemas.plan import GoalPhase, GoalState, Path
 from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import GoalOrder
 from monstertruckd.tools.replay_check.goals import GoalRecord, GoalReport, RecordedCall
@@ -42,6 +43,16 @@ def test_ticks_that_left_nothing_lie_on_the_grid_of_those_that_did():
     assert [tick / SECOND for tick in log.ticks(PERIOD)] == [1.0, 3.0, 3.1, 3.3, 3.5, 4.0]
     unseen = [tick / SECOND for tick in log.unseen_ticks(PERIOD)]
     assert unseen == pytest.approx([3.2, 3.4, 3.6, 3.7, 3.8, 3.9])  # none before there was a goal
+
+
+def test_a_tick_begins_with_its_path_which_is_published_before_the_report():
+    log = record((3.0, 1, GoalPhase.DRIVING), (3.4, 1, GoalPhase.IDLE))
+    poses = {"poses": np.zeros(6), "directions": np.ones(2)}
+    for name, seconds in (("goal-1-deformed.2", 3.394), ("halt-1.3", 3.395), ("halt-1.4", 3.397), ("goal-1.5", 3.2)):
+        stamp = round(seconds * SECOND)
+        log.paths.append(Path(stamp=stamp, received=stamp, seq=0, frame="map", name=name, **poses))
+    assert [tick / SECOND for tick in log.ticks(PERIOD)] == [3.0, 3.395]
+    assert [tick / SECOND for tick in log.unseen_ticks(PERIOD)] == pytest.approx([3.095, 3.195, 3.295])
 
 
 def test_a_tick_that_reported_nothing_came_before_a_report_was_due():
@@ -87,6 +98,7 @@ def test_an_answer_counted_when_the_goal_was_no_longer_being_planned():
         (2.7, 1, GoalPhase.PLANNING, {"recoveries": 1}),
         (3.1, 1, GoalPhase.DRIVING, {"routes": 1}),
     )
-    assert log.decided(2 * SECOND) == round(2.7 * SECOND)
-    assert log.decided(round(2.7 * SECOND)) == round(3.1 * SECOND)
-    assert log.decided(round(3.1 * SECOND)) is None
+    answers = []
+    for log.replayed in range(4):
+        answers.append(log.decided())
+    assert answers == [round(2.7 * SECOND), round(2.7 * SECOND), round(3.1 * SECOND), None]
