@@ -141,7 +141,7 @@ def truck(world: str, seed: int, *, scans_alone: bool = False) -> SimulatedTruck
     """The emulated truck with nothing that drives by itself; alone: the gate takes no current for a contact."""
     config = load_config(ROOT / "configs" / "demo.yaml", SimulatedTruckConfig)[0]
     config = config.model_copy(update={"recorder": None, "tracker": None, "path": None, "map": None})
-    gate = {"contact": {"current": 1.0, "rolling": 2.0}} if scans_alone else {}
+    gate = {"contact": {"rise": 10.0, "rolling": 2.0}} if scans_alone else {}
     return with_overlay(config, {"sim": {"seed": seed, "world": {"map": world}}, "gate": gate})
 
 

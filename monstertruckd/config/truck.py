@@ -281,7 +281,7 @@ class TruckConfig(Schema):
         return (*weakened(self.gate), *blind, *self._weakened_comparison(), *devices, *opened, *housings)
 
     def _weakened_comparison(self) -> Iterator[str]:
-        usual, above = ConsistencyConfig(), ("slip", "slide", "delay")
+        usual, above = ConsistencyConfig(), ("slip", "slide", "delay", "drift")
         if self.consistency is None:
             yield UNCOMPARED
         else:

@@ -169,12 +169,12 @@ class ShaftCheckConfig(Schema):
 class ContactConfig(Schema):
     """Detection of contact while an operator drives into unseen ground, and how far the robot backs off."""
 
-    current: Annotated[float, Field(gt=0, le=1)] = 0.15
-    """Rise of a motor's current above the rolling current that shows a contact, A: less than half of its rise until the
-    clutch slips."""
+    rise: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """Rise of a motor's current above its rolling current that shows a contact, as a fraction of that current: less
+    than half of the truck's rise until its clutch slips."""
     rolling: Annotated[float, Field(gt=0, le=2)] = 0.25
     """Assumed rolling current on unseen ground and near a dock until the robot has measured its own elsewhere, A. Raise
-    it for motors that draw more than ``rolling`` plus ``current`` while they roll."""
+    it for motors that draw more than ``rolling`` and its ``rise`` while they roll."""
     share: Annotated[float, Field(gt=0, lt=1)] = 0.3
     """Fraction of the commanded speed below which shafts, free wheels and turns are held."""
     within: Annotated[float, Field(gt=0, le=0.3)] = 0.15
@@ -461,7 +461,7 @@ WEAKER_ABOVE: Final = (
     "unwitnessed",
     "blocked.within",
     "blocked.speed",
-    "contact.current",
+    "contact.rise",
     "contact.rolling",
     "contact.within",
     "runaway.distance",

@@ -10,7 +10,7 @@ motion for a few centimetres. Then the robot stands until the operator releases 
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
-from statistics import median
+from statistics import median, pstdev
 from typing import Any, Final, NamedTuple
 
 from monstertruck_kinematics.chassis import STILL
@@ -198,10 +198,10 @@ class ContactCheck(Check):
         self._compare(f"shaft {shaft}", feedback, measured, abs(commanded))
         if feedback.current is not None:
             known = self._rolling.setdefault(shaft, deque(maxlen=20))  # number of rolling currents kept for each motor
-            enough = 3  # number of rolling currents whose median replaces ``ContactConfig.rolling``
+            enough = 10  # number of rolling currents that replace ``ContactConfig.rolling``
             measured_it, near = len(known) >= enough, self.view.confirmed or self.view.dock is not None
-            usual = median(known) if measured_it else self._config.rolling
-            limit, load = usual + self._config.current, sign * feedback.current
+            limit = _current_limit(known if measured_it else (self._config.rolling,), self._config.rise)
+            load = sign * feedback.current
             # Elsewhere the robot measures its own first: every motor draws another one.
             if load > limit and (measured_it or near):
                 self._touch(ContactFinding("motor current", load, "A", limit), feedback.received)
@@ -246,3 +246,12 @@ class ContactCheck(Check):
             self._touched, self._finding, self._began, self._backed = self._request, found, now, 0.0
             self._reached.clear()
             self._slow.clear()
+
+
+def _current_limit(rolling: Sequence[float], rise: float) -> float:
+    """Return the current above the rolling currents (A) by more than a share of them, ``rise``, and than their noise.
+
+    Downhill a motor rolls with hardly any current, or brakes: there the noise decides.
+    """
+    usual, sigmas = median(rolling), 5.0  # significance
+    return usual + max(rise * abs(usual), sigmas * pstdev(rolling))

@@ -106,6 +106,6 @@ def test_a_contact_in_a_confirmed_drive_is_noticed_within_three_tenths_of_a_seco
 
 def test_a_contact_that_neither_motor_nor_gyroscope_shows_is_noticed_by_the_scans():
     """As of a drive that measures no current: the wheels turn, and the scans show a robot that stands."""
-    seconds, metres = pushed({"gate": {"contact": {"current": 1.0, "rolling": 2.0}}}, Reason.CONTACT)
+    seconds, metres = pushed({"gate": {"contact": {"rise": 10.0, "rolling": 2.0}}}, Reason.CONTACT)
     assert 0.0 <= seconds <= 0.5
     assert metres == pytest.approx(0.03, abs=0.015)

@@ -26,6 +26,9 @@ class ConsistencyConfig(Schema):
     configured"""
     delay: Positive = 0.2
     """Tolerated delay of one sensor's content against the others (s)"""
+    drift: Annotated[float, Field(ge=0, le=0.1)] = 0.012
+    """Tolerated lasting error of the speed by scans (m/s, rad/s) where they show that a body stands: the lowest speed
+    of a docking"""
     window: Annotated[float, Field(ge=1, le=8)] = 5.0
     """Maximum time window for comparing motions (s)"""
     latency: Annotated[float, Field(gt=0, le=1)] = 0.02

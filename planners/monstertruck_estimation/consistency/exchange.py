@@ -41,6 +41,7 @@ class StepInput:
     """Motion by the wheels since the previous scan; None if unknown."""
     slip: float = ConsistencyConfig().slip
     delay: float = ConsistencyConfig().delay
+    drift: float = ConsistencyConfig().drift
     """See ``ConsistencyConfig``."""
 
 

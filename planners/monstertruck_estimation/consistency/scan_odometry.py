@@ -145,7 +145,7 @@ class ScanMotionStep:
         if inputs.rolled is None:
             self._standing = None
             return None
-        self._standing = self._standing or StandingWatch(inputs.slip, inputs.delay)
+        self._standing = self._standing or StandingWatch(inputs.slip, inputs.delay, inputs.drift)
         return self._standing.observe(since, inputs.scan.stamp, np.array(inputs.rolled), motion, covariance)
 
     def _scale_change(self, inputs: StepInput, whole: Scan, dt: float, motions: list[Array]) -> float | None:

@@ -257,9 +257,9 @@ class ConsistencyService:
         end = scan.stamp + round(len(scan.ranges) * scan.time_increment * SECOND)
         claim, rest = monitor.claim(scan.stamp), monitor.rest_claim(scan.stamp, end)
         rolled = monitor.rolled(scan.stamp)
-        slip, delay = self._config.slip, self._config.delay
+        slip, delay, drift = self._config.slip, self._config.delay, self._config.drift
         return StepInput(
-            inputs, front, claim=claim, lag=monitor.lag(), rest=rest, rolled=rolled, slip=slip, delay=delay
+            inputs, front, claim=claim, lag=monitor.lag(), rest=rest, rolled=rolled, slip=slip, delay=delay, drift=drift
         )
 
     # Publishing

@@ -2,8 +2,9 @@
 
 The distance by the scans is a function of the distance by the wheels: a broken line. Up to the break both hypotheses
 have the slope of the places before it; after the break the body stands (slope 0), or rolls on with the greatest
-tolerated slip. The difference of both sums of squared residuals, in variances of a place, is twice the logarithm of the
-likelihood ratio. Every place since the wheels' velocity became steady may be the break.
+tolerated slip while the scans drift at the greatest tolerated speed. The difference of both sums of squared residuals,
+in variances of a place, is twice the logarithm of the likelihood ratio. Every place since the wheels' velocity became
+steady may be the break.
 """
 
 import math
@@ -36,10 +37,11 @@ class StandingWatch:
     Args:
         slip: tolerated slip, as a fraction of the wheels' motion.
         delay: tolerated delay of the scans, s.
+        drift: tolerated lasting error of the speed by scans, m/s.
     """
 
-    def __init__(self, slip: float, delay: float) -> None:
-        self._slip = slip
+    def __init__(self, slip: float, delay: float, drift: float) -> None:
+        self._slip, self._drift = slip, drift
         self._delay = round(delay * SECOND)
         self._velocity: Array | None = None
         self._steady_since = 0
@@ -72,7 +74,7 @@ class StandingWatch:
         return self._judged()
 
     def _judged(self) -> StandingBody | None:
-        _, rolled, shown, variances = np.array(self._places).T
+        stamps, rolled, shown, variances = np.array(self._places).T
         likeliest, found = LIKELIER, None
         for start in range(len(rolled) - AFTER):
             before, after = np.minimum(rolled - rolled[start], 0.0), np.maximum(rolled - rolled[start], 0.0)
@@ -82,7 +84,9 @@ class StandingWatch:
             free = len(rolled) - columns.shape[1] - 1
             if free < FREE:
                 continue
-            sides = np.column_stack((places, places - (1.0 - self._slip) * after))
+            drifted = self._drift * np.maximum(stamps - stamps[start], 0.0) / SECOND
+            least = np.maximum((1.0 - self._slip) * after - drifted, 0.0)
+            sides = np.column_stack((places, places - least))
             coefficients = np.linalg.lstsq(columns, sides, rcond=None)[0]
             stands, rolls = ((sides - columns @ coefficients) ** 2).sum(axis=0).tolist()
             likelier = (rolls - stands) * (FREE + free) / (FREE * float(variances.mean()) + stands)

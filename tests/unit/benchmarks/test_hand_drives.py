@@ -38,4 +38,4 @@ def test_a_contact_that_only_scans_can_show_has_more_time():
         drive = Drive("loop", 0, within)
         hand_drives.end_touch(hand_drives._Touch(0, "reverse", (0.0, 0.0)), round(0.4 * SECOND), drive)
         assert len(drive.unnoticed) == unnoticed
-    assert hand_drives.truck("loop", 1, scans_alone=True).gate.contact.current == 1.0
+    assert hand_drives.truck("loop", 1, scans_alone=True).gate.contact.rise == 10.0

@@ -51,7 +51,7 @@ DELIVERED = {
         "memory_deviation": 0.1,
         "open_ground": False,
     },
-    "contact": {"current": 0.15, "rolling": 0.25, "share": 0.3, "within": 0.15, "back_off": 0.03},
+    "contact": {"rise": 1.0, "rolling": 0.25, "share": 0.3, "within": 0.15, "back_off": 0.03},
     "runaway": {"distance": 0.01, "body_distance": 0.03, "idle_current": 0.05},
     "docking": {"speed": 0.05, "across": 0.15, "turn": 0.3, "beyond": 0.02},
     "sonar": {"stale_after": 0.3, "core": 0.2, "unseen_speed": 0.1},

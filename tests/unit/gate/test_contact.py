@@ -1,6 +1,7 @@
 """What tells that something holds a robot that drives into unseen ground, and how it leaves it."""
 
 import math
+import random
 from functools import partial
 
 import pytest
@@ -60,7 +61,7 @@ def test_a_motor_that_pushes_is_noticed_within_three_tenths_of_a_second_and_back
     assert rig.trips[-1].reason is Reason.CONTACT
     (figure,) = rig.trips[-1].causes[0].measurements
     assert (figure.name, figure.value, figure.unit) == ("motor current", pytest.approx(PUSHING), "A")
-    assert figure.limit == pytest.approx(ROLLING + ContactConfig().current)
+    assert figure.limit == pytest.approx(ROLLING * (1.0 + ContactConfig().rise))
     rig.load, before = ROLLING, rig.travelled
     rig.tick(20)
     assert rig.out.speeds[0] == pytest.approx(0.05), "the other way"
@@ -121,7 +122,10 @@ def test_the_current_of_rolling_is_learned():
     rig.load = 0.5  # a stiff robot
     rig.tick(100)
     assert rig.out.reasons == (Reason.UNSEEN_DRIVE,)
-    rig.load = 0.5 + ContactConfig().current + 0.02
+    rig.load = 0.5 * (1.0 + ContactConfig().rise) - 0.02
+    rig.tick()
+    assert rig.out.reasons == (Reason.UNSEEN_DRIVE,)
+    rig.load = 0.5 * (1.0 + ContactConfig().rise) + 0.1
     assert rig.until(Reason.CONTACT) is not None
 
 
@@ -283,5 +287,32 @@ def test_without_a_lidar_a_motor_that_draws_more_than_assumed_is_measured_first(
     rig.silent = {"scan"}
     rig.driver, rig.load = {"speed": 0.15}, 1.0
     assert rig.until(Reason.CONTACT) is None
-    rig.load = 1.4
+    rig.load = 2.2
+    assert rig.until(Reason.CONTACT) is not None
+
+
+def test_a_small_motor_that_pushes_draws_less_than_a_large_one_that_rolls():
+    rig = Backing(scan={"stale_after": 0.25, "critical": False})
+    rig.silent = {"scan"}
+    rig.driver, rig.load = {"speed": 0.15}, 0.03
+    assert rig.until(Reason.CONTACT) is None
+    rig.load = 0.1
+    assert rig.until(Reason.CONTACT) is not None
+
+
+@pytest.mark.parametrize("load", [0.0, -0.1])
+def test_the_noise_of_a_motor_that_hardly_draws_current_is_no_contact(load):
+    """A motor that rolls downhill, or whose current is as small as its noise."""
+    rig = Backing(scan={"stale_after": 0.25, "critical": False})
+    rng = random.Random(1)
+    rig.silent = {"scan"}
+    rig.driver = {"speed": 0.15}
+
+    def noisy():
+        rig.load = load + rng.gauss(0.0, 0.02)
+
+    rig.extra = noisy
+    assert rig.until(Reason.CONTACT, ticks=500) is None
+    rig.extra = lambda: None
+    rig.load = 0.3
     assert rig.until(Reason.CONTACT) is not None

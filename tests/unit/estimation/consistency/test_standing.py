@@ -18,9 +18,9 @@ NOISE = 0.002
 ALONG = np.array((-1.0, 0.0, 0.0))
 
 
-def found(shares, *, direction=ALONG, deviation=0.004, steps=STEP, slip=0.3, delay=0.2, seed=1):
+def found(shares, *, direction=ALONG, deviation=0.004, steps=STEP, slip=0.3, delay=0.2, drift=0.012, seed=1):
     """Findings while the body moves by these shares of the wheels' steps: number of the step, and the evidence."""
-    rng, watch, offset, out = np.random.default_rng(seed), StandingWatch(slip, delay), 0.0, []
+    rng, watch, offset, out = np.random.default_rng(seed), StandingWatch(slip, delay, drift), 0.0, []
     covariance = deviation**2 * np.eye(3)
     steps = np.broadcast_to(steps, len(shares))
     for k, (share, step) in enumerate(zip(shares, steps, strict=True)):
@@ -46,6 +46,16 @@ def test_a_body_that_is_held_is_found_after_four_scans(seed):
 @pytest.mark.parametrize("seed", range(5))
 def test_a_body_that_slips_as_much_as_is_tolerated_is_not(shares, seed):
     assert not found(shares, seed=seed)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_scans_that_drift_at_the_end_of_a_docking_show_no_standing_body(seed):
+    """The last set-point of a docking, 0.012 m/s, is as small as the drift: the scans show rest."""
+    slows = np.maximum(0.05 * 0.94 ** np.arange(40), 0.012)
+    steps = np.concatenate((np.full(20, 0.05), slows)) * 0.1
+    drifts = np.where(np.arange(60) >= 40, 0.012 * 0.1, 0.0)
+    assert not found(1.0 - drifts / steps, steps=steps, seed=seed)
+    assert found(1.0 - drifts / steps, steps=steps, seed=seed, drift=0.0)
 
 
 def test_a_turn_on_the_spot_counts_as_well():
@@ -76,7 +86,7 @@ def test_without_a_tolerated_delay_late_scans_show_a_standing_body():
 
 
 def test_wheels_that_stand_or_start_show_nothing():
-    watch = StandingWatch(0.3, 0.2)
+    watch = StandingWatch(0.3, 0.2, 0.012)
     for k in range(30):
         assert watch.observe(k * PERIOD, (k + 1) * PERIOD, np.zeros(3), np.zeros(3), np.zeros((3, 3))) is None
 
