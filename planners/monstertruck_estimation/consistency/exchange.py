@@ -7,7 +7,11 @@ from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.delay import SIGMAS, Delay, LagQuestion
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.se2 import Pose2
+from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.state import StandingBody
+
+IN_USE: Final = 2 * SECOND
+"""Maximum age of a sample of a measure in use (ns); a lidar that was silent for longer may have another scale."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from monstertruck_estimation.consistency.comparison import (
 )
 from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_estimation.consistency.delay import FEWEST, GREATEST, Delay, LagQuestion, ScanStep, lag_question
-from monstertruck_estimation.consistency.exchange import Claim, StepOutput
+from monstertruck_estimation.consistency.exchange import IN_USE, Claim, StepOutput
 from monstertruck_estimation.consistency.repeats import RepeatDetector, WholeRepeats
 from monstertruck_estimation.consistency.rest import RestWatch
 from monstertruck_estimation.consistency.tracks import STILL, MotionTrack, between
@@ -41,8 +41,6 @@ WITNESSES: Final = (Measure.WHEELS, Measure.GYRO, Measure.ENCODERS, Measure.STAN
 """Measures that show when the motion changes."""
 GAP: Final = SECOND // 2
 """Maximum time between joined headings or rates (ns)."""
-IN_USE: Final = 2 * SECOND
-"""Maximum age of a sample of a measure in use (ns)."""
 
 
 class _OpenDisagreement(NamedTuple):

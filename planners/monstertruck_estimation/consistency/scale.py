@@ -29,16 +29,26 @@ class ScaleWatch:
     """Compares each revolution with the one before.
 
     After a change in the middle of a revolution neither motion nor a factor explains it: the next one is compared with
-    that before it.
+    that before it. The last revolution before a change is kept, because a change back may take longer, or happen
+    while the lidar is covered: the ranges have changed back once they fit that revolution again.
     """
 
     def __init__(self) -> None:
+        self._sound: tuple[Cloud, Array] | None = None
+        """Last revolution before the scale changed, and the wheels' motion since; None while it is unchanged."""
+        self._scale = 1.0
+        """Factor from its ranges to the current ones."""
         self._reference: Revolution | None = None
         self._over: list[Array] = []
         """Motions from the reference to a revolution that nothing explained; empty without one."""
 
+    def restart(self, newest: Revolution | None) -> None:
+        """Begin with a lidar that was restarted: its scale is a new one."""
+        self._sound = None
+        self.begin(newest)
+
     def begin(self, newest: Revolution | None) -> None:
-        """Restart at a revolution, or without one."""
+        """Compare from a revolution on, or from the next one."""
         self._reference, self._over = newest, []
 
     def change(self, newest: Revolution, motions: list[Array]) -> float | None:
@@ -46,8 +56,26 @@ class ScaleWatch:
 
         Args:
             newest: latest revolution.
-            motions: see ``scale_change``, from the revolution before; always as many.
+            motions: see ``scale_change``, from the revolution before; always as many, that of the wheels last.
         """
+        earlier = self._reference
+        factor = self._changed(newest, motions)
+        if self._sound is None and (factor is None or earlier is None):
+            return None
+        if self._sound is None:
+            assert earlier is not None
+            self._sound, self._scale = (Cloud.of(earlier.scan), np.zeros(3)), 1.0
+        cloud, moved = self._sound
+        moved = compose(moved, motions[-1])
+        # 0.5: distance beyond which it shows too little of the same surroundings, m
+        self._sound = None if math.hypot(moved[0], moved[1]) > 0.5 else (cloud, moved)
+        if np.count_nonzero(~_fits(newest.scan, cloud, moved)) < REFUTING:
+            self._sound = None
+            return 1.0 / self._scale
+        self._scale *= 1.0 if factor is None else factor
+        return factor
+
+    def _changed(self, newest: Revolution, motions: list[Array]) -> float | None:
         factor, skipped = None, bool(self._over)
         over = [compose(*pair) for pair in zip(self._over, motions, strict=True)] if skipped else motions
         if self._reference is not None:

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from monstertruck_estimation.consistency.delay import scan_delay
-from monstertruck_estimation.consistency.exchange import Claim, RestEvidence, ScanVerdict, StepInput, StepOutput
+from monstertruck_estimation.consistency.exchange import IN_USE, Claim, RestEvidence, ScanVerdict, StepInput, StepOutput
 from monstertruck_estimation.consistency.rest_proof import rest_evidence
 from monstertruck_estimation.consistency.scale import Revolution, ScaleWatch
 from monstertruck_estimation.consistency.standing import StandingWatch, place_covariance, spread
@@ -77,6 +77,8 @@ class ScanMotionStep:
         """Changes from one motion to the next (m^2, rad^2)."""
         self._last: tuple[int, Cloud] | None = None
         self._scale = ScaleWatch()
+        self._scanned: int | None = None
+        """Stamp of the last scan, also of one with too few points (ns)."""
         self._reference: tuple[Cloud, Array] | None = None
         """Reference scan of the registration, and its pose."""
         self._kept: deque[tuple[int, Scan, Array]] = deque(maxlen=128)  # number of scans kept for claims
@@ -93,6 +95,9 @@ class ScanMotionStep:
             self._front = front_of(inputs.front)
         name, front = self._front
         stamp, last = inputs.scan.stamp, None if inputs.anew else self._last
+        if self._scanned is not None and stamp - self._scanned > IN_USE:
+            self._scale.restart(None)
+        self._scanned = stamp
         dt = math.inf if last is None else (stamp - last[0]) / SECOND
         follows = bool(self._motions) and 0.0 < dt < GAP
         lasting, twist = np.zeros(3), np.zeros(3)

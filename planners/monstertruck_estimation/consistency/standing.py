@@ -2,9 +2,11 @@
 
 The distance by the scans is a function of the distance by the wheels: a broken line. Up to the break both hypotheses
 have the slope of the places before it; after the break the body stands (slope 0), or rolls on with the greatest
-tolerated slip while the scans drift at the greatest tolerated speed. The difference of both sums of squared residuals,
-in variances of a place, is twice the logarithm of the likelihood ratio. Every place since the wheels' velocity became
-steady may be the break.
+tolerated slip. The difference of both sums of squared residuals, in variances of a place, is twice the logarithm of the
+likelihood ratio. Every place since the wheels' velocity became steady may be the break.
+
+The errors of places are taken as independent. Scans may drift as well: wheels so slow that slip and drift together
+could bring the body nearer to standing than to rolling on show nothing.
 """
 
 import math
@@ -67,6 +69,10 @@ class StandingWatch:
             return None
         if since - self._steady_since < self._delay:
             return None  # scans that late still show the earlier velocity
+        equal = (1.0 + self._slip) / 2  # share of the wheels' motion missing where both hypotheses are equally likely
+        if math.hypot(self._slip * speed, self._drift) > equal * speed:
+            self._places.clear()
+            return None
         direction = velocity / speed
         _, way, shown, _ = self._places[-1] if self._places else (since, 0.0, 0.0, 0.0)
         variance = float(direction @ covariance @ direction)
@@ -74,7 +80,7 @@ class StandingWatch:
         return self._judged()
 
     def _judged(self) -> StandingBody | None:
-        stamps, rolled, shown, variances = np.array(self._places).T
+        _, rolled, shown, variances = np.array(self._places).T
         likeliest, found = LIKELIER, None
         for start in range(len(rolled) - AFTER):
             before, after = np.minimum(rolled - rolled[start], 0.0), np.maximum(rolled - rolled[start], 0.0)
@@ -84,9 +90,7 @@ class StandingWatch:
             free = len(rolled) - columns.shape[1] - 1
             if free < FREE:
                 continue
-            drifted = self._drift * np.maximum(stamps - stamps[start], 0.0) / SECOND
-            least = np.maximum((1.0 - self._slip) * after - drifted, 0.0)
-            sides = np.column_stack((places, places - least))
+            sides = np.column_stack((places, places - (1.0 - self._slip) * after))
             coefficients = np.linalg.lstsq(columns, sides, rcond=None)[0]
             stands, rolls = ((sides - columns @ coefficients) ** 2).sum(axis=0).tolist()
             likelier = (rolls - stands) * (FREE + free) / (FREE * float(variances.mean()) + stands)

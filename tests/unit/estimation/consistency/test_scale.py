@@ -97,6 +97,25 @@ def test_a_change_in_the_middle_of_a_revolution_is_found_at_the_next_one(share):
     assert math.prod(factor for factor in found[2:] if factor) == pytest.approx(1.0, abs=0.02), "and changed back"
 
 
+def test_ranges_that_change_back_unnoticed_are_sound_once_they_fit_those_before_the_change():
+    """Over several revolutions, none of which fits the one before by motion or by a factor."""
+    pose, watch = np.array(LANE[0][:3], float), ScaleWatch()
+    clean, beams = ranges(HALL, pose), np.arange(len(ranges(HALL, pose)))
+    back = [np.where(beams < share * len(clean), clean, 1.6 * clean) for share in (0.25, 0.5, 0.75)]
+    found = [watch.change(revolution(one), [np.zeros(3)] * 2) for one in (clean, 1.6 * clean, *back, clean, clean)]
+    assert found[1] == pytest.approx(1.6, rel=0.01)
+    assert math.prod(factor for factor in found if factor) == pytest.approx(1.0)
+
+
+def test_a_lidar_that_was_restarted_has_no_earlier_scale():
+    pose, watch = np.array(LANE[0][:3], float), ScaleWatch()
+    clean, still = revolution(ranges(HALL, pose)), [np.zeros(3)] * 2
+    changed = revolution(1.6 * ranges(HALL, pose))
+    assert [watch.change(one, still) for one in (clean, changed)] == [None, pytest.approx(1.6, rel=0.01)]
+    watch.restart(None)
+    assert [watch.change(clean, still) for _ in range(2)] == [None, None]
+
+
 def test_a_wall_that_the_robot_approaches_far_between_two_revolutions_changes_no_scale():
     """All ranges shrink by one factor; the wheels lead the registration, which does not reach so far by itself."""
     wall, moved = [((2.0, -20.0), (2.0, 20.0))], np.array((0.5, 0.0, 0.0))
