@@ -42,24 +42,24 @@ class ScaleWatch:
         self._over: list[Array] = []
         """Motions from the reference to a revolution that nothing explained; empty without one."""
 
-    def restart(self, newest: Revolution | None) -> None:
+    def restart(self, latest: Revolution | None) -> None:
         """Begin with a lidar that was restarted: its scale is a new one."""
         self._sound = None
-        self.begin(newest)
+        self.begin(latest)
 
-    def begin(self, newest: Revolution | None) -> None:
+    def begin(self, latest: Revolution | None) -> None:
         """Compare from a revolution on, or from the next one."""
-        self._reference, self._over = newest, []
+        self._reference, self._over = latest, []
 
-    def change(self, newest: Revolution, motions: list[Array]) -> float | None:
+    def change(self, latest: Revolution, motions: list[Array]) -> float | None:
         """Return the common scale factor of all ranges, or None.
 
         Args:
-            newest: latest revolution.
-            motions: see ``scale_change``, from the revolution before; always as many, that of the wheels last.
+            latest: the revolution to judge.
+            motions: see ``scale_change``, from the revolution before; always as many, by the wheels last.
         """
         earlier = self._reference
-        factor = self._changed(newest, motions)
+        factor = self._changed(latest, motions)
         if self._sound is None and (factor is None or earlier is None):
             return None
         if self._sound is None:
@@ -69,29 +69,29 @@ class ScaleWatch:
         moved = compose(moved, motions[-1])
         # 0.5: distance beyond which it shows too little of the same surroundings, m
         self._sound = None if math.hypot(moved[0], moved[1]) > 0.5 else (cloud, moved)
-        if np.count_nonzero(~_fits(newest.scan, cloud, moved)) < REFUTING:
+        if np.count_nonzero(~_fits(latest.scan, cloud, moved)) < REFUTING:
             self._sound = None
             return 1.0 / self._scale
         self._scale *= 1.0 if factor is None else factor
         return factor
 
-    def _changed(self, newest: Revolution, motions: list[Array]) -> float | None:
+    def _changed(self, latest: Revolution, motions: list[Array]) -> float | None:
         factor, skipped = None, bool(self._over)
         over = [compose(*pair) for pair in zip(self._over, motions, strict=True)] if skipped else motions
         if self._reference is not None:
-            factor = scale_change(newest, self._reference, over)
+            factor = scale_change(latest, self._reference, over)
         if factor is None and self._reference is not None and not skipped:
             self._over = motions
         else:
-            self.begin(newest)
+            self.begin(latest)
         return None if factor == 1.0 else factor
 
 
-def scale_change(newest: Revolution, earlier: Revolution, motions: list[Array]) -> float | None:
+def scale_change(latest: Revolution, earlier: Revolution, motions: list[Array]) -> float | None:
     """Return the factor from the earlier ranges to the latest ones: 1 if motion explains them, None if nothing does.
 
     Args:
-        newest: latest revolution.
+        latest: the revolution to judge.
         earlier: reference revolution.
         motions: initial guesses of the registration, at least one, the most likely one first, each of shape (3,) (m,
             rad).
@@ -99,19 +99,19 @@ def scale_change(newest: Revolution, earlier: Revolution, motions: list[Array]) 
     cloud = Cloud.of(earlier.scan)
     fits = []
     for motion in motions:
-        fits.append(_fits(newest.scan, cloud, motion))
+        fits.append(_fits(latest.scan, cloud, motion))
         if np.count_nonzero(~fits[-1]) < REFUTING:
             return 1.0
     moved = max(fits, key=np.count_nonzero)
-    factor = _factor(newest, earlier, motions)
+    factor = _factor(latest, earlier, motions)
     if factor is None:
         return None
-    rescaled = _rescaled(newest.scan, newest.origin, 1.0 / factor)
+    rescaled = _rescaled(latest.scan, latest.origin, 1.0 / factor)
     scaled = max((_fits(rescaled, cloud, motion) for motion in motions), key=np.count_nonzero)
     # Nothing else changes with the scale: every point that does not fit the rescaled revolution is evidence of motion,
     # unless the earlier revolution did not reach so far.
     reach = _polar(earlier.scan.points, earlier.origin)[1].max()
-    judged = _polar(rescaled.points, newest.origin)[1] <= reach
+    judged = _polar(rescaled.points, latest.origin)[1] <= reach
     alone, misfits = (int(np.count_nonzero(points & judged)) for points in (scaled & ~moved, ~scaled))
     return factor if ScanVerdict(claimed=misfits, own=alone, misfits=misfits).refuted else None
 
@@ -120,13 +120,13 @@ def _fits(scan: Scan, cloud: Cloud, motion: Array) -> np.ndarray[tuple[int], np.
     return fitting(scan, cloud, register(scan, cloud, motion).pose)
 
 
-def _factor(newest: Revolution, earlier: Revolution, motions: list[Array]) -> float | None:
+def _factor(latest: Revolution, earlier: Revolution, motions: list[Array]) -> float | None:
     """Compare points of the same bearing, by the motion under which they agree best on one factor.
 
     None if too few are compared, or the factor does not stand out of their scatter: the lidar looks at another place.
     """
-    bearings, distances = _polar(newest.scan.points, newest.origin)
-    seen = [_polar(transform(inverse(motion), earlier.scan.points), newest.origin) for motion in motions]
+    bearings, distances = _polar(latest.scan.points, latest.origin)
+    seen = [_polar(transform(inverse(motion), earlier.scan.points), latest.origin) for motion in motions]
     found = [_ratios(bearings, distances, *earlier_ones) for earlier_ones in seen]
     if min(map(len, found)) < 30:  # minimum number of points with one of the same bearing
         return None

@@ -230,12 +230,12 @@ def event_of(was: Finding, answer: DeformAnswer) -> tuple[Reason, Severity, str]
     text = answer.text or answer.reason.text
     match answer.finding:
         case "blocked" if was != "blocked":
-            return answer.reason, Severity.WARNING, f"no way round what stands on the route ({text})"
+            return answer.reason, Severity.WARNING, f"no way round the obstacle on the route ({text})"
         case "yields" if was != "yields":
             return Reason.YIELDS, Severity.INFO, Reason.YIELDS.text
         case "new" if was in ("idle", "free", "blocked", "yields"):
             partly = answer.reason is Reason.PATH_PARTIAL
-            how = f"only so far ({text})" if partly else "round what stands on it"
+            how = f"only so far ({text})" if partly else "round the obstacle on it"
             return Reason.ROUTE_DEFORMED, Severity.INFO, f"the route is deformed, {how}"
         case "free" if was not in ("idle", "free"):
             return Reason.ROUTE_FREE, Severity.INFO, "back on the route"
