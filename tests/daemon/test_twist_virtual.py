@@ -93,7 +93,7 @@ def assert_odometry_agrees(seen: Seen) -> None:
     ("name", "side"),
     mostly_long(
         product(("differential", "skid_steer", "omni", "mecanum", "independent"), (1, -1)),
-        {("differential", 1), ("skid_steer", -1), ("independent", 1)},
+        {("skid_steer", -1), ("independent", 1)},
     ),
 )
 def test_turning_on_the_spot(name: str, side: int):

@@ -16,6 +16,7 @@ from monstertruck_sim.faults import apply
 from monstertruckd.config.load import load_config
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
+from tests.long_kit import mostly_long
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 UNUSED = {
@@ -43,7 +44,7 @@ def test_every_fault_that_takes_an_argument_is_drawn_one():
     assert ARGUMENTS.keys() == {name for name, fault in FAULTS.items() if fault.argument}
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", mostly_long(ROBOTS, {"full", "robots/sonar", "robots/skid_stand"}))
 def test_every_family_of_a_robot_begins_and_ends_and_every_signal_is_a_real_one(name):
     async def test(rig, clock):
         context, rng = rig.context, np.random.default_rng(1)

@@ -1,6 +1,7 @@
 """Starts that are nearer to an obstacle than routes pass: left without coming nearer, then the margin is kept."""
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from monstertruck_planners.route.lattice import LatticePlanner
 from monstertruck_planners.route.motion import MotionPath
 from monstertruck_planners.route.replan import remaining_route, replan
 from monstertruck_schemas.reasons import Reason
+from tests.long_kit import mostly_long
 from tests.unit.planners.route.route_kit import CAR, TRUCK, assert_drivable, ground, room
 
 SPARE_MARGIN = 0.002
@@ -58,9 +60,17 @@ def assert_leaves(where, vehicle, path, *, dip=0.0):
     return path.sample(0.002).travelled[off]
 
 
-@pytest.mark.parametrize("gap", [0.0, 0.02, 0.0405])
-@pytest.mark.parametrize("way", ["facing", "behind", "aslant"])
-@pytest.mark.parametrize("body", BODIES)
+@pytest.mark.parametrize(
+    ("body", "way", "gap"),
+    mostly_long(
+        product(BODIES, ("facing", "behind", "aslant"), (0.0, 0.02, 0.0405)),
+        {
+            ("4ws", "facing", 0.0), ("4ws", "behind", 0.02), ("4ws", "aslant", 0.0405),
+            ("2ws", "facing", 0.02), ("2ws", "behind", 0.0405), ("2ws", "aslant", 0.0),
+            ("differential", "facing", 0.0405), ("differential", "behind", 0.0), ("differential", "aslant", 0.02),
+        },
+    ),
+)  # fmt: skip
 def test_it_leaves_a_wall_ahead_or_behind_and_keeps_the_margin_from_there_on(body, way, gap):
     vehicle, where = BODIES[body], ground()
     start = vehicle.reference_pose(base_beside(way, gap + 1e-6))
@@ -79,8 +89,10 @@ def test_a_body_that_drives_sideways_leaves_a_wall_beside_it_without_coming_near
     assert assert_leaves(where, TRUCK, result.path) < 0.3
 
 
-@pytest.mark.parametrize("gap", [0.003, 0.01, 0.04])
-@pytest.mark.parametrize("body", ["2ws", "differential"])
+@pytest.mark.parametrize(
+    ("body", "gap"),
+    mostly_long(product(("2ws", "differential"), (0.003, 0.01, 0.04)), {("2ws", 0.003), ("differential", 0.01)}),
+)
 def test_a_body_that_turns_its_end_to_a_wall_beside_it_never_touches_it(body, gap):
     """Beside a long wall there is no motion that does not turn it: it comes nearer as little as it can."""
     vehicle, where = BODIES[body], ground()

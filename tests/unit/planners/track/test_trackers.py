@@ -2,7 +2,7 @@
 
 import math
 import sys
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from monstertruck_planners.track.mpc import Solver
 from monstertruck_planners.track.path_tracker import TruckState
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.reasons import Reason
+from tests.long_kit import mostly_long
 from tests.unit.planners.kit import STEERING, TRACKER, Follower, circle, figure_eight, path, straight
 
 KINDS = list(TRACKERS)
@@ -27,9 +28,16 @@ def there_and_back():
     return path(np.concatenate((out, out[::-1][1:])), [1] * len(out) + [-1] * (len(out) - 1))
 
 
-@pytest.mark.parametrize("direction", [1, -1])
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("kind", ["pure_pursuit", *EXACT])
+@pytest.mark.parametrize(
+    ("kind", "mode", "direction"),
+    mostly_long(
+        product(("pure_pursuit", *EXACT), MODES, (1, -1)),
+        {
+            ("pure_pursuit", "front", 1), ("pure_pursuit", "counter", -1), ("lqr", "rear", 1), ("lqr", "front", -1),
+            ("mpc", "hybrid", 1), ("mpc", "rear", -1),
+        },
+    ),
+)  # fmt: skip
 def test_a_straight_path_is_reached_from_beside_it(kind, mode, direction):
     route = straight(2.5, 0.1) * (direction, 1)
     truck = Follower(path(route, [direction] * len(route)), pose=(0.0, 0.12, 0.05), kind=kind, steering=mode)
@@ -39,9 +47,13 @@ def test_a_straight_path_is_reached_from_beside_it(kind, mode, direction):
     assert max(max(abs(c.front), abs(c.rear)) for c in truck.log) <= 0.4 + 1e-9
 
 
-@pytest.mark.parametrize("direction", [1, -1])
-@pytest.mark.parametrize("mode", ["front", "counter", "hybrid"])
-@pytest.mark.parametrize("kind", EXACT)
+@pytest.mark.parametrize(
+    ("kind", "mode", "direction"),
+    mostly_long(
+        product(EXACT, ("front", "counter", "hybrid"), (1, -1)),
+        {("lqr", "front", 1), ("lqr", "hybrid", -1), ("mpc", "counter", 1), ("mpc", "front", -1)},
+    ),
+)
 def test_curves_leave_no_error(kind, mode, direction):
     route = circle(1.2, turns=0.4) * (direction, 1)
     truck = Follower(path(route, [direction] * len(route)), kind=kind, steering=mode)
