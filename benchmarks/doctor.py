@@ -83,7 +83,7 @@ def driven(seed: int, wrong: str | None) -> list[Finding]:
                 await clock.sleep(START_UP)
                 mover = Mover(LocalTruck(rig.daemon, clock, "doctor"), clock, config.chassis())  # type: ignore[arg-type]
                 return await signs(
-                    lambda step: mover.move(step, lambda _: None), config, lambda *words: " ".join(words)
+                    lambda step: mover.move(step, lambda *_: None), config, lambda *words: " ".join(words)
                 )
 
         return run_virtual(main)

@@ -25,7 +25,7 @@ from monstertruck_sim.world.noise import IMU_FIXED, generator
 from monstertruck_sim.world.plant import PLANT_GRAVITY, TruthState
 from monstertruckd.config.calibration import CalibrationStore, Result, Value, WizardName, with_values
 from monstertruckd.daemon import Daemon
-from monstertruckd.tools.calibrate.steps import Confirm, Number
+from monstertruckd.tools.calibrate.steps import Confirm, Number, Plot
 from monstertruckd.tools.calibrate.wizard import Wizard, calibrate
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
@@ -123,6 +123,7 @@ class SimulatedOperator:
         charges: tuple[float, ...] = (),
     ) -> None:
         self.said: list[str] = []
+        self.seen: Plot | None = None
         self._rig = rig
         self._rng = rng
         self._hands = hands
@@ -139,6 +140,10 @@ class SimulatedOperator:
 
     def progress(self, name: str, done: float, total: float) -> None:
         """Wait."""
+
+    def plot(self, plot: Plot) -> None:
+        """Look at it."""
+        self.seen = plot
 
     async def number(self, step: Number) -> float:
         """Measure what is asked for."""
@@ -483,6 +488,8 @@ class Session:
     file: Path
     seconds: float
     """It took, on the truck's clock."""
+    plot: Plot | None
+    """The last one shown."""
 
 
 def run_session(
@@ -510,7 +517,7 @@ def run_session(
             began = clock.now()
             truck = LocalTruck(rig.daemon, clock)
             result, file = await calibrate(wizard, truck, operator, clock, calibrated, known)
-            return Session(result, Path(file), (clock.now() - began) / SECOND)
+            return Session(result, Path(file), (clock.now() - began) / SECOND, operator.seen)
 
     return run_virtual(main)
 
@@ -532,6 +539,19 @@ class Verdict:
         if self.low is None or self.high is None:
             return self.value == self.truth
         return self.low <= self.truth <= self.high
+
+
+def distance_from_fit(plot: Plot) -> float:
+    """Median distance of the measurements from the fit, as a fraction of the plot's ranges; 0 without a fit."""
+    assert np.isfinite(plot.points).all()
+    if plot.curve is None:
+        return 0.0
+    everything = np.vstack((plot.points, plot.curve))
+    low, span = everything.min(axis=0), np.maximum(np.ptp(everything, axis=0), 1e-9)
+    points, curve = (plot.points - low) / span, (plot.curve - low) / span
+    along = np.linspace(0, len(curve) - 1, 1000)
+    dense = np.column_stack([np.interp(along, np.arange(len(curve)), axis) for axis in curve.T])
+    return float(np.median(np.hypot(*(points[:, None] - dense).T).min(axis=0)))
 
 
 def verdicts(result: Result, config: SimulatedTruckConfig) -> list[Verdict]:

@@ -94,7 +94,7 @@ def closing_error(config: SimulatedTruckConfig) -> float:
             arc = MoveStep("corner", SPEED, ANGLE, -ANGLE, 2.0 * corner, done=turned, also=(topics.ODOMETRY,))
             began, poses = rig.world.truth(clock.now()), []
             for move in (side, arc) * 4:
-                poses += [o.pose for o in (await mover.move(move, lambda _: None)).of(topics.ODOMETRY)]
+                poses += [o.pose for o in (await mover.move(move, lambda *_: None)).of(topics.ODOMETRY)]
             ended = rig.world.truth(clock.now())
             true = _moved((began.x, began.y, began.yaw), (ended.x, ended.y))
             first, last = poses[0], poses[-1]

@@ -134,6 +134,12 @@ class Result(Schema):
         """The estimate of that name."""
         return next((estimate for estimate in self.estimates if estimate.name == name), None)
 
+    def number(self, name: str) -> float:
+        """The value of an estimate that is there and is a number."""
+        estimate = self.estimate(name)
+        assert estimate is not None
+        return float(estimate.value)
+
 
 class CalibrationFile(Schema):
     """Everything known of one truck; replaced as a whole, never changed."""

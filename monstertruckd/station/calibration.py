@@ -57,6 +57,8 @@ class PagePanel:
         self.said: deque[str] = deque(maxlen=SAID)
         self.bar: dict[str, Any] | None = None
         """Progress of the step under way."""
+        self.drawn: dict[str, Any] | None = None
+        """Plot of the measurements."""
         self.question: dict[str, Any] | None = None
         """Question to the operator."""
         self._answer: asyncio.Future[float | bool] | None = None
@@ -70,6 +72,17 @@ class PagePanel:
     def progress(self, name: str, done: float, total: float) -> None:
         """Move the bar of a step."""
         self.bar = {"name": name, "done": round(min(done, total), 3), "total": total}
+        self._show()
+
+    def plot(self, plot: Any) -> None:
+        """Show measurements; ``plot`` has a name, labels of both axes, points and perhaps a curve."""
+        self.drawn = {
+            "name": plot.name,
+            "x": plot.x,
+            "y": plot.y,
+            "points": _thinned(plot.points),
+            "curve": None if plot.curve is None else _thinned(plot.curve),
+        }
         self._show()
 
     async def number(self, step: Any) -> float:
@@ -139,6 +152,7 @@ class Calibration:
                 phase=self._phase,
                 said=list(self._panel.said),
                 progress=self._panel.bar,
+                plot=self._panel.drawn,
                 question=self._panel.question,
                 measured=measured,
                 text=self._text,
@@ -209,3 +223,9 @@ class Calibration:
             raise
         finally:
             self._decision = None
+
+
+def _thinned(points: Any) -> list[list[float]]:
+    """At most 200 points, shape (n, 2), as a plot 300 pixels wide can show them; the last one is kept."""
+    step = -(-len(points) // 200)
+    return [[float(f"{value:.5g}") for value in point] for point in points[::-1][::step][::-1]] if step else []

@@ -15,7 +15,7 @@ from monstertruckd.tools.calibrate.sonar import SonarWizard
 from monstertruckd.tools.calibrate.stabiliser import StabiliserWizard
 from monstertruckd.tools.calibrate.wizard import Wizard
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
-from tests.calibration_kit import run_session, verdicts
+from tests.calibration_kit import distance_from_fit, run_session, verdicts
 from tests.calibration_robots import robot_of
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(600)]
@@ -27,6 +27,8 @@ def judged(wizard: Wizard, config: SimulatedTruckConfig, seed: int, outside: int
     found = verdicts(session.result, config)
     missed = [verdict for verdict in found if not verdict.holds]
     assert len(missed) <= outside, missed
+    assert session.plot is not None
+    assert distance_from_fit(session.plot) < 0.05
     return {verdict.name.partition(".")[2] for verdict in found}
 
 

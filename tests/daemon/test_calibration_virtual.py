@@ -28,7 +28,16 @@ from monstertruckd.tools.calibrate.wizard import calibrate
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
-from tests.calibration_kit import LocalTruck, Session, SilentTruck, SimulatedOperator, hidden, run_session, verdicts
+from tests.calibration_kit import (
+    LocalTruck,
+    Session,
+    SilentTruck,
+    SimulatedOperator,
+    distance_from_fit,
+    hidden,
+    run_session,
+    verdicts,
+)
 
 pytestmark = [pytest.mark.virtual, pytest.mark.timeout(600)]
 
@@ -52,6 +61,8 @@ def judged(session: Session, config: SimulatedTruckConfig) -> None:
     found = verdicts(session.result, config)
     assert found
     assert all(verdict.holds for verdict in found), [verdict for verdict in found if not verdict.holds]
+    assert session.plot is not None
+    assert distance_from_fit(session.plot) < 0.05
 
 
 # The truth lies within the stated interval

@@ -40,7 +40,7 @@ def test_signs(tmp_path: Path, world, checks):
         async with rig.running():
             await clock.sleep(START_UP)
             mover = Mover(LocalTruck(rig.daemon, clock, "doctor"), clock, config.chassis())
-            return await signs(lambda step: mover.move(step, lambda _: None), config, lambda *words: " ".join(words))
+            return await signs(lambda step: mover.move(step, lambda *_: None), config, lambda *words: " ".join(words))
 
     found = run_virtual(main)
     assert {finding.check for finding in found if finding.level is not Level.OK} == checks, found

@@ -46,6 +46,42 @@ function intervals(row) {
   return [drawn];
 }
 
+/**
+ * Measurements as points, and the fit to them as a curve, between axes with the ends of their ranges.
+ *
+ * @param {{name: string, x: string, y: string, points: number[][], curve: number[][] | null}} plot
+ */
+function plotted({ name, x, y, points, curve }) {
+  const all = [...points, ...(curve ?? [])];
+  const [left, right, top, bottom] = [44, 292, 8, 148];
+  const range = (axis) => {
+    const values = all.map((point) => point[axis]);
+    const [low, high] = [Math.min(...values), Math.max(...values)];
+    return high > low ? [low, high] : [low - 0.5, low + 0.5];
+  };
+  const [[west, east], [south, north]] = [range(0), range(1)];
+  const place = ([along, up]) => [left + ((along - west) / (east - west)) * (right - left), bottom - ((up - south) / (north - south)) * (bottom - top)];
+  const drawn = svg("svg", { viewBox: "0 0 300 180", role: "img", "aria-label": name });
+  const label = (text, at, anchor) => {
+    const made = svg("text", { ...at, "text-anchor": anchor });
+    made.textContent = text;
+    return made;
+  };
+  const short = (value) => String(Number(value.toPrecision(3)));
+  drawn.append(
+    svg("path", { class: "frame", d: `M${left} ${top}V${bottom}H${right}` }),
+    label(short(north), { x: left - 4, y: top + 8 }, "end"), label(short(south), { x: left - 4, y: bottom }, "end"),
+    label(short(west), { x: left, y: bottom + 12 }, "start"), label(short(east), { x: right, y: bottom + 12 }, "end"),
+    label(x, { x: (left + right) / 2, y: bottom + 26 }, "middle"), label(y, { x: left + 6, y: top + 8 }, "start"),
+    ...points.map((point) => {
+      const [cx, cy] = place(point);
+      return svg("circle", { cx, cy, r: 2 });
+    }),
+  );
+  if (curve) drawn.append(svg("path", { class: "fit", d: `M${curve.map((point) => place(point).join(" ")).join("L")}` }));
+  return drawn;
+}
+
 export class Calibration {
   /**
    * @param {import("./socket.js").Link} link
@@ -101,7 +137,7 @@ export class Calibration {
     if (byId("wizard-number").value.trim() && Number.isFinite(typed)) this.answer(typed);
   }
 
-  show({ step, phase, said, progress, question, measured, text }) {
+  show({ step, phase, said, progress, plot, question, measured, text }) {
     const runs = phase === "running";
     byId("wizard").hidden = phase === "idle";
     byId("wizards").hidden = runs || phase === "measured";
@@ -111,6 +147,8 @@ export class Calibration {
     const bar = byId("wizard-progress");
     bar.hidden = !progress;
     if (progress) Object.assign(bar, { max: progress.total, value: progress.done, ariaLabel: progress.name });
+    byId("wizard-plot").hidden = !plot?.points.length;
+    if (plot?.points.length) byId("wizard-plot").replaceChildren(element("figcaption", { textContent: plot.name }), plotted(plot));
     byId("wizard-ask").hidden = !question;
     if (question) this.ask(question);
     byId("wizard-result").hidden = !measured;

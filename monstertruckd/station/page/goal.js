@@ -107,7 +107,7 @@ export class Goals {
   text(state, running) {
     if (this.drawn) return words("path.drawn", { metres: number(lengthOf(this.drawn), 1) });
     if (this.pending) return words("goal.at", { x: number(this.pending[0]), y: number(this.pending[1]), yaw: degrees(this.pending[2]) });
-    if (running) return words("goal.state", { number: state.number, phase: this.phase(state.phase), remaining: number(state.remaining, 1) });
+    if (running) return words(state.remaining > 0 ? "goal.left" : "goal.state", { number: state.number, phase: this.phase(state.phase), remaining: number(state.remaining, 1) });
     if (state?.outcome === "estopped") return words("goal.estopped", { number: state.number });
     return state ? words("goal.ended", { number: state.number, text: state.text || reason(state.outcome) }) : "";
   }

@@ -18,7 +18,7 @@ from monstertruck_schemas.sensor import Battery
 from monstertruckd.config.calibration import Result, WizardName
 from monstertruckd.config.wizards import STEERING
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated
-from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number
+from monstertruckd.tools.calibrate.steps import Collect, Confirm, Number, Plot
 from monstertruckd.tools.calibrate.wizard import WizardContext
 
 METER: Final = Number("meter", "Voltage of the pack at its plug by the multimeter, V", 5.0, 70.0)
@@ -72,9 +72,21 @@ class BatteryWizard:
             reading = self._reading(taken, volts, gain, offset, self._step(context))
             check_input(reading, gain)
             readings.append(reading)
+            self._plot(context, readings)
             if not await context.confirm(ANOTHER):
                 break
-        return context.fit("scale", lambda: self._result(readings, keys))
+        result = context.fit("scale", lambda: self._result(readings, keys))
+        self._plot(context, readings, self.scale(readings))
+        return result
+
+    @staticmethod
+    def _plot(
+        context: WizardContext, readings: list[MeterReading], scale: tuple[Interval, Interval] | None = None
+    ) -> None:
+        points = np.array([(reading.raw, reading.volts) for reading in readings])
+        raw = np.array((points[:, 0].min(), points[:, 0].max()))
+        line = None if scale is None else np.column_stack((raw, scale[0].value * raw + scale[1].value))
+        context.plot(Plot("voltage of the pack", "input (V)", "multimeter (V)", points, line))
 
     @staticmethod
     def _keys(context: WizardContext) -> tuple[str, str]:

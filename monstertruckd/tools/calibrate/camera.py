@@ -29,7 +29,7 @@ from monstertruckd.tools.calibrate.board_mount import NAMES, LidarPlace, fit_mou
 from monstertruckd.tools.calibrate.board_views import BoardGuide, BoardView
 from monstertruckd.tools.calibrate.lidar import joint_angles
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated, known_errors
-from monstertruckd.tools.calibrate.steps import Collect, Confirm, WatchStep
+from monstertruckd.tools.calibrate.steps import Collect, Confirm, Plot, WatchStep
 from monstertruckd.tools.calibrate.wizard import WizardContext
 
 ROOM: Final = "a printed board on something flat (`stand print`), 0.4 to 1 m before the camera; light; nothing drives"
@@ -96,6 +96,8 @@ class CameraWizard:
                 raise InputError(f"the camera's pictures were {width} x {height} pixels and are {now} now: start again")
             sighting = None if picture is None else reader.read(picture)
             if guide.take(message.stamp, sighting, scans, damaged=picture is None) is not None:
+                corners = np.vstack([view.sighting.corners for view in guide.views]) * (1.0, -1.0)
+                context.plot(Plot("corners of the board in the picture", "right (px)", "up (px)", corners))
                 missing = guide.missing()
                 if missing:
                     context.say(f"view {len(guide.views)}; still missing: {'; '.join(missing[:2])}")

@@ -21,7 +21,7 @@ from monstertruck_schemas import topics
 from monstertruckd.config.calibration import Estimate, Result, WizardName
 from monstertruckd.config.wizards import COMPASS
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, mean_angle
-from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
+from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep, Plot
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = "2 m x 2 m, level, outdoors or well away from iron: no car, no reinforced wall, no drain within 3 m"
@@ -77,6 +77,17 @@ class FieldCircle:
             raise InputError(f"{len(rows)} readings of the compass while the robot moved: expected {fewest} or more")
         return cls(*np.array(rows).T)
 
+    def plot(self, iron: IronConfig | None = None) -> Plot:
+        """Plot the horizontal field, and the ellipse that ``iron`` makes of a circle."""
+        field, ellipse = np.column_stack((self.x, self.y)), None
+        if iron is not None:
+            soft = np.array(((iron.soft_xx, iron.soft_xy), (iron.soft_xy, iron.soft_yy)))
+            hard = np.array((iron.hard_x, iron.hard_y))
+            radius = float(np.hypot(*(soft @ (field - hard).T)).mean())
+            around = np.linspace(0.0, math.tau, 73)  # every 5 degrees
+            ellipse = hard + radius * np.column_stack((np.cos(around), np.sin(around))) @ np.linalg.inv(soft)
+        return Plot("magnetic field on the circle", "field ahead (uT)", "field to the left (uT)", field, ellipse)
+
 
 @dataclass(frozen=True, slots=True)
 class CompassWizard:
@@ -113,7 +124,11 @@ class CompassWizard:
             )
             for name, speed in (("a circle to the left", self.speed), ("the same circle back", -self.speed))
         ]
-        return context.fit("ellipse", lambda: result_of(FieldCircle.of(tracks)))
+        circle = FieldCircle.of(tracks)
+        context.plot(circle.plot())
+        result = context.fit("ellipse", lambda: result_of(circle))
+        context.plot(circle.plot(IronConfig(**{name: result.number(name) for name in _NAMES})))
+        return result
 
 
 def result_of(circle: FieldCircle) -> Result:

@@ -21,7 +21,7 @@ from monstertruckd.config.calibration import Estimate, Result, WizardName
 from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.response import ResponseFit, Steps, unexplained
 from monstertruckd.tools.calibrate.statistics import Interval, estimated, mean_interval
-from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
+from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number, Plot
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 RATIO: Final = "geometry.drive_ratio"
@@ -92,8 +92,10 @@ class DriveWizard:
             straight = None if compass else await context.confirm(_STRAIGHT)
             runs.append(TapedRun.of(track, distance, straight=straight))
             tracks.append(track)
+            context.plot(_plot(runs))
         delays = context.fit("dead time and lag", lambda: drive_estimates(tracks, float(context.value(RATE))))
         result = context.fit("turns per metre", lambda: self._result(context, inverted, runs))
+        context.plot(_plot(runs, result.number("turns_per_metre")))
         return result.model_copy(update={"estimates": (*result.estimates, *delays)})
 
     @staticmethod
@@ -303,3 +305,9 @@ def drive_estimates(records: Iterable[MoveRecord], rate: float) -> list[Estimate
         covers = f"95 % of the runs' spread, and the driver's cycle of {1000 / rate:g} ms"
         found += drive_response(runs, part, 1 / rate).estimates(meanings, covers, prefix=f"{part}_")
     return found
+
+
+def _plot(runs: Sequence[TapedRun], turns_per_metre: float | None = None) -> Plot:
+    points = np.array([(number, run.turns / run.length) for number, run in enumerate(runs, start=1)])
+    line = None if turns_per_metre is None else np.array(((1, turns_per_metre), (len(runs), turns_per_metre)))
+    return Plot("turns of the motor", "run", "turns per metre", points, line)

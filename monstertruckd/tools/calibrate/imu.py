@@ -17,7 +17,7 @@ from monstertruckd.config.calibration import Result, WizardName
 from monstertruckd.config.wizards import IMU
 from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, known_errors
-from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep
+from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep, Plot
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = "2 m x 2 m, level"
@@ -87,6 +87,9 @@ class ImuWizard:
         rate = context.value(f"{IMU}.rate_z"), context.value(f"{IMU}.rate_scale")
         await context.confirm(CLEAR)
         resting = await context.collect(Collect("the unit at rest", topics.IMU, 500, 60.0))  # readings at rest
+        since = resting[0].stamp
+        rates = np.array([((r.stamp - since) / SECOND, math.degrees(r.angular_velocity.z)) for r in resting])
+        context.plot(Plot("the unit at rest", "time (s)", "yaw rate (deg/s)", rates))
         tilt = await context.collect(Collect("the robot's tilt", topics.COMPASS, 20))
         turns = []
         angle = 0.35  # angle of both axles, in opposite directions, rad
@@ -105,7 +108,14 @@ class ImuWizard:
                 )
                 turns.append(Turn.of(await context.move(move), float(rate[0]), float(rate[1])))
         before = {name: float(context.value(f"{IMU}.{name}")) for name in _NAMES}
-        return context.fit("biases and scale", lambda: result_of(resting, tilt, turns, before))
+        result = context.fit("biases and scale", lambda: result_of(resting, tilt, turns, before))
+        if turns:
+            bias, scale = (result.number(name) for name in ("rate_z", "rate_scale"))
+            by_unit = np.array([turn.integral - bias * turn.seconds for turn in turns])
+            points = np.degrees(np.column_stack((by_unit, [turn.turned for turn in turns])))
+            line = np.outer((points[:, 0].min(), points[:, 0].max()), (1.0, scale))
+            context.plot(Plot("full turns", "by the unit (deg)", "by the compass (deg)", points, line))
+        return result
 
 
 _NAMES: Final = ("rate_x", "rate_y", "rate_z", "rate_scale", "force_x", "force_y")

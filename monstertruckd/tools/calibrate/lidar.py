@@ -36,7 +36,7 @@ from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.beams import stacked_ranges
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, correlation_factor, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import AXLES, EYE
-from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep, Number
+from monstertruckd.tools.calibrate.steps import Collect, MoveRecord, MoveStep, Number, Plot
 from monstertruckd.tools.calibrate.weave import weaves
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
@@ -141,7 +141,11 @@ class LidarWizard:
         level = await self._level(context) if self.heights else ()
         await context.confirm(CLEAR)
         chassis = context.chassis
-        legs = [LidarLeg.of(await context.move(move), chassis, mount) for move in self._moves(chassis)]
+        legs = []
+        for move in self._moves(chassis):
+            legs.append(LidarLeg.of(await context.move(move), chassis, mount))
+            seen = np.array([leg.seen[:2] for leg in legs])
+            context.plot(Plot("motion between rests by the scans", "ahead (m)", "to the left (m)", seen))
         also = topics.SCAN, topics.ODOMETRY
         weaving = [await context.move(replace(move, also=also)) for move in weaves(1)]
         crab = crab_error(context)

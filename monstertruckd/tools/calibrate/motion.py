@@ -67,9 +67,9 @@ class Mover:
         self._drivetrain = chassis.drivetrain
 
     async def move(
-        self, move: MoveStep, report: Callable[[float], None], say: Callable[[str], None] = lambda _: None
+        self, move: MoveStep, report: Callable[[MoveRecord, float], None], say: Callable[[str], None] = lambda _: None
     ) -> MoveRecord:
-        """Drive ``move`` and return its record; ``report`` is called with the distance travelled (m).
+        """Drive ``move`` and return its record; ``report`` gets the record so far and the distance (m).
 
         The truck is always stopped and disarmed at the end. After a transient stop, such as a late request, the mover
         reports through ``say``, drives back to the start of the move and repeats it, at most twice.
@@ -105,7 +105,7 @@ class Mover:
                     await self._once(_Run(self._truck, self._clock, feeds, also), move.back(covered), report)
             return run.track
 
-    async def _once(self, run: "_Run", move: MoveStep, report: Callable[[float], None]) -> None:
+    async def _once(self, run: "_Run", move: MoveStep, report: Callable[[MoveRecord, float], None]) -> None:
         async with self._armed(run):
             steering = 1.0  # time to turn the wheels while the truck stands (s)
             if move.approach:
@@ -117,7 +117,7 @@ class Mover:
             await run.rest(move.front, move.rear)
             await run.hold(0.0, move.front, move.rear, move.rest)
 
-    async def _drive(self, run: "_Run", move: MoveStep, report: Callable[[float], None]) -> None:
+    async def _drive(self, run: "_Run", move: MoveStep, report: Callable[[MoveRecord, float], None]) -> None:
         run.track.left = run.robot_time
         distance, since = 0.0, self._clock.now()
         began = since
@@ -126,7 +126,7 @@ class Mover:
             side = move.side((self._clock.now() - began) / SECOND)
             await run.hold(move.speed, side * move.front, side * move.rear, REQUEST_PERIOD)
             new = abs(run.track.distance(self._drivetrain))
-            report(new)
+            report(run.track, new)
             if new >= move.metres or (move.done is not None and move.done(run.track)):
                 return
             if new - distance > 0.01:  # minimum progress (m)

@@ -24,7 +24,7 @@ from monstertruckd.config.wizards import STEERING
 from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.statistics import Interval, estimated, known_errors
 from monstertruckd.tools.calibrate.steering_model import AXLES, EYE, Maps, SteeringModel, SteeringRun
-from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
+from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number, Plot
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = "3.5 m x 3.5 m on either side: squares of 2.4 m to the left and to the right of the robot, level"
@@ -87,6 +87,8 @@ class OdometryWizard:
         maps = Maps.of(context.config)
         await context.confirm(CLEAR)
         squares = [await self._square(context, maps, side) for _ in range(self.rounds) for side in (1, -1)]
+        ends = 100 * np.array([square.off for square in squares])
+        context.plot(Plot("ends of the squares", "ahead of the mark (cm)", "left of the mark (cm)", ends))
         return context.fit("distance scale, wheelbase and steering offset", lambda: self.judge(context, maps, squares))
 
     async def _square(self, context: WizardContext, maps: Maps, sense: int) -> Square:

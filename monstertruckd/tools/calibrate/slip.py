@@ -25,7 +25,7 @@ from monstertruck_schemas.topics import Topic
 from monstertruckd.config.calibration import Estimate, Result, WizardName
 from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.statistics import known_errors
-from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
+from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep, Plot
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 Observer = Literal["stand", "pose"]
@@ -109,6 +109,8 @@ class SlipWizard:
                     # 1.5: seconds at each end: 30 poses of a stand
                     move = MoveStep(name, direction * speed, front, 0.0, metres, rest=1.5, also=also)
                     arcs.append(SkidArc.of(await context.move(move), self.by, context.chassis))
+                    ends = np.array([arc.motion[:2] for arc in arcs])
+                    context.plot(Plot("ends of the arcs", "ahead of the start (m)", "left of the start (m)", ends))
         return context.fit("turning centres", lambda: result_of(arcs, config.geometry.wheel_radius, track / 2))
 
 

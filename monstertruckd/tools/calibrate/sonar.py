@@ -27,7 +27,7 @@ from monstertruckd.config.calibration import Result, WizardName
 from monstertruckd.config.wizards import SONAR, TURN_IN_A_METRE
 from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.statistics import Interval, estimated, known_errors, mean_angle
-from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number
+from monstertruckd.tools.calibrate.steps import Confirm, MoveRecord, MoveStep, Number, Plot
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
 ROOM: Final = (
@@ -142,6 +142,15 @@ class SonarWizard:
                 records.append(await context.move(move))
         origin = _start(records[0])
         legs = [SonarLeg.of(record, origin) for record in records]
+        echoes = np.vstack(
+            [
+                np.column_stack((np.degrees(leg.poses[name][:, 2]), ranges))[np.isfinite(ranges)]
+                for leg in legs
+                for name, ranges in leg.ranges.items()
+            ]
+            or [np.empty((0, 2))]
+        )
+        context.plot(Plot("echoes of the arcs", "heading of the robot (deg)", "range (m)", echoes))
         return context.fit("places and cones", lambda: result_of(legs, settings, wall, self.tape_error))
 
 

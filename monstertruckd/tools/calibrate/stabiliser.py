@@ -29,7 +29,7 @@ from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.beams import bearings_of, stacked_ranges
 from monstertruckd.tools.calibrate.lidar import HEIGHTS, beam_distance, beam_tilt
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval
-from monstertruckd.tools.calibrate.steps import Collect, Confirm
+from monstertruckd.tools.calibrate.steps import Collect, Confirm, Plot
 from monstertruckd.tools.calibrate.wizard import WizardContext
 
 ROOM: Final = (
@@ -124,6 +124,10 @@ class StabiliserWizard:
         await context.confirm(_SIDE)
         side, _ = await self._stand(context)
         walls = ahead, left
+        stands = [(s.body[axis], s.joints[axis]) for s in (flat, nose, side) for axis in (0, 1)]
+        points = np.degrees(np.array(stands))
+        level = np.outer((points[:, 0].min(), points[:, 0].max()), (1.0, -1.0))
+        context.plot(Plot("joints that level the lidar", "tilt of the body (deg)", "joint (deg)", points, level))
         return context.fit(
             "zeros and directions", lambda: result_of(flat, nose, side, heights, walls, device.driver, self.tape_error)
         )

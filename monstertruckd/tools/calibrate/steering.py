@@ -14,6 +14,7 @@ import numpy as np
 from monstertruck_drivers.os4000.config import IronConfig, Os4000Config
 from monstertruck_kinematics.chassis import TruckChassis
 from monstertruck_kinematics.elementary import Array
+from monstertruck_kinematics.fitting import FitResult
 from monstertruck_runtime.errors import InputError, RequestRefusedError
 from monstertruck_schemas.reasons import Reason
 from monstertruckd.config.calibration import Estimate, Result, WizardName
@@ -21,7 +22,7 @@ from monstertruckd.config.wizards import STEERING
 from monstertruckd.tools.calibrate.assumed import ASSUMED
 from monstertruckd.tools.calibrate.statistics import NORMAL, Interval, estimated
 from monstertruckd.tools.calibrate.steering_model import AXLES, Maps, SteeringModel, SteeringRun, half_widths
-from monstertruckd.tools.calibrate.steps import Confirm, MoveStep, Number
+from monstertruckd.tools.calibrate.steps import Confirm, MoveStep, Number, Plot
 from monstertruckd.tools.calibrate.weave import estimates, response, weaves
 from monstertruckd.tools.calibrate.wizard import CLEAR, WizardContext
 
@@ -111,7 +112,12 @@ class SteeringWizard:
         settings = None if compass is None else compass.driver
         iron = settings.iron if isinstance(settings, Os4000Config) else IronConfig()
         answer = context.fit("dead time and lag", lambda: response(weaving, chassis, iron))
-        result = context.fit("pulse maps", lambda: self._result(context, model, legs, first, travel))
+        fit = context.fit("pulse maps", lambda: model.fit(legs, first))
+        turns, _ = model.predict(legs, Maps.from_parameters(fit.parameters))
+        points = np.degrees(np.column_stack((turns, [leg.turn for leg in legs])))
+        same = np.repeat(np.array((points.min(), points.max()))[:, None], 2, axis=1)
+        context.plot(Plot("turns of all legs", "by the pulse maps (deg)", "by the compass (deg)", points, same))
+        result = context.fit("intervals", lambda: self._result(context, model, legs, fit, travel))
         return result.model_copy(update={"estimates": (*result.estimates, *estimates(answer))})
 
     # Driving
@@ -213,10 +219,9 @@ class SteeringWizard:
         context: WizardContext,
         model: SteeringModel,
         legs: list[SteeringRun],
-        first: Maps,
+        fit: FitResult,
         travel: "list[AxleTravel]",
     ) -> Result:
-        fit = model.fit(legs, first)
         maps = Maps.from_parameters(fit.parameters)
         travel = [AxleTravel.of(reach.axle, reach.sign, reach.legs, model, maps) for reach in travel]
         # 0.003: relative error of a taped wheelbase

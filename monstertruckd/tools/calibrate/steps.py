@@ -203,6 +203,21 @@ class WatchStep(Generic[M]):
     """Timeout without a message (s)"""
 
 
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """Measurements of a wizard, and the fit to them."""
+
+    name: str
+    x: str
+    """Label of the horizontal axis, with its unit"""
+    y: str
+    """Label of the vertical axis, with its unit"""
+    points: Array
+    """Measurements, shape (n, 2)"""
+    curve: Array | None = None
+    """The fit, shape (m, 2); None before it"""
+
+
 class Panel(Protocol):
     """Operator interface of a wizard: a terminal, a script, or a simulated operator."""
 
@@ -211,6 +226,9 @@ class Panel(Protocol):
 
     def progress(self, name: str, done: float, total: float) -> None:
         """Show the progress of a step."""
+
+    def plot(self, plot: Plot) -> None:
+        """Show measurements; replaces the previous plot."""
 
     async def number(self, step: Number) -> float:
         """Ask for a number.

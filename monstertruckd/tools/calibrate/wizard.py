@@ -7,10 +7,13 @@ the calibration unchanged; the gate stops the truck as it does for any operator 
 """
 
 import json
+import math
 from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Protocol, TypeVar
+
+import numpy as np
 
 from monstertruck_runtime.client import TruckClient
 from monstertruck_runtime.clock import Clock
@@ -24,7 +27,7 @@ from monstertruckd.config.expiry import state_of
 from monstertruckd.config.truck import TruckConfig
 from monstertruckd.config.wizards import WizardRun, sequence
 from monstertruckd.tools.calibrate.motion import Mover
-from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, MoveStep, Number, Panel, WatchStep
+from monstertruckd.tools.calibrate.steps import Collect, Confirm, MoveRecord, MoveStep, Number, Panel, Plot, WatchStep
 
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
@@ -82,6 +85,10 @@ class WizardContext:
         """Show a sentence to the operator."""
         self._panel.say(text)
 
+    def plot(self, plot: Plot) -> None:
+        """Show measurements, and the fit to them, to the operator."""
+        self._panel.plot(plot)
+
     def value(self, key: str) -> Value:
         """A value of the daemon's configuration.
 
@@ -126,8 +133,13 @@ class WizardContext:
         which = f" ({self._moved} of {self._moves})" if self._moved <= self._moves else ""
         self._panel.say(f"moving{which}: {step.name}")
 
-        def report(distance: float) -> None:
+        driven: list[tuple[float, float]] = []
+
+        def report(record: MoveRecord, distance: float) -> None:
             self._panel.progress(step.name, distance, step.metres)
+            driven.append((distance, math.degrees(record.turned())))
+            if record.attitude:
+                self.plot(Plot(step.name, "distance (m)", "turn, left positive (deg)", np.array(driven)))
 
         return await self._mover.move(step, report, self._panel.say)
 

@@ -12,7 +12,7 @@ from typing import Self
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.readable import when_readable
-from monstertruckd.tools.calibrate.steps import Confirm, Number
+from monstertruckd.tools.calibrate.steps import Confirm, Number, Plot
 from monstertruckd.tools.cli.output import progress, remark
 
 WORDS = {"y": True, "yes": True, "n": False, "no": False}
@@ -64,6 +64,9 @@ class TerminalPanel:
             self._close_bar()
             self._bar = (name, self._bars.enter_context(progress(name, total)))
         self._bar[1](min(done, total))
+
+    def plot(self, plot: Plot) -> None:
+        """Show nothing: plots are for the page."""
 
     async def number(self, step: Number) -> float:
         """Ask until a number within the bounds comes; one given beforehand has to be right at once."""

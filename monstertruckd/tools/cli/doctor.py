@@ -88,7 +88,7 @@ async def _drive(robot: str, endpoint: str, clock: "Clock", command: "Callable[.
         async with TruckClient(robot, endpoint, clock=clock, timeout=10.0) as client:
             config = await robot_config(client)
             mover = Mover(client, clock, config.chassis())
-            return await signs(lambda step: mover.move(step, lambda _: None), config, command)
+            return await signs(lambda step: mover.move(step, lambda *_: None), config, command)
     except TruckError as error:
         return [fail("signs", error.reason, str(error))]
 

@@ -6,6 +6,7 @@ from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from monstertruck_runtime.clock import WallClock
@@ -13,7 +14,7 @@ from monstertruck_runtime.errors import InputError, NoAnswerError
 from monstertruckd.station import commands
 from monstertruckd.station.calibration import Calibration, Measured
 from monstertruckd.station.viewer import Viewer
-from monstertruckd.tools.calibrate.steps import Confirm, Number
+from monstertruckd.tools.calibrate.steps import Confirm, Number, Plot
 from tests.unit.station.test_server import connected, serving
 
 ROW = {"name": "gain", "value": 1.02, "low": 1.0, "high": 1.04, "unit": "", "meaning": "m", "grade": "A", "before": 1.0}
@@ -44,6 +45,7 @@ class Wizards:
             self.cancelled = True
             raise
         panel.progress("drive", 0.5, 1.0)
+        panel.plot(Plot("scale", "input (V)", "meter (V)", np.linspace((0.0, 0.0), (300.0, 600.0), 301), np.eye(2)))
 
         async def save() -> str:
             self.saved += 1
@@ -89,6 +91,11 @@ async def test_a_wizard_asks_shows_its_result_and_saves_it_once_it_is_accepted()
     run.answer(False)
     measured = await state(viewer)
     assert (measured["phase"], measured["question"]) == ("measured", None)
+    drawn = measured["plot"]
+    assert (drawn["name"], drawn["x"], drawn["y"]) == ("scale", "input (V)", "meter (V)")
+    assert len(drawn["points"]) <= 200
+    assert drawn["points"][-1] == [300.0, 600.0], "the last one"
+    assert drawn["curve"] == [[1.0, 0.0], [0.0, 1.0]]
     assert measured["measured"] == {"rows": [ROW], "text": "12.6 V, False"}
     assert wizards.saved == 0
     with pytest.raises(InputError, match="asks nothing now"):

@@ -554,7 +554,9 @@ async def a_goal_says_what_the_gate_lets_it_do(page: Page) -> None:
     await say(page, {"kind": "goal", "m": goal}, gate_says(GateMode.DRIVING))
     await expect(page.locator("#goal-text")).to_have_text("Goal 3: driving, 1.0 m to go")
     await say(page, gate_says(GateMode.DISARMED))
-    await expect(page.locator("#goal-text")).to_have_text("Goal 3: waits, the robot is disarmed, 1.0 m to go")
+    await expect(page.locator("#goal-text")).to_have_text("Goal 3: waiting, the robot is disarmed, 1.0 m to go")
+    await say(page, {"kind": "goal", "m": goal | {"phase": "planning", "remaining": 0.0}}, gate_says(GateMode.DRIVING))
+    await expect(page.locator("#goal-text")).to_have_text("Goal 3: planning")
     ended = goal | {"phase": "idle", "goal": None, "outcome": "estopped", "text": "emergency stop is latched"}
     await say(page, {"kind": "goal", "m": ended})
     await expect(page.locator("#goal-text")).to_have_text("Goal 3 was ended by an emergency stop")
@@ -877,7 +879,7 @@ async def a_wizard_asks_and_its_result_is_accepted_beside_the_one_before(page: P
     await expect(page.locator("#command code")).to_have_text("monstertruckd calibrate battery --meter-error 0.8")
 
     state = {"kind": "calibrating", "step": "battery.gain", "phase": "running", "said": ["battery: Scale"], "text": ""}
-    state |= {"progress": None, "measured": None, "question": None}
+    state |= {"progress": None, "plot": None, "measured": None, "question": None}
     question = {"kind": "number", "name": "meter", "text": "What does the meter show, V?", "low": 5.0, "high": 30.0}
     await say(page, state | {"question": question})
     await expect(page.locator("#wizard-question")).to_have_text(question["text"])
@@ -890,6 +892,17 @@ async def a_wizard_asks_and_its_result_is_accepted_beside_the_one_before(page: P
     await say(page, state | {"progress": {"name": "drive", "done": 0.5, "total": 1.0}})
     assert await page.locator("#wizard-progress").evaluate("(bar) => bar.position") == 0.5
     await expect(page.locator("#wizard-ask")).to_be_hidden()
+    await expect(page.locator("#wizard-plot")).to_be_hidden()
+    axes = {"name": "scale", "x": "input (V)", "y": "meter (V)"}
+    await say(
+        page, state | {"plot": axes | {"points": [[10.0, 10.2], [12.0, 12.4]], "curve": [[10.0, 10.2], [12.0, 12.4]]}}
+    )
+    await expect(page.locator("#wizard-plot text")).to_have_text(["12.4", "10.2", "10", "12", "input (V)", "meter (V)"])
+    places = await page.locator("#wizard-plot circle").evaluate_all(
+        "(all) => all.map((one) => [one.cx, one.cy].map((at) => at.baseVal.value))"
+    )
+    assert places == [[44, 148], [292, 8]], "up and to the right"
+    assert await page.locator("#wizard-plot .fit").get_attribute("d") == "M44 148L292 8"
     row = {"name": "gain", "value": 1.0213, "low": 1.0, "high": 1.04, "unit": "V", "meaning": "scale", "grade": "A"}
     measured = {"rows": [row | {"before": {"value": 0.98, "low": 0.97, "high": 0.99}}], "text": "two readings"}
     await say(page, state | {"phase": "measured", "measured": measured})

@@ -78,7 +78,7 @@ def test_a_run_that_is_held_ends_by_what_holds_it(held: tuple[Reason, ...], kind
             await clock.sleep(motion.REQUEST_PERIOD)
 
         run = SimpleNamespace(track=record, state=gate_state(held, GateMode.DRIVING), hold=hold, robot_time=0)
-        await mover._drive(run, STEP, lambda _: None)
+        await mover._drive(run, STEP, lambda *_: None)
 
     with pytest.raises(kind) as ended:
         run_virtual(main)
@@ -160,7 +160,7 @@ def hindered(step: MoveStep, *stops: tuple[float, Reason, float]) -> tuple[Hinde
         try:
             mover = motion.Mover(truck, clock, SimpleNamespace(drivetrain=DriveTrain()))
             try:
-                return truck, await mover.move(step, lambda _: None, said.append), said
+                return truck, await mover.move(step, lambda *_: None, said.append), said
             except RequestRefusedError as error:
                 return truck, error, said
         finally:
@@ -207,7 +207,7 @@ def test_when_it_set_off_is_by_the_robots_clock(booted: float):
         truck = HinderedTruck(clock, booted=booted)
         publishing = asyncio.create_task(truck.publish())
         mover = motion.Mover(truck, clock, SimpleNamespace(drivetrain=DriveTrain()))
-        record = await mover.move(STEP, lambda _: None)
+        record = await mover.move(STEP, lambda *_: None)
         publishing.cancel()
         at_rest = [reading.position for reading in record.drive if reading.stamp < record.left]
         moving = [reading.position for reading in record.drive if record.left < reading.stamp < record.arrived]
@@ -224,7 +224,7 @@ def test_a_robot_that_vanishes_is_not_said_to_be_stuck_or_restless(place: float)
         truck = HinderedTruck(clock)
         publishing = asyncio.create_task(truck.publish())
         mover = motion.Mover(truck, clock, SimpleNamespace(drivetrain=DriveTrain()))
-        moving = asyncio.create_task(mover.move(STEP, lambda _: None))
+        moving = asyncio.create_task(mover.move(STEP, lambda *_: None))
         while truck.x < place - 1e-6:
             await clock.sleep(0.02)
         publishing.cancel()

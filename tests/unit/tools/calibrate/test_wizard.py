@@ -60,6 +60,9 @@ class Panel:
     def progress(self, name, done, total):
         self.said.append(f"{name} {done:g}/{total:g}")
 
+    def plot(self, plot):
+        self.said.append(plot.name)
+
     async def number(self, step):
         return self._number
 
