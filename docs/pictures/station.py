@@ -14,12 +14,14 @@ import asyncio
 import base64
 import io
 import json
+import math
 import tempfile
 from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 from playwright.async_api import Browser, Page
 
@@ -205,14 +207,22 @@ async def wizard(page: Page, _: ReplayFeed) -> None:
     """A calibration that asks for a decision."""
     await show_tab(page, "system")
     await page.evaluate("document.querySelector('#wizards-list').click()")
-    row = {"name": "gain", "value": 1.0213, "low": 1.002, "high": 1.041, "unit": "", "meaning": "scale of the voltage"}
-    measured = {
-        "rows": [row | {"grade": "A", "before": {"value": 0.98, "low": 0.95, "high": 1.012}}],
-        "text": "two readings of a meter",
-    }
-    said = ["battery: Scale of the measured voltage.", "What does the meter show, V? 12.4"]
-    state = {"kind": "calibrating", "step": "battery.gain", "phase": "measured", "said": said, "progress": None}
-    await page.evaluate("(state) => window.heard(state)", state | {"question": None, "measured": measured, "text": ""})
+    around, noise = np.linspace(0.0, math.tau, 97), np.random.default_rng(1).normal(0.0, 0.25, (97, 2))
+    fit = np.column_stack((5.2 + 20.4 * np.cos(around), -3.1 + 18.2 * np.sin(around)))
+    axes = {"name": "magnetic field on the circle", "x": "field ahead (uT)", "y": "field to the left (uT)"}
+    said = ["compass: the robot's own magnetism, from a driven circle", "moving: a circle to the left"]
+    said += ["moving: the same circle back", "computing: ellipse"]
+    hard = {"unit": "uT", "meaning": "hard iron", "grade": "A"}
+    before = {"value": 4.8, "low": 4.4, "high": 5.2}
+    rows = [
+        hard | {"name": "hard_x", "value": 5.2, "low": 4.9, "high": 5.5, "before": before},
+        hard | {"name": "hard_y", "value": -3.1, "low": -3.4, "high": -2.8, "before": None},
+    ]  # fmt: skip
+    state = {"kind": "calibrating", "step": "compass.hard_x", "phase": "measured", "said": said, "text": ""}
+    state |= {"progress": None, "question": None}
+    state |= {"plot": axes | {"points": (fit + noise).tolist(), "curve": fit.tolist()}}
+    state |= {"measured": {"rows": rows, "text": "97 readings on a circle driven forward and back"}}
+    await page.evaluate("(state) => window.heard(state)", state)
     await page.evaluate("document.querySelector('#wizard').scrollIntoView({ block: 'center' })")
 
 
@@ -306,7 +316,7 @@ VIEWS: dict[str, View] = {
 STEPS = ("path", "zone", "mission", "point", "fleet")
 """Views that each begin where the one before ends."""
 SHOWN: dict[tuple[str, str], tuple[str, ...]] = {
-    ("desk", "light"): ("drive", "mission", "tryout", "fleet"),
+    ("desk", "light"): ("drive", "wizard", "mission", "tryout", "fleet"),
     ("desk", "dark"): ("plots",),
     ("tablet", "light"): ("settings",),
     ("phone", "light"): ("drive",),

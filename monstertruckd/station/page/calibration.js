@@ -53,7 +53,7 @@ function intervals(row) {
  */
 function plotted({ name, x, y, points, curve }) {
   const all = [...points, ...(curve ?? [])];
-  const [left, right, top, bottom] = [44, 292, 8, 148];
+  const [left, right, top, bottom] = [44, 292, 22, 162];
   const range = (axis) => {
     const values = all.map((point) => point[axis]);
     const [low, high] = [Math.min(...values), Math.max(...values)];
@@ -61,7 +61,7 @@ function plotted({ name, x, y, points, curve }) {
   };
   const [[west, east], [south, north]] = [range(0), range(1)];
   const place = ([along, up]) => [left + ((along - west) / (east - west)) * (right - left), bottom - ((up - south) / (north - south)) * (bottom - top)];
-  const drawn = svg("svg", { viewBox: "0 0 300 180", role: "img", "aria-label": name });
+  const drawn = svg("svg", { viewBox: "0 0 300 194", role: "img", "aria-label": name });
   const label = (text, at, anchor) => {
     const made = svg("text", { ...at, "text-anchor": anchor });
     made.textContent = text;
@@ -72,7 +72,7 @@ function plotted({ name, x, y, points, curve }) {
     svg("path", { class: "frame", d: `M${left} ${top}V${bottom}H${right}` }),
     label(short(north), { x: left - 4, y: top + 8 }, "end"), label(short(south), { x: left - 4, y: bottom }, "end"),
     label(short(west), { x: left, y: bottom + 12 }, "start"), label(short(east), { x: right, y: bottom + 12 }, "end"),
-    label(x, { x: (left + right) / 2, y: bottom + 26 }, "middle"), label(y, { x: left + 6, y: top + 8 }, "start"),
+    label(x, { x: (left + right) / 2, y: bottom + 26 }, "middle"), label(y, { x: 4, y: 12 }, "start"),
     ...points.map((point) => {
       const [cx, cy] = place(point);
       return svg("circle", { cx, cy, r: 2 });

@@ -901,8 +901,8 @@ async def a_wizard_asks_and_its_result_is_accepted_beside_the_one_before(page: P
     places = await page.locator("#wizard-plot circle").evaluate_all(
         "(all) => all.map((one) => [one.cx, one.cy].map((at) => at.baseVal.value))"
     )
-    assert places == [[44, 148], [292, 8]], "up and to the right"
-    assert await page.locator("#wizard-plot .fit").get_attribute("d") == "M44 148L292 8"
+    assert places == [[44, 162], [292, 22]], "up and to the right"
+    assert await page.locator("#wizard-plot .fit").get_attribute("d") == "M44 162L292 22"
     row = {"name": "gain", "value": 1.0213, "low": 1.0, "high": 1.04, "unit": "V", "meaning": "scale", "grade": "A"}
     measured = {"rows": [row | {"before": {"value": 0.98, "low": 0.97, "high": 0.99}}], "text": "two readings"}
     await say(page, state | {"phase": "measured", "measured": measured})
