@@ -335,7 +335,8 @@ class BodyWatch:
     ) -> Runaway | None:
         """Take proven motion in a time window; return an uncommanded motion.
 
-        Distance accumulates over consecutive windows. A window that is published again is ignored.
+        Distance accumulates over consecutive windows. A window that is published again is ignored, and so is one that
+        starts before the robot stands: it shows braking.
 
         Args:
             since: start of the window, ns.
@@ -350,10 +351,12 @@ class BodyWatch:
             return None
         goes_on, self._stamp, self.runs = since == self._stamp, stamp, driven
         speed = moved / (stamp - since) * SECOND
-        if not goes_on or not driven:
+        if not goes_on or not driven or since < stood:
             self._travel = 0.0
-        self._travel += speed * max(0, stamp - max(since, stood)) / SECOND
-        if not driven or self._travel + speed * (now - max(stamp, stood)) / SECOND <= config.distance:
+        if since < stood:
+            return None
+        self._travel += moved
+        if not driven or self._travel + speed * (now - stamp) / SECOND <= config.distance:
             return None
         self._travel = 0.0
         return Runaway(RunawayKind.BODY_MOVES, self._source, speed, 0.0, 0.0)

@@ -534,6 +534,23 @@ def test_a_motion_that_the_scans_prove_late_is_taken_to_go_on(late):
     assert bool(rig.reported(Reason.UNCOMMANDED_MOTION)) is bool(late)
 
 
+@pytest.mark.parametrize("braking", [True, False])
+def test_a_motion_whose_scans_span_the_braking_is_none_without_an_order(braking):
+    """The body coasts on for some millimetres after the motor has stopped."""
+    rig = Rig().driving()
+    rig.current = 0.3
+    rig.tick(10)
+    braked = rig.now
+    rig.driver = {"speed": 0.0}
+    rig.order(Order.ESTOP)
+    rig.tick(9)
+    stood = rig.now
+    rig.tick(5)
+    shown(rig, braked if braking else stood, 0.03)
+    rig.tick()
+    assert bool(rig.reported(Reason.UNCOMMANDED_MOTION)) is not braking
+
+
 @pytest.mark.parametrize("current", [0.3, None])
 def test_a_drive_that_reads_rest_need_not_obey_any_further_if_its_current_shows_what_pulls(current):
     rig = Rig().driving()
