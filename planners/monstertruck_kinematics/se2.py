@@ -27,28 +27,28 @@ def wrap(angle: Array | float) -> Array:
 def compose(outer: Array, inner: Array) -> Array:
     """Pose ``inner``, given in the frame of ``outer``, transformed to the parent frame of ``outer``."""
     c, s = np.cos(outer[..., 2]), np.sin(outer[..., 2])
-    return np.stack(
-        (
-            outer[..., 0] + c * inner[..., 0] - s * inner[..., 1],
-            outer[..., 1] + s * inner[..., 0] + c * inner[..., 1],
-            wrap(outer[..., 2] + inner[..., 2]),
-        ),
-        axis=-1,
-    )
+    x = outer[..., 0] + c * inner[..., 0] - s * inner[..., 1]
+    y = outer[..., 1] + s * inner[..., 0] + c * inner[..., 1]
+    return _poses(x, y, wrap(outer[..., 2] + inner[..., 2]))
 
 
 def inverse(pose: Array) -> Array:
     """Pose of the outer frame in the inner one."""
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x, y = pose[..., 0], pose[..., 1]
-    return np.stack((-c * x - s * y, s * x - c * y, wrap(-pose[..., 2])), axis=-1)
+    return _poses(-c * x - s * y, s * x - c * y, wrap(-pose[..., 2]))
 
 
 def between(origin: Array, target: Array) -> Array:
     """Pose ``target`` in the frame of ``origin``, both given in one frame."""
     c, s = np.cos(origin[..., 2]), np.sin(origin[..., 2])
     dx, dy = target[..., 0] - origin[..., 0], target[..., 1] - origin[..., 1]
-    return np.stack((c * dx + s * dy, -s * dx + c * dy, wrap(target[..., 2] - origin[..., 2])), axis=-1)
+    return _poses(c * dx + s * dy, -s * dx + c * dy, wrap(target[..., 2] - origin[..., 2]))
+
+
+def _poses(x: Array, y: Array, yaw: Array) -> Array:
+    """Poses from their columns; ``np.stack`` alone would take as long as all other work on a single pose."""
+    return np.stack((x, y, yaw), axis=-1) if yaw.ndim else np.array((x, y, yaw))
 
 
 def transform(pose: Array, points: Array) -> Array:
