@@ -42,10 +42,10 @@ ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 TRACED = ("tests/unit/schemas", "tests/unit/gate", "tests/unit/runtime/wire", "tests/unit/drivers")
 """Folders of the tests with a coverage gate (marked in tests/conftest.py)."""
-TESTS = ("--dist", "worksteal", "--hypothesis-profile", "ci", "--assert", "plain", "--showlocals")
+TESTS = ("--dist", "worksteal", "--hypothesis-profile", "ci", "--assert", "plain", "--showlocals", "--durations", "30")
 """Neighbours run in one process, which caches their shared data; property tests have the same examples every time, and
 no time limit. Plain pytest draws new ones. Values of local variables stand for those in assertions, whose rewriting
-would take as long as a thousand tests."""
+would take as long as a thousand tests. The slowest tests are listed."""
 TWO = ("-n", "2")
 """Tests at a time on the two cores of a small computer: one more process would import everything once more, and trucks
 and daemons on the wall clock would be late."""
