@@ -5,7 +5,7 @@
 ``lap``: a lap of the circuit while it maps: distance from the path by the world's truth, and the map's walls against
 the world's. ``goals``: places drawn along the circuit, each 2.5 to 4 m further, among two people who walk, on a map
 that grows. ``explore``: from nothing to a whole map, and home. ``faults``: a drill of families of faults
-(benchmarks/drill.py), driven at random.
+(benchmarks/drill.py), driven at random. The ``donkeycar``, without a lidar, has faults alone.
 
 Results are kept in ``runs/benchmarks/robots.json``, part by part, so that the parts can run one by one. Only what was
 run is in the figures; a goal of a part that was not run is not met.
@@ -47,7 +47,9 @@ from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 KEPT: Final = ROOT / "runs" / "benchmarks" / "robots.json"
-ROBOTS: Final = ("turtle", "truck_today", "f1tenth")
+MAPPING: Final = ("turtle", "truck_today", "f1tenth")
+"""Robots with a lidar."""
+ROBOTS: Final = (*MAPPING, "donkeycar")
 PARTS: Final = ("lap", "goals", "explore", "faults")
 CROSS_TRACK: Final = 0.02
 """Goal of the RMS distance from the path, as a share of what the robot drives in a second."""
@@ -65,17 +67,22 @@ PEOPLE: Final = (
 PLAIN: Final[dict[str, Any]] = {
     "recorder": None,
     "blackbox": None,
-    "slam": {"save": None},
     "placement": {"planner": "loop", "local_planner": "loop", "explorer": "loop"},
 }
 
 Story = Callable[[VirtualRig, LocalOperator], Awaitable[dict[str, Any]]]
 
 
+def parts_of(robot: str) -> tuple[str, ...]:
+    """Parts that a robot's sensors allow."""
+    return PARTS if robot in MAPPING else ("faults",)
+
+
 def configured(name: str, **overlay: Any) -> SimulatedTruckConfig:
     """A robot of configs/robots, without what the benchmark does not need."""
     config = load_config(ROOT / "configs" / "robots" / f"{name}.yaml", SimulatedTruckConfig)[0]
-    return with_overlay(with_overlay(config, PLAIN), overlay)
+    plain = PLAIN if config.slam is None else PLAIN | {"slam": {"save": None}}
+    return with_overlay(with_overlay(config, plain), overlay)
 
 
 def driven(config: SimulatedTruckConfig, story: Story) -> dict[str, Any]:
@@ -171,7 +178,8 @@ async def to_goal(rig: VirtualRig, operator: LocalOperator, x: float, y: float, 
                         number = int((await operator.call("goal", {**await operator.header(), **request}))["number"])
                         return await goal_end(number, operator, states, gate)
                     except RequestRefusedError as refused:
-                        refusals.append(f"{clock.now() / SECOND:.1f} s: {refused}")
+                        if refusals[-1:] != [refused.refusal.value]:
+                            refusals.append(refused.refusal.value)
                         await clock.sleep(1.0)
         except TimeoutError:
             return "late"
@@ -236,7 +244,7 @@ def figures_of(kept: dict[str, Any], robots: tuple[str, ...]) -> dict[str, Any]:
     return {
         f"{robot}_{part}_{key}": value
         for robot in robots
-        for part in PARTS
+        for part in parts_of(robot)
         for key, value in kept.get(robot, {}).get(part, {}).items()
         if not isinstance(value, list)
     }
@@ -290,7 +298,7 @@ def main() -> int:
         "faults": lambda robot: faults_of(robot, arguments.faults),
     }
     for robot in arguments.robots:
-        for part in arguments.parts:
+        for part in (one for one in parts_of(robot) if one in arguments.parts):
             run = parts[part](robot)
             kept.setdefault(robot, {})[part] = run
             print(robot, part, json.dumps(run), flush=True)
@@ -299,7 +307,7 @@ def main() -> int:
     missed = [
         f"{robot} {part}: {text}"
         for robot in ROBOTS
-        for part in PARTS
+        for part in parts_of(robot)
         for text in shortcomings(robot, part, kept.get(robot, {}).get(part))
     ]
     for text in missed:

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.robots import CROSS_TRACK, MAP_ERROR, ROBOTS, configured, lap_of
+from benchmarks.robots import CROSS_TRACK, MAP_ERROR, MAPPING, configured, lap_of
 from monstertruck_schemas.reasons import Reason
 
 pytestmark = [pytest.mark.virtual, pytest.mark.long, pytest.mark.timeout(600)]
@@ -18,7 +18,7 @@ def lap(name: str) -> dict[str, Any]:
     return lap_of(name)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", MAPPING)
 def test_it_drives_a_lap_at_its_top_speed_and_touches_nothing(name: str):
     assert configured(name).gate.speed == SPEEDS[name]
     drive = lap(name)
@@ -32,7 +32,7 @@ def test_it_keeps_to_its_path(name: str):
     assert lap(name)["cross_track_m"] <= CROSS_TRACK * SPEEDS[name]
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", MAPPING)
 def test_the_walls_of_its_map_are_true(name: str):
     assert lap(name)["wall_mean_m"] <= MAP_ERROR
 
