@@ -1,14 +1,16 @@
 """``goto``, ``track``, ``path``, ``dock``, ``undock``: send the robot somewhere, and follow it; ``convert-path``."""
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.path_forms import PathForm
 from monstertruckd.tools.cli.connection import require_section, robot_config, with_robot
+from monstertruckd.tools.cli.model_options import ModelCommand, field_parameters
 from monstertruckd.tools.cli.options import (
     HEADING,
     EndpointOption,
@@ -21,9 +23,12 @@ from monstertruckd.tools.cli.options import (
 from monstertruckd.tools.cli.output import JsonOption, print_end, print_json, print_words, remark
 
 if TYPE_CHECKING:
+    import inspect
+
     from monstertruck_runtime.client import TruckClient
     from monstertruck_runtime.clock import Clock
     from monstertruck_runtime.drives import Arrival
+    from monstertruck_schemas.mission import DockStep, UndockStep
     from monstertruck_schemas.plan import Path as PathMessage
     from monstertruckd.tools.cli.runs import RunEnd
 
@@ -189,41 +194,47 @@ def convert_path(
     typer.echo(f"{output}: {len(path.poses) // 3} poses")
 
 
-DockArgument = Annotated[
-    str | None, typer.Argument(help="Name of the dock; not needed if the robot has one only.", show_default=False)
-]
+class DockCommand(ModelCommand):
+    """Command with the name of a dock as argument."""
+
+    def added(self) -> Iterator["inspect.Parameter"]:
+        """Yield the name."""
+        from monstertruck_schemas.mission import DockStep
+
+        return field_parameters(DockStep, "dock", arguments=True)
 
 
 def dock(
-    name: DockArgument = None,
+    context: typer.Context,
     arm: ArmOption = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
     """Drive to a dock and charge. Ctrl-C stops the robot."""
-    _dock_or_undock("dock", name, robot, endpoint, arm=arm, json_output=json_output)
+    from monstertruck_schemas.mission import DockStep
+
+    _dock_or_undock(DockStep(do="dock", **context.obj), robot, endpoint, arm=arm, json_output=json_output)
 
 
 def undock(
-    name: DockArgument = None,
+    context: typer.Context,
     arm: ArmOption = False,
     robot: RobotOption = "truck",
     endpoint: EndpointOption = DEFAULT_ENDPOINT,
     json_output: JsonOption = False,
 ) -> None:
     """Leave a dock, back to its staging pose. Ctrl-C stops the robot."""
-    _dock_or_undock("undock", name, robot, endpoint, arm=arm, json_output=json_output)
+    from monstertruck_schemas.mission import UndockStep
+
+    _dock_or_undock(UndockStep(do="undock", **context.obj), robot, endpoint, arm=arm, json_output=json_output)
 
 
-def _dock_or_undock(
-    do: Literal["dock", "undock"], name: str | None, robot: str, endpoint: str, *, arm: bool, json_output: bool
-) -> None:
-    from monstertruck_schemas.mission import DockStep, Mission, UndockStep
+def _dock_or_undock(step: "DockStep | UndockStep", robot: str, endpoint: str, *, arm: bool, json_output: bool) -> None:
+    from monstertruck_schemas.mission import Mission
     from monstertruckd.tools.cli.runs import run_mission
 
-    step = DockStep(do="dock", dock=name) if do == "dock" else UndockStep(do="undock", dock=name)
-    mission = Mission(version=2, name=do, steps=(step,))
+    mission = Mission(version=2, name=step.do, steps=(step,))
 
     async def main(client: "TruckClient", _: "Clock") -> "RunEnd":
         await require_section(client, "docks", "has no docks")

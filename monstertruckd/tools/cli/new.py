@@ -1,47 +1,32 @@
 """``new-robot``: a robot's configuration and its simulated twin, from answers; ``new-driver``: a driver's package."""
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from monstertruck_runtime.errors import InputError
-from monstertruckd.tools.cli.output import NumberCommand, on_terminal, remark
+from monstertruckd.tools.cli.model_options import ModelCommand, parameter
+from monstertruckd.tools.cli.output import on_terminal, remark
 from monstertruckd.tools.new_driver.write import DriverKind, write_driver
 
 if TYPE_CHECKING:
     import inspect
 
-    from typer._click import Context
-    from typer._click.core import Parameter
 
+class AnswersCommand(ModelCommand):
+    """Command with an option for every answer."""
 
-class AnswersCommand(NumberCommand):
-    """Command with an option for every answer; the model behind them is loaded when the command is used."""
+    def added(self) -> Iterator["inspect.Parameter"]:
+        """Yield the answers as text, which they judge."""
+        from monstertruckd.tools.new_robot.answers import Answers, question
 
-    _params: "list[Parameter]"
-    _answers: "list[Parameter] | None" = None
-
-    @property
-    def params(self) -> "list[Parameter]":
-        """Declared options, and from the first use on those of the answers."""
-        if self._answers is None:
-            every = typer.Typer(add_completion=False)
-            every.command()(_with_options())
-            self._answers = [one for one in typer.main.get_command(every).params if one.name != "help"]
-            self._params += self._answers
-        return self._params
-
-    @params.setter
-    def params(self, declared: "list[Parameter]") -> None:
-        self._params = declared
-
-    def invoke(self, ctx: "Context") -> Any:
-        """Run it; the answers are in the context's ``obj``."""
-        names = [parameter.name or "" for parameter in self._answers or ()]
-        ctx.obj = {name: given for name in names if (given := ctx.params.pop(name)) is not None}
-        return super().invoke(ctx)
+        for name, field in Answers.model_fields.items():
+            if name != "name":
+                usual = "" if field.is_required() or field.default is None else f"; default: {field.default}"
+                words = f"--{name.replace('_', '-')}"
+                yield parameter(name, str, typer.Option(words, help=question(name) + usual, show_default=False))
 
 
 def new_robot(
@@ -54,11 +39,8 @@ def new_robot(
 
     The new folder holds robot.yaml, simulation.yaml and twin.yaml. Existing files are never overwritten.
     """
-    from pydantic import ValidationError
-
     from monstertruck_drivers.computer import Sysfs
     from monstertruck_drivers.usb.tree import read_tree
-    from monstertruck_schemas.base import first_mistake
     from monstertruckd.tools.new_robot.answers import Answers, check_complete
     from monstertruckd.tools.new_robot.write import next_commands, write_robot
 
@@ -66,10 +48,7 @@ def new_robot(
     if ask and on_terminal(sys.stdin):
         given = _asked(given)
     check_complete(given)
-    try:
-        answers = Answers.model_validate(given, strict=False)
-    except ValidationError as error:
-        raise InputError(first_mistake(error)) from error
+    answers = Answers.model_validate(given, strict=False)
     made = write_robot(answers, folder, read_tree(Sysfs()))
     remark(f"written: {made}; next:")
     print("\n".join(next_commands(made)))
@@ -92,29 +71,6 @@ def _asked(given: dict[str, Any]) -> dict[str, Any]:
                 break
             remark(wrong)
     return given
-
-
-def _with_options() -> Any:
-    """A function whose parameters are the options of all answers."""
-    import inspect
-
-    from monstertruckd.tools.new_robot.answers import Answers, question
-
-    def option(name: str) -> "inspect.Parameter":
-        field = Answers.model_fields[name]
-        usual = "" if field.is_required() or field.default is None else f"; default: {field.default}"
-        text = question(name) + usual
-        declared = typer.Option(f"--{name.replace('_', '-')}", help=text, show_default=False)
-        kind = inspect.Parameter.KEYWORD_ONLY
-        return inspect.Parameter(name, kind, default=None, annotation=Annotated[str | None, declared])
-
-    def answers(**options: Any) -> None:
-        pass
-
-    parameters = [option(name) for name in Answers.model_fields if name != "name"]
-    answers.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    answers.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return answers
 
 
 def new_driver(

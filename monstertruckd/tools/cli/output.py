@@ -359,7 +359,7 @@ def _usage_in_one_line() -> Iterator[None]:
     except NoArgsIsHelpError:  # a group without a command: its help is the answer
         raise
     except UsageError as error:
-        complaint = _in_own_words(" ".join(error.format_message().split()).removesuffix("."))
+        complaint = in_own_words(" ".join(error.format_message().split()).removesuffix("."))
         if isinstance(error, MissingParameter) and (wanted := getattr(error.param, "help", None)):
             complaint += f". {wanted.removesuffix('.')}"
         command = "monstertruckd" if error.ctx is None else error.ctx.command_path
@@ -367,7 +367,7 @@ def _usage_in_one_line() -> Iterator[None]:
         raise typer.Exit(error.exit_code) from None
 
 
-def _in_own_words(complaint: str) -> str:
+def in_own_words(complaint: str) -> str:
     """Without the phrases of the library that reads values."""
     text = complaint.replace(": Value error, ", ": ").replace(": Input should be ", ": expected ")
     text = text.replace(": expected a valid integer", ": expected a whole number")

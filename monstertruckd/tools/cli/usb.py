@@ -9,7 +9,7 @@ import typer
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd.tools.cli.connection import with_robot
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption, complete_role
-from monstertruckd.tools.cli.output import JsonOption, console, on_terminal, print_json, remark
+from monstertruckd.tools.cli.output import JsonOption, console, on_terminal, print_json, print_table, remark
 
 
 def usb(
@@ -20,7 +20,7 @@ def usb(
 ) -> None:
     """List USB hubs, ports and devices of a running robot, with role, state and replugs."""
     from monstertruck_runtime.clock import run_wall
-    from monstertruckd.tools.cli.usb_tree import draw, local_tree, plain, robot_tree
+    from monstertruckd.tools.cli.usb_tree import HEADINGS, draw, local_tree, robot_tree, rows
 
     nodes = (
         run_wall(local_tree)
@@ -36,7 +36,7 @@ def usb(
     elif on_terminal(sys.stdout):
         console().print(*draw(nodes), sep="\n")
     else:
-        print("\n".join(plain(nodes)))
+        print_table(HEADINGS, rows(nodes))
 
 
 def find_port(

@@ -1,6 +1,7 @@
 """The USB tree of a robot or of this machine, drawn or as a table."""
 
 from collections.abc import Iterable
+from typing import Final
 
 from rich.text import Text
 from rich.tree import Tree
@@ -90,14 +91,16 @@ def _remarks(node: UsbNode) -> list[str]:
     return remarks
 
 
-def plain(nodes: Iterable[UsbNode]) -> list[str]:
-    """The tree as a table, for pipes: hub, port, role, state, replugs, USB id, node, remarks, product."""
-    lines = [f"{'hub':10} {'port':4} {'role':11} {'state':8} {'replugs':7} {'id':9} {'node':9} device"]
+HEADINGS: Final = ("hub", "port", "role", "state", "replugs", "id", "node", "device")
+
+
+def rows(nodes: Iterable[UsbNode]) -> list[tuple[str, ...]]:
+    """Return the tree as rows of a table, for pipes."""
+    found = []
     for node in nodes:
-        hub, port = node.parent or node.name, port_of(node.name) or "-"
-        remarks = "".join(f", {remark}" for remark in _remarks(node) if "replug" not in remark)
-        lines.append(
-            f"{hub:10} {port:<4} {node.role or '-':11} {node.state.value:8} {node.replugs:<7} {node.usb_id or '-':9} "
-            f"{node.tty or '-':9} {node.title or '-'}{remarks}"
-        )
-    return lines
+        remarks = [remark for remark in _remarks(node) if "replug" not in remark]
+        cells = (node.role, node.state.value, str(node.replugs), node.usb_id, node.tty, node.title)
+        *others, title = (cell or "-" for cell in cells)
+        place = node.parent or node.name, str(port_of(node.name) or "-")
+        found.append((*place, *others, ", ".join((title, *remarks))))
+    return found

@@ -7,7 +7,7 @@ import typer
 from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruck_runtime.errors import InputError, NoAnswerError
 from monstertruckd.tools.cli.connection import not_ready, require_section, with_robot
-from monstertruckd.tools.cli.explore import seconds_of
+from monstertruckd.tools.cli.model_options import seconds_of
 from monstertruckd.tools.cli.options import EndpointOption, RobotOption
 from monstertruckd.tools.cli.output import JsonOption, command_group, print_json, print_table, remark
 

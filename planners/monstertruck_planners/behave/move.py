@@ -54,7 +54,7 @@ class MoveConfig(BehaviourConfig):
     angle: float | None = None
     """Turn, rad, counter-clockwise positive; null: given by the length"""
     bearing: Annotated[float, Field(ge=-math.tau, le=math.tau)] = 0.0
-    """Direction of travel in base, rad: 0 = ahead, 1.5708 = sideways to the left"""
+    """Direction of travel in base, rad: 0 = ahead, a quarter turn = sideways to the left"""
     profile: Literal["trapezoid", "cubic", "ramp"] = "trapezoid"
     """Constant acceleration; cubic ramps over time; or cubic ramps from the current speed"""
     speed: Annotated[float, Field(gt=0, le=5)] = 0.15

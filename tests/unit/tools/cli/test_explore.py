@@ -16,7 +16,7 @@ from monstertruck_schemas.req import ExploreOrder
 from monstertruck_schemas.roles import ServiceName
 from monstertruck_schemas.state import GateMode, GateState
 from monstertruck_schemas.topics import EVENT, EXPLORE, GATE
-from monstertruckd.tools.cli.explore import seconds_of
+from monstertruckd.tools.cli.model_options import seconds_of
 from monstertruckd.tools.cli.runs import progress_line, run_exploration
 
 

@@ -37,7 +37,7 @@ def test_what_is_no_move_is_refused_at_once(options, said):
         (["--length", "-0.5"], {"length": -0.5}),
         (["--length", "1", "--bearing", "90"], {"length": 1.0, "bearing": pytest.approx(math.pi / 2)}),
         (
-            ["--radius", "0", "--angle", "-1.5rad", "--speed", "0.3", "--profile", "ramp"],
+            ["--radius", "0", "--angle", "-1.5rad", "--turn-rate", "0.3", "--profile", "ramp"],
             {"radius": 0.0, "angle": -1.5, "turn_rate": 0.3, "profile": "ramp"},
         ),
         (

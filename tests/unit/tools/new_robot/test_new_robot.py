@@ -159,8 +159,8 @@ def test_the_command_takes_every_answer_as_an_option(tmp_path: Path):
     ("words", "complaint"),
     [
         ([], "missing --body, --wheelbase, --track"),
-        ([*options(ANT), "--drive", "hamster"], "drive: Input should be 'vesc', 'arduino_bridge'"),
-        ([*options(ANT), "--speed", "fast"], "speed: Input should be a valid number"),
+        ([*options(ANT), "--drive", "hamster"], "--drive: expected 'vesc', 'arduino_bridge'"),
+        ([*options(ANT), "--speed", "fast"], "--speed: expected a number"),
         ([*options(ANT), "--lidar", "sick"], "lidar sick: expected none or one of hokuyo_urg"),
         ([*options(ANT), "--lidar", "rplidar:c9"], "lidar rplidar:c9: model: Input should be 'a1', 'a2'"),
         ([*options(ANT), "--lidar", "hokuyo_urg:04"], "lidar hokuyo_urg:04: hokuyo_urg has one model"),
