@@ -13,7 +13,7 @@ other's walls. A single match of this kind proves nothing, so it needs supportin
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numba import njit
@@ -24,37 +24,23 @@ from monstertruck_estimation.slam.correlation import Submap, correlate, look_ups
 from monstertruck_estimation.slam.graph import optimise, residuals, robust_weights
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.registration import measure, register
-from monstertruck_estimation.slam.scan_matcher import degeneracy, deviations
+from monstertruck_estimation.slam.scan_matcher import LIKELY, degeneracy, deviations
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between, compose, inverse, rotation, transform
 
 VIEW: Final = 2.5
 """Distance within which two keyframes see enough of the same surroundings, m."""
-WINDOW: Final = 3.0
-"""Half width of a search in standard deviations of the drift."""
-MARGIN: Final = (0.3, 0.05)
-"""Added to the half width, m and rad."""
-MAX_WINDOW: Final = (12.0, 1.0)
-"""Half width of a search at most, m and rad."""
-SMALL_WINDOW: Final = (1.5, 0.3)
-"""Matches in windows up to this need no support, m and rad."""
 QUERY_KEYS: Final = 12
 """Keyframes of the query at most."""
-MIN_OVERLAP: Final = 0.55
-"""Share of the query's points that must fit."""
 CONTRADICTION: Final = 0.15
 """Maximum share of points that scans of the other side look through; above it a match is wrong."""
 PART_CONTRADICTION: Final = 0.05
 """Partial match: share of the points that may be looked through."""
-FLOOR: Final = (0.03, 0.03, 0.01)
-"""Standard deviation of a closure, m and rad: its submaps are not rigid."""
 MIN_SUPPORT: Final = 3
 """Matches that must agree before one of a wide search is accepted, and as many more for each that contradicts."""
 BASELINE: Final = 1.0
 """Minimum length of the trajectory between the first and the last of these, m."""
-MOST_WAITING: Final = 20
-"""Keyframes that wait for their search, at most."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +51,8 @@ class LoopMatch:
     target: int
     measured: Array
     information: Array
+    spread: tuple[float, float]
+    """Variances of position and yaw that the submaps add (m^2, rad^2)."""
     made: int
     """Number of the latest keyframe when it was found."""
 
@@ -89,8 +77,8 @@ class LoopCloser:
         return self._progress is not None
 
     def watch(self, at: int) -> None:
-        """Queue a search from keyframe ``at``; beyond ``MOST_WAITING`` the oldest are dropped."""
-        self._waiting = [*self._waiting, at][-MOST_WAITING:]
+        """Queue a search from keyframe ``at``; beyond 20 waiting ones the oldest are dropped."""
+        self._waiting = [*self._waiting, at][-20:]
 
     def step(self, keyframes: KeyframeMap, budget: ScanBudget) -> bool:
         """Continue the searches; True if a closure has moved the poses."""
@@ -117,12 +105,12 @@ class LoopCloser:
         for candidate in self._candidates(keyframes, at, covariances, far):
             self._tried[candidate] = at
             window = _window(covariances[candidate])
-            hit = yield from self._search(keyframes, query, own, at, candidate, window)
+            min_overlap = 0.55  # share of the query's points that must fit
+            hit = yield from self._search(keyframes, query, own, at, candidate, window, least=min_overlap)
             if hit is None:
                 continue
-            sure = window[0] <= SMALL_WINDOW[0] and window[1] <= SMALL_WINDOW[1]
             yield Work.EDGE_OPTIMISED * len(keyframes.edges)
-            if self._accepted(keyframes, hit, sure=sure):
+            if self._accepted(keyframes, hit, sure=_is_small(window)):
                 return True
         return False
 
@@ -138,7 +126,8 @@ class LoopCloser:
         candidate = int(numbers[np.argmin(_distance(keyframes, at)[numbers])])
         own, query = surroundings(keyframes, at)
         join_overlap = 0.75  # share of the points that must fit, of a submap that is searched for in the whole map
-        hit = yield from self._search(keyframes, query, own, at, candidate, MARGIN, least=join_overlap)
+        window = _window(np.zeros((3, 3)))
+        hit = yield from self._search(keyframes, query, own, at, candidate, window, least=join_overlap)
         if hit is None:
             return None
         yield Work.EDGE_OPTIMISED * len(keyframes.edges)
@@ -188,15 +177,18 @@ class LoopCloser:
         numbers = self._possible(keyframes, at, covariances, far)
         if not len(numbers):
             return None
-        place, turn = _window(covariances[numbers[0]])
-        if place > SMALL_WINDOW[0] or turn > SMALL_WINDOW[1]:
+        window = _window(covariances[numbers[0]])
+        if not _is_small(window):
             return None
+        place, turn = window
         own, query = surroundings(keyframes, at)
         # Partial match: added to the half width of the search, m and rad, as scans drift beyond their covariance.
         part_wider = (1.0, 2.0)
+        windows = [(place * wider, turn * wider) for wider in part_wider]
+        # 0.7: share of the points in view of the place that must fit
         tries = (
-            finished(self._search(keyframes, query, own, at, int(numbers[0]), (place * wider, turn * wider), part=True))
-            for wider in part_wider
+            finished(self._search(keyframes, query, own, at, int(numbers[0]), window, part=True, least=0.7))
+            for window in windows
         )
         return next((hit for hit in tries if hit is not None), None)
 
@@ -219,7 +211,7 @@ class LoopCloser:
         """Keyframes before ``at`` that may be near it within the drift, the likeliest first."""
         off = between(keyframes.poses[at], keyframes.poses)
         distance = np.hypot(off[:, 0], off[:, 1])
-        reach = np.minimum(WINDOW * np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]), MAX_WINDOW[0])
+        reach = _limited(LIKELY * np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1]))[0]
         possible = np.isfinite(far) & (far > keyframes.config.local_spread**2) & (distance < VIEW + reach)
         possible[at:] = False
         for place in self._tried:
@@ -237,12 +229,15 @@ class LoopCloser:
         candidate: int,
         window: tuple[float, float],
         *,
+        least: float,
         part: bool = False,
-        least: float = MIN_OVERLAP,
     ) -> Pieces[LoopMatch | None]:
-        """Match ``query``, the surroundings of keyframe ``at``, or a part of it, to those of ``candidate``."""
+        """Match ``query``, the surroundings of keyframe ``at``, or a part of it, to those of ``candidate``.
+
+        At least a share ``least`` of the points must fit.
+        """
         self.searches += 1
-        window = min(window[0], MAX_WINDOW[0]), min(window[1], MAX_WINDOW[1])
+        window = _limited(*window)
         # The whole window, not only around the candidate: a similar place must not win for lack of rivals.
         numbers = keyframes.well_known(candidate)
         # Without the query's own neighbours: a match to them closes no loop.
@@ -257,7 +252,7 @@ class LoopCloser:
         levels = 7  # levels of the correlation pyramid
         yield submap.grid_cost(levels)
         grid = submap.grid(levels)
-        deviation = max(window[0] / WINDOW, 0.1), max(window[1] / WINDOW, 0.02)
+        deviation = max(window[0] / LIKELY, 0.1), max(window[1] / LIKELY, 0.02)
         guess = keyframes.poses[at]
         min_score = 0.45  # least mean likelihood of a match
         part_score = 0.1  # partial match (only a part of the surroundings was seen before): least mean likelihood
@@ -282,7 +277,7 @@ class LoopCloser:
         off = keyframes.poses[numbers, :2] - fit.pose[:2]
         near = numbers[np.argsort(np.hypot(off[:, 0], off[:, 1]), kind="stable")][:QUERY_KEYS]
         overlap = _overlap_in_view(keyframes, near, query, submap, fit.pose) if part else fit.overlap
-        if overlap < (0.7 if part else least):  # partial match: share of the points in view of the place that must fit
+        if overlap < least:
             return None
         if _contradiction(keyframes, own, at, near, fit.pose) > (PART_CONTRADICTION if part else CONTRADICTION):
             return None
@@ -290,9 +285,10 @@ class LoopCloser:
         # The information is about x, y in map; the relation is in the frame of its origin.
         turn = np.eye(3)
         turn[:2, :2] = rotation(keyframes.poses[origin, 2])
-        covariance = np.linalg.inv(turn.T @ fit.information @ turn + np.eye(3)) + np.diag(np.square(FLOOR))
+        spread = 0.03**2, 0.01**2  # least variances of a closure, m^2 and rad^2: its submaps are not rigid
+        covariance = np.linalg.inv(turn.T @ fit.information @ turn + np.eye(3)) + np.diag((*spread[:1] * 2, spread[1]))
         measured = between(keyframes.poses[origin], fit.pose)
-        return LoopMatch(origin, at, measured, np.linalg.inv(covariance), len(keyframes) - 1)
+        return LoopMatch(origin, at, measured, np.linalg.inv(covariance), spread, len(keyframes) - 1)
 
     def _accepted(self, keyframes: KeyframeMap, hit: LoopMatch, *, sure: bool, baseline: float = BASELINE) -> bool:
         """Add ``hit`` and the matches that agree with it to the graph if they are enough and the graph accepts them."""
@@ -315,8 +311,7 @@ class LoopCloser:
         _, squares = residuals(before, edges)
         held = robust_weights(squares, edges.loop) > 0.5
         for hit in hits:
-            spread = (FLOOR[0] ** 2, FLOOR[2] ** 2)
-            keyframes.edges.add(hit.origin, hit.target, hit.measured, hit.information, spread, loop=True)
+            keyframes.edges.add(hit.origin, hit.target, hit.measured, hit.information, hit.spread, loop=True)
         edges = keyframes.edges.edges()
         poses = optimise(before, edges)
         _, squares = residuals(poses, edges)
@@ -378,7 +373,17 @@ def consistent_group(keyframes: KeyframeMap, hits: list[LoopMatch]) -> list[Loop
 def _window(covariance: Array) -> tuple[float, float]:
     """Half widths of the search, m and rad, for this drift."""
     place, turn = deviations(covariance)
-    return WINDOW * place + MARGIN[0], WINDOW * turn + MARGIN[1]
+    return LIKELY * place + 0.3, LIKELY * turn + 0.05
+
+
+def _limited(place: Any, turn: Any = 0.0) -> tuple[Any, Any]:
+    """Half widths of a search, m and rad, limited to what is searched."""
+    return np.minimum(place, 12.0), np.minimum(turn, 1.0)
+
+
+def _is_small(window: tuple[float, float]) -> bool:
+    """Whether matches in a window, m and rad, need no support."""
+    return window[0] <= 1.5 and window[1] <= 0.3
 
 
 def _contradiction(
@@ -469,10 +474,6 @@ def _way(keyframes: KeyframeMap, hits: list[LoopMatch]) -> float:
     return float(np.hypot(steps[:, 0], steps[:, 1]).sum())
 
 
-VIEW_SECTORS: Final = 180
-"""Sectors of a scan's view all round."""
-
-
 def contradiction(one: list[Scan], poses: Array, others: list[Scan], other_poses: Array) -> float:
     """Share of the points in view of the opposite scans, 0..1, that those looked through; 0 if none is in view.
 
@@ -514,20 +515,21 @@ def in_view(viewers: list[Scan], poses: Array, points: Array) -> NDArray[np.bool
 
 
 @njit(cache=True)
-def _sector(x, y):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
-    return int((math.atan2(y, x) + math.pi) / (2 * math.pi) * VIEW_SECTORS) % VIEW_SECTORS
+def _sector(x, y, sectors):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
+    return int((math.atan2(y, x) + math.pi) / (2 * math.pi) * sectors) % sectors
 
 
 @njit(cache=True)
 def _view(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     """Return the minimum range per sector and its neighbours, m; 0 where any of the three saw nothing."""
-    nearest = np.full(VIEW_SECTORS, np.inf)
+    sectors = 180  # all round
+    nearest = np.full(sectors, np.inf)
     for i in range(points.shape[0]):
-        k = _sector(points[i, 0], points[i, 1])
+        k = _sector(points[i, 0], points[i, 1], sectors)
         nearest[k] = min(nearest[k], math.hypot(points[i, 0], points[i, 1]))
-    view = np.zeros(VIEW_SECTORS)
-    for k in range(VIEW_SECTORS):
-        a, b, c = nearest[k - 1], nearest[k], nearest[(k + 1) % VIEW_SECTORS]
+    view = np.zeros(sectors)
+    for k in range(sectors):
+        a, b, c = nearest[k - 1], nearest[k], nearest[(k + 1) % sectors]
         if math.isfinite(a + b + c):
             view[k] = min(a, b, c)
     return view
@@ -536,7 +538,7 @@ def _view(points):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
 @njit(cache=True)
 def _sight(view, x, y):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN202
     """Return the view of a point: 0 not in view, 1 seen, 2 in view and looked through."""
-    limit = view[_sector(x, y)]
+    limit = view[_sector(x, y, len(view))]
     r = math.hypot(x, y)
     # Minimum distance between a point and the surface seen behind it that proves the point was looked through, m.
     view_margin = 0.25

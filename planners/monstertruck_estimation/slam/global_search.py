@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.budget import Pieces, PiecewiseSearch, ScanBudget, Work
+from monstertruck_estimation.slam.closure import CONTRADICTION
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.correlation import RivalSearch, Submap, correlation, merged
 from monstertruck_estimation.slam.map_evidence import Evidence, EvidenceGrid
@@ -27,17 +28,14 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, between, compose
 from monstertruck_runtime.clock import SECOND
 
-LEVELS: Final = 7
 QUERY_KEYS: Final = 6
 """Number of keyframes in the query: more would include the drift of a search without odometry."""
 MIN_SEARCH_OVERLAP: Final = (0.85, 0.7)
 """Minimum share of the query's points that fit the place found, and a unique place: in a recording from an office right
 places had 0.92 and more, wrong ones 0.84 at most; at the edge of the map unique ones of 0.7 were right."""
-MAX_CONTRADICTION: Final = (0.15, 0.3)
+MAX_CONTRADICTION: Final = (CONTRADICTION, 0.3)
 """Maximum share of beams that contradict the saved grid, for the same two cases: in a recording from an office, right
 places had a median of 0.08, wrong ones 0.45; with beams of 30 m, unique right places of another had 0.27."""
-BASELINE: Final = (0.8, 3.0)
-"""Distance between two fits that makes a place certain (m): if both found it unique, and if not."""
 BROKEN: Final = frozenset({MappingEvent.APART, MappingEvent.PRUNED})
 """Events after which keyframes of the local map have moved or been renumbered: the local map is restarted."""
 
@@ -84,7 +82,7 @@ class GlobalLocaliser:
         """Whether the last search found no place."""
         self.outside = False
         """Whether no search has found a place for 10 s."""
-        submap.grid(LEVELS)  # takes longer than a scan may
+        self._grid = submap.grid(7)  # levels of the whole map; takes longer than a scan may
         low, high = submap.cloud.points.min(axis=0), submap.cloud.points.max(axis=0)
         self._middle = np.array((*((low + high) / 2), 0.0))
         self._half = float((high - low).max() / 2) + 1.0
@@ -128,7 +126,7 @@ class GlobalLocaliser:
         newest = len(self._mapper.map) - 1
         for hypothesis in self._hypotheses:
             key, unique = hypothesis.searches[-1]
-            if not unique or self._ways[newest] - self._ways[key] < BASELINE[0]:
+            if not unique or not self._far_apart(key, newest, unique=True):
                 continue
             numbers, led = self._surroundings(newest), self._led(hypothesis, newest)
             fit = register(self._merged(numbers, newest), self._submap.cloud, led)
@@ -192,7 +190,7 @@ class GlobalLocaliser:
         if len(points) < min_points:
             return None
         anywhere = (1e6, 1e6)
-        grid, window = self._submap.grid(LEVELS), (self._half, math.pi)
+        grid, window = self._grid, (self._half, math.pi)
         unique_ratio = 0.85  # a place is unique if the next best scores less than this share of its score
         ambiguous_ratio = 0.97  # a place is ambiguous if another scores more than this share of its score
         rivals = RivalSearch(1.0, unique_ratio, ambiguous_ratio)  # minimum distance between different places, m
@@ -226,15 +224,19 @@ class GlobalLocaliser:
         return compose(result.pose, between(known.poses[result.key], known.poses[-1]))
 
     def _far_enough(self, hypothesis: Hypothesis) -> tuple[int, bool] | None:
-        """Return the last search as far from the latest one as ``BASELINE`` requires; None without one.
+        """Return the last search far enough from the latest one for certainty; None without one.
 
         The result is its keyframe, and whether both found the place unique.
         """
         newest, unique = hypothesis.searches[-1]
         for key, also in reversed(hypothesis.searches):
-            if self._ways[newest] - self._ways[key] >= BASELINE[0 if unique and also else 1]:
+            if self._far_apart(key, newest, unique=unique and also):
                 return key, unique and also
         return None
+
+    def _far_apart(self, key: int, newest: int, *, unique: bool) -> bool:
+        """Whether two fits are far enough apart to make a place certain that both, or one at most, found unique."""
+        return self._ways[newest] - self._ways[key] >= (0.8 if unique else 3.0)
 
     def _foreseen(self, hypothesis: Hypothesis, since: int, unique: bool) -> bool:
         """Whether everything seen since keyframe ``since`` fits the map, and nothing since the first search refutes it.

@@ -18,15 +18,12 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between, compose, compose_jacobians, inverse, wrap
 from monstertruck_runtime.clock import SECOND
 
-INITIAL_ROWS: Final = 64
-"""Number of rows allocated at first."""
-
 
 class GrowingArray:
     """Rows of one shape, appended in amortised constant time."""
 
     def __init__(self, *shape: int, dtype: type = float) -> None:
-        self._data: NDArray[Any] = np.zeros((INITIAL_ROWS, *shape), dtype)
+        self._data: NDArray[Any] = np.zeros((64, *shape), dtype)
         self._count = 0
 
     def append(self, row: object) -> None:
@@ -38,7 +35,7 @@ class GrowingArray:
 
     def set(self, rows: NDArray[Any]) -> None:
         """Replace all rows."""
-        data = np.zeros((max(INITIAL_ROWS, len(rows)), *self._data.shape[1:]), self._data.dtype)
+        data = np.zeros((max(len(rows), 1), *self._data.shape[1:]), self._data.dtype)
         data[: len(rows)] = rows
         self._data, self._count = data, len(rows)
 
@@ -562,8 +559,7 @@ REFINE_NEIGHBOURS: Final = 2
 REFINE_PARTNERS: Final = 12
 """Maximum number of earlier keyframes that each is paired with."""
 REFINE_REACH: Final = 4.5
-"""Maximum distance of a partner (m); an angle of view is weighted as REFINE_TURN metres per radian."""
-REFINE_TURN: Final = 1.0
+"""Maximum distance of a partner (m); an angle of view counts a metre per radian."""
 REFINE_OVERLAP: Final = 0.4
 
 
@@ -577,7 +573,7 @@ def partners(poses: Array) -> NDArray[np.int64]:
     for k in range(1, len(poses)):
         result += [(j, k) for j in range(max(k - REFINE_NEIGHBOURS, 0), k)]
         off = between(poses[k], poses[: max(k - REFINE_NEIGHBOURS, 0)])
-        cost = np.hypot(off[:, 0], off[:, 1]) + REFINE_TURN * np.abs(off[:, 2])
+        cost = np.hypot(off[:, 0], off[:, 1]) + np.abs(off[:, 2])
         near = np.flatnonzero(cost < REFINE_REACH)
         near = near[np.argsort(cost[near], kind="stable")]
         _, first = np.unique(stretch[near], return_index=True)
@@ -598,7 +594,7 @@ def witnesses(keys: list[Keyframe], poses: Array, part: NDArray[np.int64]) -> ND
     for k in range(1, len(poses)):
         before = np.flatnonzero((stamps[:k] <= stamps[k] - pause) & (part[:k] == part[k]))
         off = between(poses[k], poses[before])
-        near = before[np.hypot(off[:, 0], off[:, 1]) + REFINE_TURN * np.abs(off[:, 2]) < REFINE_REACH]
+        near = before[np.hypot(off[:, 0], off[:, 1]) + np.abs(off[:, 2]) < REFINE_REACH]
         near = near[np.linspace(0, len(near) - 1, min(len(near), REFINE_PARTNERS)).astype(np.intp)]
         others = [int(j) for j in near if (int(j), k) not in used]
         result += [(j, k) for j in others if _share(keys, poses, j, k) > REFINE_OVERLAP]

@@ -13,7 +13,7 @@ from kiss_icp.registration import get_registration
 
 from monstertruck_estimation.slam.correlation import Submap
 from monstertruck_estimation.slam.registration import measure
-from monstertruck_estimation.slam.scan_matcher import MIN_PAIRS, MatchStatus, ScanMatch, gated, rejected
+from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch, enough, gated, rejected
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
 
@@ -80,7 +80,7 @@ class KissMatcher:
 
     def match(self, scan: Scan, delta: Array, guess: Array, covariance: Array, submap: Submap) -> ScanMatch:
         """See ``ScanMatcher``."""
-        if len(scan) < MIN_PAIRS or len(submap.cloud) < MIN_PAIRS:
+        if not (enough(len(scan)) and enough(len(submap.cloud))):
             return rejected(guess, covariance, MatchStatus.EMPTY)
         if submap is not self._submap:
             self._submap = submap

@@ -25,9 +25,6 @@ from monstertruck_estimation.slam.motion import (
 from monstertruck_estimation.slam.mount import LidarCheck
 from monstertruck_estimation.slam.movers import MoverDetector
 from monstertruck_estimation.slam.relocation import (
-    OFF_MOTION,
-    OFF_MOTION_SUSPECT,
-    SUSPECT_CONTRADICTION,
     LossDetector,
     Relocation,
     contradicts,
@@ -36,14 +33,14 @@ from monstertruck_estimation.slam.relocation import (
     prediction_is_certain,
 )
 from monstertruck_estimation.slam.scan_matcher import (
-    GATE_LOW_OVERLAP,
+    LIKELY,
     LOW_OVERLAP,
-    MIN_PAIRS,
     MatchStatus,
     PlanarMatcher,
     ScanMatch,
     ScanMatcher,
     deviations,
+    enough,
     off_guess,
     rejected,
 )
@@ -55,6 +52,8 @@ from monstertruck_kinematics.se2 import Pose2, Twist2, between, compose, compose
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.health import MATCHED, UNCERTAIN_DEVIATION, LocalisationStatus, OdometryUse
 
+SUSPECT_CONTRADICTION: Final = 0.03
+"""Maximum contradiction of scan and map where a similar-looking place is possible."""
 UNKNOWN: Final = np.diag((100.0**2, 100.0**2, math.pi**2))
 """Covariance of a lost robot's pose."""
 
@@ -211,7 +210,7 @@ class Mapper:
             instead = self._matched(still, *motion, 1.0 - len(still) / len(scan))
             guess, covariance = _moved(self._pose, self._covariance, *motion)
             # Of wheels that are wrong, walls seem to move: then the rest fits elsewhere.
-            if fits(instead) and (fits(match) or off_guess(instead.pose, guess, covariance) <= GATE_LOW_OVERLAP):
+            if fits(instead) and (fits(match) or off_guess(instead.pose, guess, covariance) <= LIKELY):
                 return still, motion, instead
         if fits(match) or self._submap is None:
             return scan, motion, match
@@ -240,9 +239,13 @@ class Mapper:
             return match
         most = PART_CONTRADICTION if suspect else CONTRADICTION
         if match.accepted and (off := self._motion.off(between(self._pose, match.pose))):
-            if exceeds(off, OFF_MOTION):
+            # Maximum difference of a match from odometry, or from the last motion, if these may be wrong (m, rad).
+            # Every misfit enlarges the window of the next match, and the window of the last motion is wide: a robot
+            # that was carried fits somewhere in it sooner or later. The last motion corrects wheels that are late.
+            if exceeds(off, (0.5, 1.0)):
                 return rejected(guess, covariance, MatchStatus.FAR)
-            if exceeds(off, OFF_MOTION_SUSPECT[self._loss.doubts(match)]):
+            # Minimum difference of a match that may be at a similar-looking place: for doubtful and usual matches.
+            if exceeds(off, (0.1, 0.1) if self._loss.doubts(match) else (0.25, 0.25)):
                 suspect, most = True, SUSPECT_CONTRADICTION
         if (suspect or after_gap) and contradicts(self.map, scan, match.pose, most):
             return rejected(guess, covariance, MatchStatus.CONTRADICTED)
@@ -290,7 +293,7 @@ class Mapper:
         return self._trajectory.marked(self.map.joined())
 
     def _key_is_due(self, scan: Scan) -> bool:
-        if len(scan) < MIN_PAIRS:
+        if not enough(len(scan)):
             return False
         if not len(self.map):
             return True
@@ -309,7 +312,7 @@ class Mapper:
 
     def _is_elsewhere(self, scan: Scan) -> bool:
         """Whether a lost robot has left the place where its motion since the last fit led it."""
-        if not len(self.map) or len(scan) < MIN_PAIRS or not self._loss.lost:
+        if not len(self.map) or not enough(len(scan)) or not self._loss.lost:
             return False
         alone = self._motion.use is not OdometryUse.USED
         return alone or self._loss.after_gap or contradicts(self.map, scan, self._pose)

@@ -31,8 +31,6 @@ def velocity(delta: Array, dt: float) -> Twist2:
 
 FEWEST_SAMPLES: Final = 2
 """Minimum number of steps of a comparison."""
-SLACK: Final = (0.1, 0.2)
-"""Tolerated difference for an offset of the clocks, and its maximum including crossed motion (m, rad)."""
 CONTRADICTIONS: Final = 2
 """Number of comparisons in a row that must contradict odometry, by their last and by their first scans, before it is
 dropped: one scan with a late stamp contradicts nothing, wherever it lies."""
@@ -43,7 +41,7 @@ class OdometryCheck:
 
     The differences of their motions are summed over some seconds: clocks that disagree shift both a little and change
     no sum. A slow robot is compared over as much motion as a fast one: within seconds alone its error would not exceed
-    ``SLACK``. A contradicted quantity, distances or turns, must agree step by step over 2 m or 2 rad before odometry is
+    a slack. A contradicted quantity, distances or turns, must agree step by step over 2 m or 2 rad before odometry is
     used again: a turn of the wrong sign agrees as long as the robot drives straight. If distances are contradicted,
     turns remain in use while they agree over everything compared, and the reverse.
     """
@@ -111,7 +109,8 @@ class OdometryCheck:
         motion = np.cumsum(lengths, axis=1).max(axis=0)
         # Tolerated difference of the distance per radian (m), and of the turn per metre (rad): levers, unequal wheels.
         crossed = 0.1
-        slack = np.minimum(SLACK[0] + crossed * motion[:, ::-1], SLACK[1])
+        # Tolerated for an offset of the clocks: 0.1, and at most 0.2 including crossed motion (m, rad).
+        slack = np.minimum(0.1 + crossed * motion[:, ::-1], 0.2)
         tolerance = 0.3  # tolerated difference of odometry and scans as a share of the distance, or of the turn
         beyond = (off > tolerance * motion + slack)[FEWEST_SAMPLES - 1 :]
         wrong = sliding_window_view(beyond, CONTRADICTIONS, axis=0).all(axis=-1).any(axis=0)
@@ -353,10 +352,22 @@ class MotionPredictor:
 
 UNCONSTRAINED: Final = np.diag((1e-4, 1e-4, 1e-2))
 """Added to every information: an unconstrained direction has a standard deviation of 100 m, or of 10 rad."""
-OVERLAP_DROP: Final = 0.15
-"""Maximum distance of the overlap below its running mean for a valid match after a rejected one."""
-OVERLAP_GAIN: Final = 0.05
-"""Weight of one match in the running mean of the overlap."""
+
+
+class UsualOverlap:
+    """Running mean of the overlap of good matches."""
+
+    def __init__(self) -> None:
+        self._mean = 0.0
+
+    @property
+    def least(self) -> float:
+        """Overlap below which a match overlaps clearly less than usual; negative before the first match."""
+        return self._mean - 0.15
+
+    def take(self, overlap: float) -> None:
+        """Take the overlap of a good match."""
+        self._mean += (overlap - self._mean) * (0.05 if self._mean else 1.0)
 
 
 class ScanOdometry:
@@ -369,8 +380,7 @@ class ScanOdometry:
 
     def __init__(self) -> None:
         self._last: tuple[int, Array] | None = None
-        self._usual = 0.0
-        """Running mean of the overlap of the matches used; 0 before the first."""
+        self._usual = UsualOverlap()
         self._least = LOW_OVERLAP
 
     def take(
@@ -386,12 +396,12 @@ class ScanOdometry:
             corrected: a loop closure moved the map at this step: the next motion begins at ``pose``.
         """
         if match.information is None or not (alone or match.overlap >= self._least):
-            self._least = max(LOW_OVERLAP, self._usual - OVERLAP_DROP)
+            self._least = max(LOW_OVERLAP, self._usual.least)
             if corrected or not alone:
                 self._last = None
             return None
         self._least = LOW_OVERLAP
-        self._usual += (match.overlap - self._usual) * (OVERLAP_GAIN if self._usual else 1.0)
+        self._usual.take(match.overlap)
         last, self._last = self._last, (stamp, pose.copy() if corrected else match.pose)
         if last is None:
             return None
@@ -435,8 +445,6 @@ def without_weak_direction(match: ScanMatch, guess: Array, covariance: Array) ->
 
 OFFSET_LEAST_SCANS: Final = 120
 """Minimum number of scans."""
-LEAST_EXCITATION: Final = 0.05
-"""Minimum standard deviation of the yaw rate (rad/s)."""
 
 
 class ClockOffsetEstimator:
@@ -478,7 +486,7 @@ def find_offset(stamps: Array, matched: Array, odom: Array) -> float | None:
     inside = (times[:-1] >= margin) & (times[1:] <= times[-1] - margin)
     steps = np.diff(times)[inside]
     turning = np.diff(scan)[inside] / steps if len(steps) else np.zeros(0)
-    if len(turning) < OFFSET_LEAST_SCANS // 2 or turning.std() < LEAST_EXCITATION:
+    if len(turning) < OFFSET_LEAST_SCANS // 2 or _is_steady(turning):
         return None
     likeness = np.array([_correlation(turning, times, wheel, lag, inside) for lag in offset_lags])
     best = int(np.argmax(likeness))
@@ -506,7 +514,11 @@ def _turning(times: Array, wheel: Array, lag: float, inside: NDArray[np.bool_]) 
 
 def _correlation(turning: Array, times: Array, wheel: Array, lag: float, inside: NDArray[np.bool_]) -> float:
     turned = _turning(times, wheel, lag, inside)
-    spread = turned.std()
-    if spread < LEAST_EXCITATION:
+    if _is_steady(turned):
         return 0.0
-    return float(np.mean((turning - turning.mean()) * (turned - turned.mean())) / (turning.std() * spread))
+    return float(np.mean((turning - turning.mean()) * (turned - turned.mean())) / (turning.std() * turned.std()))
+
+
+def _is_steady(rates: Array) -> bool:
+    """Whether yaw rates (rad/s) vary too little to show a shift in time."""
+    return bool(rates.std() < 0.05)

@@ -19,19 +19,15 @@ from numpy.typing import NDArray
 
 from monstertruck_estimation.slam.budget import Pieces, PiecewiseSearch, ScanBudget, Work, finished
 from monstertruck_estimation.slam.closure import CONTRADICTION, VIEW, LoopCloser, contradiction, opposed, surroundings
-from monstertruck_estimation.slam.correlation import Peak, Submap, correlate, look_ups
+from monstertruck_estimation.slam.correlation import PIECE, Peak, Submap, correlate, look_ups
 from monstertruck_estimation.slam.keyframes import Join, KeyframeMap
-from monstertruck_estimation.slam.motion import OVERLAP_DROP, OVERLAP_GAIN
-from monstertruck_estimation.slam.scan_matcher import GATE_LOW_OVERLAP, LOW_OVERLAP, ScanMatch, deviations, off_guess
+from monstertruck_estimation.slam.motion import UsualOverlap
+from monstertruck_estimation.slam.scan_matcher import LIKELY, LOW_OVERLAP, ScanMatch, deviations, off_guess
 from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import between, compose
 from monstertruck_runtime.clock import SECOND
 
-LOST_PATH: Final = 7.0
-"""Distance travelled until the robot is lost, by wheels that agree with sparse scans, as a multiple of the distance
-between keyframes. Three scans so far apart, or a turn among people, may show the same crowd. By default it is 2.1 m,
-less than ``VIEW``: a submap that begins there still shares surroundings with the last keyframe."""
 PERIOD_GAIN: Final = 0.1
 """Weight of one period in the usual period."""
 
@@ -39,7 +35,7 @@ PERIOD_GAIN: Final = 0.1
 class LossDetector:
     """Detect that scans no longer fit the map.
 
-    After a misfit or a gap the overlap must return to its mean less ``OVERLAP_DROP``, and after a gap the match must
+    After a misfit or a gap the overlap must return to nearly its mean, and after a gap the match must
     constrain all directions: a partial fit, or one wall, is found in many places. The mapper judges whether the match
     looks through walls of the map, and whether the motion led there: rooms of one shape overlap wherever they are.
     """
@@ -49,7 +45,7 @@ class LossDetector:
         self.fitted = 0
         """Stamp of the last scan that fitted (ns)."""
         self._period = 0.0
-        self._usual = 0.0
+        self._usual = UsualOverlap()
         self._misfits = 0
         self._spacing, self._path = 0.0, 0.0
         self.after_gap = False
@@ -62,16 +58,16 @@ class LossDetector:
 
     def doubts(self, match: ScanMatch) -> bool:
         """Whether a match follows a misfit, or overlaps clearly less than usual."""
-        return not self.fits or match.overlap < self._usual - OVERLAP_DROP
+        return not self.fits or match.overlap < self._usual.least
 
     def suspects(self, match: ScanMatch, guess: Array, covariance: Array) -> bool:
         """Whether an accepted ``match`` overlaps clearly less than usual, and is far from the predicted pose.
 
         Such a match is at a place that only looks similar. ``guess``, shape (3,), has ``covariance``, shape (3, 3).
         """
-        if not match.accepted or match.overlap >= self._usual - OVERLAP_DROP:
+        if not match.accepted or match.overlap >= self._usual.least:
             return False
-        return off_guess(match.pose, guess, covariance) > GATE_LOW_OVERLAP
+        return off_guess(match.pose, guess, covariance) > LIKELY
 
     @property
     def sparse(self) -> bool:
@@ -82,7 +78,12 @@ class LossDetector:
     def lost(self) -> bool:
         """Whether scans have not fitted for 1.5 s."""
         since = (self._stamp or 0) - self.fitted
-        far = not self.sparse or self.after_gap or self._path >= LOST_PATH
+        # Distance travelled until the robot is lost, by wheels that agree with sparse scans, as a multiple of the
+        # distance between keyframes. Three scans so far apart, or a turn among people, may show the same crowd. By
+        # default it is 2.1 m, less than ``VIEW``: a submap that begins there still shares surroundings with the last
+        # keyframe.
+        lost_path = 7.0
+        far = not self.sparse or self.after_gap or self._path >= lost_path
         lost_after = 1.5  # maximum duration of misfits (s); then the robot is lost
         lost_scans = 3  # maximum number of misfits; then the robot is lost
         return self._misfits >= lost_scans and since >= lost_after * SECOND and far
@@ -116,13 +117,13 @@ class LossDetector:
         if self.misfits(match):
             self._misfits += 1
             return
-        self._usual += (match.overlap - self._usual) * (OVERLAP_GAIN if self._usual else 1.0)
+        self._usual.take(match.overlap)
         self.restart()
 
     def misfits(self, match: ScanMatch) -> bool:
         """Whether ``match`` overlaps too little; after a misfit or a gap, clearly less than usual."""
         doubt = self._misfits or self.after_gap
-        least = max(LOW_OVERLAP, self._usual - OVERLAP_DROP) if doubt else LOW_OVERLAP
+        least = max(LOW_OVERLAP, self._usual.least) if doubt else LOW_OVERLAP
         return not match.accepted or match.overlap < least or (self.after_gap and match.degenerate)
 
     def restart(self) -> None:
@@ -130,17 +131,18 @@ class LossDetector:
         self._misfits, self.after_gap, self.fitted, self._path = 0, False, self._stamp or 0, 0.0
 
 
-CERTAIN_PREDICTION: Final = (0.5, 0.5)
-"""Maximum standard deviation of the predicted pose (m, rad) for accepting a match near it after a gap."""
-
-
 def prediction_is_certain(covariance: Array) -> bool:
     """Whether the ``covariance``, (3, 3), of a predicted pose is small enough to rule out any other place.
 
     A match in a wider window is one place that fits; there may be others.
     """
+    return all(_certain(covariance))
+
+
+def _certain(covariance: Array) -> tuple[bool, bool]:
+    """Whether position and yaw of a predicted pose are certain enough for a match near it after a gap."""
     place, turn = deviations(covariance)
-    return place <= CERTAIN_PREDICTION[0] and turn <= CERTAIN_PREDICTION[1]
+    return place <= 0.5, turn <= 0.5  # m, rad
 
 
 def led_there(match: ScanMatch, guess: Array, covariance: Array) -> bool:
@@ -150,21 +152,9 @@ def led_there(match: ScanMatch, guess: Array, covariance: Array) -> bool:
     """
     # Maximum Mahalanobis distance from the predicted pose of a match where the wheels led. Half of the right matches
     # are that near (chi-square of three degrees of freedom: 48 %), and one in fifteen of the wrong ones, which are
-    # spread over the matcher's ``WINDOW`` of three standard deviations on each axis (a ball in a cube).
+    # spread over the matcher's window of three standard deviations on each axis (a ball in a cube).
     led = 1.5
-    return off_guess(match.pose, guess, covariance) <= led and deviations(covariance)[0] <= CERTAIN_PREDICTION[0]
-
-
-OFF_MOTION: Final = (0.5, 1.0)
-"""Maximum difference of a match from odometry, or from the last motion, if these may be wrong (m, rad).
-
-Every misfit enlarges the window of the next match, and the window of the last motion is wide: a robot that was carried
-fits somewhere in it sooner or later. The last motion corrects wheels that are late.
-"""
-OFF_MOTION_SUSPECT: Final = ((0.25, 0.25), (0.1, 0.1))
-"""Minimum difference of a match that may be at a similar-looking place: for usual matches, and for doubtful ones."""
-SUSPECT_CONTRADICTION: Final = 0.03
-"""Maximum contradiction of scan and map for such a match."""
+    return off_guess(match.pose, guess, covariance) <= led and _certain(covariance)[0]
 
 
 def exceeds(off: tuple[float, float], limits: tuple[float, float]) -> bool:
@@ -189,18 +179,10 @@ def contradicts(keyframes: KeyframeMap, scan: Scan, pose: Array, most: float = C
     return contradiction([scan], pose[None], scans, keyframes.poses[near]) > most
 
 
-POINTS: Final = 160
-"""Maximum number of points of the surroundings in a search."""
-SLICE: Final = 2e6
-"""Number of look-ups of the first level in one slice of the search."""
 MAX_RIVAL: Final = 0.9
 """A place is ambiguous if a second one scores more than this share of its score."""
 APART: Final = (1.0, 0.5)
 """Minimum difference of two distinct places (m, rad)."""
-
-
-CONFIRMING_WAY: Final = 10.0
-"""Distance near keyframes of the other side (m) after which a join without contradiction is confirmed."""
 
 
 class JoinChange(StrEnum):
@@ -259,7 +241,9 @@ class Relocation:
             own, others = keyframes.sides(join)
             if (yield from opposed(keyframes, own, others)):
                 return join
-            if _way_along(keyframes, own[own >= join.since], others) >= CONFIRMING_WAY:
+            # Distance near keyframes of the other side (m) after which a join without contradiction is confirmed.
+            confirming = 10.0
+            if _way_along(keyframes, own[own >= join.since], others) >= confirming:
                 keyframes.doubtful.remove(join)
         return (yield from self._joined(keyframes, closer, at))
 
@@ -305,15 +289,15 @@ class Relocation:
         low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
         middle, half = (low + high) / 2, float((high - low).max() / 2) + 1.0
         _, query = surroundings(keyframes, at)
-        points = query.points[np.linspace(0, len(query) - 1, min(len(query), POINTS)).astype(np.intp)]
+        points = query.points[np.linspace(0, len(query) - 1, min(len(query), 160)).astype(np.intp)]
         fewest_slices = 4  # minimum number of slices of a search
-        slices = max(math.ceil(look_ups(points, (half, math.pi), levels) / SLICE), fewest_slices)
+        slices = max(math.ceil(look_ups(points, (half, math.pi), levels) / PIECE), fewest_slices)
         peaks: list[Peak] = []
         work = 15_000  # maximum number of blocks evaluated below the first level in one slice
         anywhere = (1e6, 1e6)  # standard deviation of the predicted pose, m and rad: it is unknown
         min_score = 0.5  # minimum mean likelihood of a place found
         for k in range(slices):
-            yield SLICE + work * len(points)
+            yield PIECE + work * len(points)
             guess = np.array((*middle, (k + 0.5) * math.tau / slices))
             least = max(min_score, MAX_RIVAL * max((peak.score for peak in peaks), default=0.0))
             peak = correlate(grid, points, guess, (half, math.pi / slices), anywhere, least, work=work)

@@ -13,16 +13,9 @@ from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
 from monstertruck_schemas.base import position_deviation
 
-MIN_PAIRS: Final = 12
-"""Minimum number of corresponding pairs of an accepted match."""
-MIN_OVERLAP: Final = 0.35
-"""Minimum share of a scan's points that fit the submap in an accepted match."""
-WINDOW: Final = 3.0
-"""Half width of the correlative search in standard deviations of the predicted pose."""
-GATE: Final = 6.0
-"""Gate: a match further from the predicted pose than this many standard deviations (Mahalanobis) is rejected."""
-GATE_LOW_OVERLAP: Final = 3.0
-"""The gate for matches that overlap less than ``LOW_OVERLAP``."""
+LIKELY: Final = 3.0
+"""Standard deviations within which a predicted pose is likely: half width of a search around it, and the gate of
+matches that overlap less than ``LOW_OVERLAP`` (Mahalanobis)."""
 LOW_OVERLAP: Final = 0.6
 """Matches that overlap less are compared with a result of the wide search."""
 
@@ -108,7 +101,7 @@ class PlanarMatcher:
         # lidar would outweigh all walls.
         spacing = 0.04
         scan = scan.averaged(spacing)
-        if len(scan) < MIN_PAIRS or len(submap.cloud) < MIN_PAIRS:
+        if not (enough(len(scan)) and enough(len(submap.cloud))):
             return rejected(guess, covariance, MatchStatus.EMPTY)
         match = self._match_in_window(scan, guess, covariance, submap)
         if match.accepted and match.overlap >= LOW_OVERLAP:
@@ -125,7 +118,7 @@ class PlanarMatcher:
         deviation = deviations(covariance)
         margin = 0.15  # added to it, m: stamps of odometry and scans disagree
         max_window = (2.0, 1.6)  # maximum half width of the search, m and rad
-        window = min(WINDOW * deviation[0] + margin, max_window[0]), min(WINDOW * deviation[1], max_window[1])
+        window = min(LIKELY * deviation[0] + margin, max_window[0]), min(LIKELY * deviation[1], max_window[1])
         prior: Array = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         coarse_points = 160  # points of a scan used in the correlative search
         points = scan.points[np.linspace(0, len(scan) - 1, min(len(scan), coarse_points)).astype(np.intp)]
@@ -144,16 +137,22 @@ def gated(fit: Fit, guess: Array, covariance: Array) -> ScanMatch:
     """Accept or reject a fit with predicted pose ``guess`` and its ``covariance``, shape (3, 3)."""
     ratio, direction = degeneracy(fit.information)
     verdict = MatchStatus.ACCEPTED
-    if fit.pairs < MIN_PAIRS:
+    gate = 6.0 if fit.overlap >= LOW_OVERLAP else LIKELY  # maximum Mahalanobis distance from the predicted pose
+    if not enough(fit.pairs):
         verdict = MatchStatus.EMPTY
-    elif fit.overlap < MIN_OVERLAP:
+    elif fit.overlap < 0.35:  # minimum share of a scan's points that fit the submap
         verdict = MatchStatus.OVERLAP
-    elif off_guess(fit.pose, guess, covariance) > (GATE if fit.overlap >= LOW_OVERLAP else GATE_LOW_OVERLAP):
+    elif off_guess(fit.pose, guess, covariance) > gate:
         verdict = MatchStatus.FAR
     posterior = np.linalg.inv(fit.information + np.linalg.inv(covariance))
     if verdict is not MatchStatus.ACCEPTED:
         return ScanMatch(guess, covariance, fit.overlap, fit.residual, ratio, direction, verdict)
     return ScanMatch(fit.pose, posterior, fit.overlap, fit.residual, ratio, direction, verdict, fit.information)
+
+
+def enough(pairs: int) -> bool:
+    """Whether so many corresponding pairs may determine a pose."""
+    return pairs >= 12
 
 
 def off_guess(pose: Array, guess: Array, covariance: Array) -> float:

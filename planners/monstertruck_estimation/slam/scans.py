@@ -21,8 +21,6 @@ RANGE_NOISE: Final = 0.012
 """Least standard deviation of a range close by, m (URG-04LX and SICK LMS200 manuals: 10 to 15 mm)."""
 RELATIVE_NOISE: Final = 0.005
 """Increase per metre of range (beam width, URG-04LX: 1 % of the range as limits)."""
-REACH: Final = 0.2
-"""Neighbours up to this far away along the surface make its normal, m; the next on either side does anyway."""
 SLIDE: Final = 5.0
 """Standard deviation along a line, m: unconstrained."""
 
@@ -232,7 +230,7 @@ def _surface(points, origins, joined, reach, increment, near, i, normals, varian
     """Normal and variances of point ``i`` from its neighbours in beam order."""
     noise = near + RELATIVE_NOISE * reach[i]
     spacing = reach[i] * increment
-    window = max(REACH, 2.5 * spacing)
+    window = max(0.2, 2.5 * spacing)
     sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0
     count = 1
     px, py = points[i, 0], points[i, 1]

@@ -83,7 +83,7 @@ def line_of_keys(count=40):
 def found(keyframes, target, off):
     """Keyframe ``target`` found beside the first one, ``off`` metres to the left of where the graph has it."""
     place = between(keyframes.poses[0], compose(np.array((0.0, off, 0.0)), keyframes.poses[target]))
-    return LoopMatch(0, target, place, np.diag((1e3, 1e3, 1e4)), target)
+    return LoopMatch(0, target, place, np.diag((1e3, 1e3, 1e4)), (0.0009, 0.0001), target)
 
 
 def test_hits_that_agree_are_believed_if_they_are_enough_and_far_enough_apart():

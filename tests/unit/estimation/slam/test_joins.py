@@ -11,7 +11,7 @@ from monstertruck_estimation.slam.closure import LoopCloser
 from monstertruck_estimation.slam.config import GridConfig, MapperConfig
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.mapping import Mapper, MappingEstimator, MappingEvent
-from monstertruck_estimation.slam.relocation import CONFIRMING_WAY, JoinChange, Relocation
+from monstertruck_estimation.slam.relocation import JoinChange, Relocation
 from monstertruck_estimation.slam.scans import prepare_input
 from monstertruck_estimation.slam.worker_io import ScanInput
 from monstertruck_kinematics.se2 import between, compose, transform
@@ -141,7 +141,7 @@ def test_a_right_join_is_confirmed_after_some_way_and_not_before():
         assert relocation.step(keyframes, closer, ScanBudget(1e12)) is None
         way = np.hypot(*np.diff(keyframes.poses[29:, :2], axis=0).T).sum()
         doubts.append((way, bool(keyframes.doubtful)))
-    assert all(doubt == (way < CONFIRMING_WAY) for way, doubt in doubts)
+    assert all(doubt == (way < 10.0) for way, doubt in doubts)
     assert not doubts[-1][1]
     assert not keyframes.part.any()
 

@@ -11,7 +11,7 @@ from monstertruck_estimation.slam.closure import LoopCloser, opposed
 from monstertruck_estimation.slam.config import MapperConfig
 from monstertruck_estimation.slam.keyframes import KeyframeMap
 from monstertruck_estimation.slam.mapping import UNKNOWN, Mapper, MappingEvent
-from monstertruck_estimation.slam.relocation import LOST_PATH, LossDetector, Relocation, contradicts, led_there
+from monstertruck_estimation.slam.relocation import LossDetector, Relocation, contradicts, led_there
 from monstertruck_estimation.slam.scan_matcher import MatchStatus, ScanMatch, rejected
 from monstertruck_estimation.slam.storage import saved_graph
 from monstertruck_kinematics.se2 import between, compose
@@ -240,7 +240,7 @@ def test_sparse_scans_that_do_not_fit_are_judged_along_the_path():
     for k in range(40):
         loss.arrive(2 * (k + 1) * SECOND)
         loss.take(fit(0.95) if k < 30 else NONE, (0.5, 1.6))
-        assert loss.lost is (k >= 30 and 0.5 * (k - 29) >= LOST_PATH)
+        assert loss.lost is (k >= 30 and 0.5 * (k - 29) >= 7.0)
     for _ in range(5):
         loss.take(NONE, (0.5, 1.6))
     assert loss.lost
