@@ -11,7 +11,7 @@ import numpy as np
 from monstertruck_drivers.ax12.emulator import Ax12Bus, TrueJoints, really
 from monstertruck_drivers.emulation import Horn
 from monstertruck_drivers.srf08.emulator import SOUND
-from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, mirrored
+from monstertruck_kinematics.polynomials import SteeringPolynomials, mirrored
 from monstertruck_runtime.clock import SECOND, Clock, VirtualClock, run_virtual
 from monstertruck_runtime.errors import NoAnswerError
 from monstertruck_runtime.mailbox import Delivery, Mailbox
@@ -315,7 +315,10 @@ def hidden(
 
 def _linkage(sign: int, rng: np.random.Generator) -> dict[str, Any]:
     """Linkage of an axle whose higher powers are off by up to 100 %."""
-    left, right = ([*(k * rng.uniform(0.0, 2.0) for k in c[:4]), *c[4:]] for c in (F_CORRECTED, G_PRINTED))
+    left, right = (
+        [*(k * rng.uniform(0.0, 2.0) for k in c[:4]), *c[4:]]
+        for c in (SteeringPolynomials().front.left_from_servo, SteeringPolynomials().front.right_from_left)
+    )
     pair = (left, right) if sign > 0 else (mirrored(tuple(left)), mirrored(tuple(right)))
     return dict(zip(("left_from_servo", "right_from_left"), pair, strict=True))
 

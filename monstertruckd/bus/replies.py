@@ -21,8 +21,6 @@ import zenoh
 from monstertruck_schemas.topics import owner_of
 from monstertruckd.bus.access import ANONYMOUS
 
-REPLY_QUEUE: Final = 4096
-"""Maximum number of queries that wait for their reply; the next is taken when one has left."""
 log = logging.getLogger(__name__)
 
 THREADS: Final = 8
@@ -39,14 +37,14 @@ class Replies:
         self._orders = ThreadPoolExecutor(THREADS, "order-replies")
         self._others = ThreadPoolExecutor(THREADS, "replies")
         self._change = threading.Condition()
-        self._waiting = 0
+        self._waiting, self._most = 0, 4096  # queries that wait for their reply; the next is taken when one has left
         self._queues: dict[tuple[str, bool], deque[tuple[zenoh.Query, Reply | None]]] = {}
         """Waiting replies by owner, orders separate; the first of each is under way."""
 
     def wait_for_room(self) -> None:
         """Wait until there is room for one more reply; not for the event loop."""
         with self._change:
-            self._change.wait_for(lambda: self._waiting < REPLY_QUEUE)
+            self._change.wait_for(lambda: self._waiting < self._most)
 
     def end(
         self, query: zenoh.Query, reply: Reply | None = None, source: str | None = None, *, order: bool = False

@@ -18,7 +18,6 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
-from ruamel.yaml.composer import MaxDepthExceededError
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
@@ -30,7 +29,7 @@ from monstertruck_runtime.map_folders import YAML as MAP_YAML
 from monstertruck_runtime.outside import reading
 from monstertruck_runtime.plugins import models_in
 from monstertruck_runtime.small_files import make_folder, replace_file, require_file
-from monstertruck_runtime.yaml_files import DEEPEST, LARGEST_YAML, bounded_yaml
+from monstertruck_runtime.yaml_files import LARGEST_YAML, bounded_yaml, yaml_problem
 from monstertruck_schemas.base import LiveValue, Schema, field_docs, live_settings
 from monstertruck_schemas.entry_points import left_out
 from monstertruckd.config.calibration import CalibrationStore, Result, WizardName, in_order, put_values, unused
@@ -461,9 +460,7 @@ def _compose(text: str, path: Path) -> MappingNode | None:
         ) from error
     except MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
-        too_deep = isinstance(error, MaxDepthExceededError)
-        problem = f"nested more than {DEEPEST} times" if too_deep else f"not valid YAML: {error.problem}"
-        raise ConfigError(f"{path}:{line}: {problem}") from error
+        raise ConfigError(f"{path}:{line}: {yaml_problem(error)}") from error
     except YAMLError as error:
         raise ConfigError(f"{path}:1: not valid YAML: {error}") from error
     if node is not None and not isinstance(node, MappingNode):

@@ -13,7 +13,6 @@ from monstertruck_schemas.sensor import HIDDEN, NO_ECHO, VALID_BEAM, LaserScan
 
 SECTORS: Final = 36
 """Number of sectors around the lidar: 0.1 m wide at the end of the checked distance, narrower than the body."""
-SECTOR: Final = 2 * math.pi / SECTORS
 
 Sectors = NDArray[np.intp]
 
@@ -55,7 +54,7 @@ class Visibility:
             self._sector_of_beam = _sector(start + increment * np.arange(len(shown), dtype=np.float64))
             self._beams = np.bincount(self._sector_of_beam, weights=shown, minlength=SECTORS).astype(np.float64)
             present = 0.5  # minimum fraction of a sector's beams in a scan for the sector to be in the field of view
-            self._field = self._beams * abs(increment) > present * SECTOR
+            self._field = self._beams * abs(increment) > present * math.tau / SECTORS
         sees = scan.codes <= NO_ECHO
         sees[((scan.codes == VALID_BEAM) & np.isfinite(scan.ranges)).nonzero()[0]] = ~on_body(
             self._footprint, points, 0.0
@@ -93,4 +92,4 @@ def travelled(views: Sequence[Visibility], body: Footprint, ground: Array) -> Se
 
 
 def _sector(bearings: Array) -> Sectors:
-    return ((bearings + math.pi) // SECTOR).astype(np.intp) % SECTORS
+    return ((bearings + math.pi) // (math.tau / SECTORS)).astype(np.intp) % SECTORS

@@ -12,7 +12,8 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 
-from monstertruck_runtime.outside import MEGABYTE, MOST_UNPACKED
+from monstertruck_runtime.outside import MOST_UNPACKED
+from monstertruck_runtime.small_files import MEGABYTE
 
 LIMIT: Final = f"expected at most {MOST_UNPACKED // MEGABYTE} MB"
 

@@ -27,8 +27,8 @@ from mcap.records import (
 )
 
 from monstertruck_runtime.errors import InputError, NotFoundError
-from monstertruck_runtime.outside import MEGABYTE, MOST_UNPACKED
-from monstertruck_runtime.small_files import DAMAGED, require_file
+from monstertruck_runtime.outside import MOST_UNPACKED
+from monstertruck_runtime.small_files import DAMAGED, MEGABYTE, require_file
 from monstertruckd.recorder.chunks import LIMIT
 
 MAGIC: Final = b"\x89MCAP0\r\n"

@@ -18,8 +18,6 @@ from monstertruckd.station.address import RobotAddress
 
 log = logging.getLogger(__name__)
 
-ROUTER_RETRY: Final = 1.0
-"""Interval between connection attempts to a router, and timeout of each (s)."""
 MOST_ROBOTS: Final = 64
 """Maximum number of robots added by one router; a page cannot show more of them sensibly."""
 
@@ -38,6 +36,7 @@ class Discovery:
         self._clock = clock
         self._found = found
         self._known: set[str] = set()
+        self._retry = 1.0  # time between connection attempts to a router, and timeout of each (s)
 
     async def run(self) -> None:
         """Watch until cancelled; logs the reason for a failed connection once."""
@@ -49,18 +48,18 @@ class Discovery:
                 if str(error) != said:
                     said = str(error)
                     log.warning("no robots from %s: %s", self._endpoint, said)
-                await self._clock.sleep(ROUTER_RETRY)
+                await self._clock.sleep(self._retry)
                 continue
             await self._watch(session)
 
     def _open(self) -> zenoh.Session:
         tls = tls_for(self._endpoint)
-        config = session_config(self._endpoint, ROUTER_RETRY, tls)
+        config = session_config(self._endpoint, self._retry, tls)
         try:
             return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
         except zenoh.ZError as error:
             require_certificates(self._endpoint, tls)
-            raise NotFoundError(f"nothing answers at {self._endpoint} within {ROUTER_RETRY} s") from error
+            raise NotFoundError(f"nothing answers at {self._endpoint} within {self._retry} s") from error
 
     async def _watch(self, session: zenoh.Session) -> None:
         hop: ThreadHop[str] = ThreadHop(self._take, 4 * MOST_ROBOTS, lambda _: None)

@@ -8,8 +8,6 @@ from monstertruckd.station.frames import Frame
 
 Place = tuple[float, float]
 """Origin of a map tile (m)."""
-MOST_ANSWERS: Final = 256
-"""Maximum number of waiting events and answers; then the oldest is dropped."""
 MOST_TILES: Final = 400
 """Maximum number of waiting map tiles; then the oldest is dropped, until the next full map."""
 
@@ -20,7 +18,7 @@ class Viewer:
     def __init__(self) -> None:
         self._newest: dict[str, Frame] = {}
         self._tiles: dict[Place, Frame] = {}
-        self._ordered: deque[Frame] = deque(maxlen=MOST_ANSWERS)
+        self._ordered: deque[Frame] = deque(maxlen=256)
         self._news = asyncio.Event()
         self.plotted: tuple[str, ...] = ()
         """Names of the numbers that the browser plots."""
@@ -44,7 +42,7 @@ class Viewer:
 
     def send(self, frame: Frame) -> None:
         """Queue ``frame`` in order of the calls."""
-        self.lost += len(self._ordered) == MOST_ANSWERS
+        self.lost += len(self._ordered) == self._ordered.maxlen
         self._ordered.append(frame)
         self._news.set()
 

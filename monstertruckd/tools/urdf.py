@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.outside import MEGABYTE, reading, text_of
+from monstertruck_runtime.outside import reading, text_of
+from monstertruck_runtime.small_files import MEGABYTE
 
 EXPECTED: Final = "URDF"
 SENSORS: Final[Mapping[str, str]] = {

@@ -9,11 +9,11 @@ import math
 from collections import deque
 from typing import Final, NamedTuple
 
+from monstertruck_kinematics.description import GRAVITY
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.sensor import Attitude
 from monstertruck_schemas.state import Odometry
 
-GRAVITY: Final = 9.81
 KEPT_ODOMETRY: Final = 64
 """Readings of the odometry."""
 

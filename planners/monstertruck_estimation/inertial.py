@@ -7,9 +7,10 @@ The tilt is a complementary filter: the gyroscopes turn the vertical, the specif
 import math
 from typing import Final
 
-from monstertruck_estimation.body_tilt import GRAVITY, Tilt
+from monstertruck_estimation.body_tilt import Tilt
 from monstertruck_estimation.gyro import Gyro, GyroConfig
 from monstertruck_estimation.transforms import Quaternion, Xyz, added, rotate
+from monstertruck_kinematics.description import GRAVITY
 from monstertruck_runtime.clock import SECOND
 from monstertruck_runtime.mailbox import Mailbox
 from monstertruck_runtime.ports import EventSink

@@ -20,9 +20,8 @@ PolynomialSet = Literal["corrected", "as_published", "2016"]
 SERVO_LIMIT = math.pi / 4.0
 """The servo command is clamped to +-45 deg; no polynomial of the sources is valid beyond."""
 
-F_PRINTED: Coefficients = (-0.0082, -0.0162, -0.00605, -0.0192, 0.6691, 0.0)
 F_CORRECTED: Coefficients = (-0.0082, -0.0162, -0.0605, -0.0192, 0.6691, 0.0)
-G_PRINTED: Coefficients = (0.0126, -0.0432, 0.0067, -0.0851, 0.9997, 0.0035)
+F_PRINTED: Coefficients = (*F_CORRECTED[:2], F_CORRECTED[2] / 10, *F_CORRECTED[3:])
 
 
 def mirrored(coefficients: Coefficients) -> Coefficients:
@@ -97,6 +96,10 @@ class AxlePolynomials:
         """
         return self.axle_from_left(self.left_of(servo))
 
+    def mirrored(self) -> "AxlePolynomials":
+        """Return the polynomials of an axle that turns the other way."""
+        return AxlePolynomials(mirrored(self.left_from_servo), mirrored(self.right_from_left), self.servo_limit)
+
     def servo_from_axle(self, axle: Real) -> Real:
         """Exact inverse of ``axle_from_servo``.
 
@@ -121,6 +124,11 @@ class AxlePolynomials:
         return servo
 
 
+def _printed(left_from_servo: Coefficients) -> AxlePolynomials:
+    """Front axle with the right wheel as printed."""
+    return AxlePolynomials(left_from_servo, (0.0126, -0.0432, 0.0067, -0.0851, 0.9997, 0.0035))
+
+
 def _converged(new: Real, old: Real) -> bool:
     """Whether Newton's method has converged (quadratic, so the error of the last iterate is below rounding)."""
     change = new - old
@@ -133,8 +141,8 @@ def _converged(new: Real, old: Real) -> bool:
 class SteeringPolynomials:
     """Both steered axles of the truck; ``named`` builds the sources' sets, the default is the corrected one."""
 
-    front: AxlePolynomials = field(default_factory=lambda: AxlePolynomials(F_CORRECTED, G_PRINTED))
-    rear: AxlePolynomials = field(default_factory=lambda: AxlePolynomials(mirrored(F_CORRECTED), mirrored(G_PRINTED)))
+    front: AxlePolynomials = field(default_factory=lambda: _printed(F_CORRECTED))
+    rear: AxlePolynomials = field(default_factory=lambda: _printed(F_CORRECTED).mirrored())
 
     @classmethod
     def named(cls, name: PolynomialSet) -> "SteeringPolynomials":
@@ -150,7 +158,7 @@ class SteeringPolynomials:
         if name == "corrected":
             return cls()
         if name == "as_published":
-            return cls(AxlePolynomials(F_PRINTED, G_PRINTED), AxlePolynomials(mirrored(F_PRINTED), mirrored(G_PRINTED)))
+            return cls(_printed(F_PRINTED), _printed(F_PRINTED).mirrored())
         if name == "2016":
             right_from_left = (-0.0058, 1.0203, 0.0)
             return cls(

@@ -20,7 +20,7 @@ from PIL import Image, TiffImagePlugin
 
 from monstertruck_runtime.errors import InputError
 from monstertruck_runtime.map_folders import YAML, MapSave, folder_of, opened
-from monstertruck_runtime.outside import picture, reading
+from monstertruck_runtime.outside import MOST_PIXELS, picture, reading
 from monstertruck_runtime.small_files import remove_file, replace_file
 from monstertruck_runtime.yaml_files import read_yaml, yaml_text
 
@@ -28,7 +28,7 @@ FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Cell values, as in an occupancy grid message."""
 OCCUPIED_FROM, FREE_TO = 65, 19
 """Thresholds of map_server (percent): a cell is occupied from the first on, free up to the second."""
-MOST_CELLS: Final = 25_000_000
+MOST_CELLS: Final = MOST_PIXELS
 """Cells of a map at most: 250 m a side at 5 cm."""
 
 _REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
@@ -290,7 +290,7 @@ def _image_of(source: Path, name: str) -> Path:
 def _read_image(source: Path, path: Path, keys: Mapping[str, Any]) -> NDArray[np.int8]:
     """Cells of an image by the rules of map_server, top row first."""
     try:
-        with picture(path, "the picture of a map", MOST_CELLS) as image:
+        with picture(path, "the picture of a map") as image:
             return _cells(*pixels(image), keys)
     except InputError as error:
         raise InputError(f"{source}: image: {error}") from error

@@ -18,21 +18,18 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from monstertruck_runtime.errors import InputError, TruckError
-from monstertruck_runtime.small_files import require_file
+from monstertruck_runtime.small_files import MEGABYTE, require_file
 from monstertruck_schemas.base import first_mistake
 
 if TYPE_CHECKING:
     from PIL import Image
 
-MEGABYTE: Final = 1_000_000
 MOST_UNPACKED: Final = 128 * MEGABYTE
 """Bytes that a compressed file, or a compressed part of one, may hold."""
 MOST_PIXELS: Final = 25 * MEGABYTE
 """Pixels of a picture: 250 m x 250 m in cells of 5 cm."""
 FORMATS: Final = ("PNG", "PPM", "BMP", "JPEG", "TIFF", "GIF", "WEBP")
 """Formats of pictures that are read; Pillow decodes others by starting programs."""
-QUOTED: Final = 200
-"""Characters of a library's message that a refusal repeats."""
 
 
 @contextmanager
@@ -56,6 +53,11 @@ def reading(file: Path | str, expected: str, refusal: type[TruckError] = InputEr
         raise refusal(f"{file}: expected {expected}: {cause_of(error)}") from error
 
 
+def quoted(text: str) -> str:
+    """Return a text from outside as one line, short enough for a refusal."""
+    return " ".join(text.split())[:200]
+
+
 def cause_of(error: BaseException) -> str:
     """Return one line about an error of a library."""
     if isinstance(error, ValidationError):
@@ -64,7 +66,7 @@ def cause_of(error: BaseException) -> str:
         return "it needs more memory than there is"
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
-    text = " ".join(str(error).split())[:QUOTED]
+    text = quoted(str(error))
     if text and isinstance(error, ValueError | OSError):
         return text
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
@@ -166,12 +168,12 @@ def _require_array(stream: Any, size: int) -> None:
 
 
 @contextmanager
-def picture(file: Path, expected: str = "a picture", most: int = MOST_PIXELS) -> Iterator["Image.Image"]:
+def picture(file: Path, expected: str = "a picture") -> Iterator["Image.Image"]:
     """Open a picture of one of ``FORMATS``, whose pixels are decoded when they are wanted.
 
     Raises:
-        InputError: it cannot be read, is of no known format, or has more than ``most`` pixels; in the body: whatever
-            decoding raises.
+        InputError: it cannot be read, is of no known format, or has too many pixels; in the body: whatever decoding
+            raises.
     """
     from PIL import Image  # noqa: PLC0415 - only for pictures
 
@@ -182,8 +184,17 @@ def picture(file: Path, expected: str = "a picture", most: int = MOST_PIXELS) ->
                 image = Image.open(file, formats=FORMATS)
         except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
             size = str(error).partition(" exceeds")[0]
-            raise InputError(f"{file}: {size}: expected at most {most} pixels") from error
+            raise InputError(f"{file}: {size}: expected at most {MOST_PIXELS} pixels") from error
         with image:
-            if image.width * image.height > most:
-                raise InputError(f"{file}: {image.width} x {image.height} pixels: expected at most {most}")
+            require_pixels(file, image.width, image.height)
             yield image
+
+
+def require_pixels(name: object, width: float, height: float) -> None:
+    """Require a picture of at most ``MOST_PIXELS``.
+
+    Raises:
+        InputError: it has more.
+    """
+    if width * height > MOST_PIXELS:
+        raise InputError(f"{name}: {width:.0f} x {height:.0f} pixels: expected at most {MOST_PIXELS}")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ruamel.yaml.error import YAMLError
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.outside import QUOTED, reading
+from monstertruck_runtime.outside import quoted, reading
 from monstertruck_runtime.path_forms import PathForm
 from monstertruck_runtime.tables import COMMENT, DELIMITERS, rows_of
 from monstertruck_runtime.yaml_files import bounded_yaml, yaml_text
@@ -181,14 +181,14 @@ def _require(right: NDArray[np.bool_], what: str, file: FilePath, rows: list[tup
     """Refuse the first row that is not right."""
     if not right.all():
         line, cells = rows[int(np.argmin(right))]
-        raise InputError(f"{file}:{line}: expected {what}, found {','.join(cells)[:QUOTED]}")
+        raise InputError(f"{file}:{line}: expected {what}, found {quoted(','.join(cells))}")
 
 
 def _column(file: FilePath, rows: list[tuple[int, list[str]]], found: Mapping[str, Array], name: str) -> Array:
     for other in COLUMNS[name]:
         if other in found:
             return found[other]
-    given = ",".join(found)[:QUOTED]
+    given = quoted(",".join(found))
     raise InputError(
         f"{file}:{rows[0][0]}: expected columns {','.join(HEADER)}, or x_m and y_m with vx_mps where there are speeds, "
         f"named in a header or by --columns; found {given}"
@@ -223,9 +223,9 @@ def _numbers(file: FilePath, line: int, cells: list[str], names: Sequence[str]) 
     try:
         numbers = [float(cell) for cell in cells]
     except ValueError as error:
-        raise InputError(f"{file}:{line}: expected numbers, found {','.join(cells)[:QUOTED]}") from error
+        raise InputError(f"{file}:{line}: expected numbers, found {quoted(','.join(cells))}") from error
     if len(numbers) != len(names) or not all(map(math.isfinite, numbers)):
-        given = ",".join(cells)[:QUOTED]
+        given = quoted(",".join(cells))
         raise InputError(f"{file}:{line}: expected {len(names)} finite numbers ({','.join(names)}), found {given}")
     return numbers
 
@@ -250,9 +250,7 @@ def _waypoints(text: str, file: FilePath) -> tuple[Array, bool]:
         try:
             data = bounded_yaml(200_000).load(documents[0]) if documents else None  # keys and values: 9000 poses
         except YAMLError as error:
-            raise InputError(
-                f"{file}: expected waypoints: not valid YAML: {' '.join(str(error).split())[:QUOTED]}"
-            ) from error
+            raise InputError(f"{file}: expected waypoints: not valid YAML: {quoted(str(error))}") from error
         if not isinstance(data, dict) or not ("waypoints" in data or "poses" in data):
             raise InputError(f"{file}: expected a mapping with waypoints, or with the poses of a path")
         name = "waypoints" if "waypoints" in data else "poses"
@@ -302,7 +300,7 @@ def _yaw(w: float, x: float, y: float, z: float) -> float:
 
 def _finite(where: str, *values: Any) -> tuple[float, float, float]:
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
-        raise InputError(f"{where}: expected finite numbers, found {','.join(map(str, values))[:QUOTED]}")
+        raise InputError(f"{where}: expected finite numbers, found {quoted(','.join(map(str, values)))}")
     x, y, yaw = (float(value) for value in values)
     return x, y, yaw
 

@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
+MEGABYTE: Final = 1_000_000
 SCRATCH: Final = ".new~"
 """End of the names of files that are being written; of a killed writer they are left."""
 

@@ -39,7 +39,8 @@ class ClientTls:
         from cryptography import x509  # noqa: PLC0415 - only for certificates
         from cryptography.x509.oid import NameOID  # noqa: PLC0415
 
-        from monstertruck_runtime.outside import MEGABYTE, contents, reading  # noqa: PLC0415
+        from monstertruck_runtime.outside import contents, reading  # noqa: PLC0415
+        from monstertruck_runtime.small_files import MEGABYTE  # noqa: PLC0415
 
         expected = "a certificate with a common name"
         with reading(self.certificate, expected):

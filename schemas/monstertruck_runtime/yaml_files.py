@@ -15,8 +15,6 @@ from monstertruck_runtime.outside import reading, text_of
 
 LARGEST_YAML: Final = 1_000_000
 """Size of one file at most: they are written by hand, or give the origin of a map."""
-DEEPEST: Final = 50
-"""Nesting of lists and mappings, at most."""
 _EXPECTED: Final = "YAML"
 
 
@@ -57,7 +55,7 @@ class _BoundedComposer(Composer):
 def bounded_yaml(most: int = 20_000, *, expand: bool = True) -> YAML:
     """Return a reader of one document of plain data with bounds of depth and size; see ``_BoundedComposer``."""
     yaml = YAML(typ="safe", pure=True)
-    yaml.max_depth = DEEPEST
+    yaml.max_depth = 50
     yaml.Composer = partial(_BoundedComposer, most=most, expand=expand)  # type: ignore[assignment]  # it is only called
     return yaml
 
@@ -74,9 +72,14 @@ def read_yaml(path: Path) -> Any:
             return bounded_yaml().load(text)
         except MarkedYAMLError as error:
             line = error.problem_mark.line + 1 if error.problem_mark else 1
-            too_deep = isinstance(error, MaxDepthExceededError)
-            problem = f"nested more than {DEEPEST} times" if too_deep else error.problem
-            raise InputError(f"{path}:{line}: not valid YAML: {problem}") from error
+            raise InputError(f"{path}:{line}: {yaml_problem(error)}") from error
+
+
+def yaml_problem(error: MarkedYAMLError) -> str:
+    """Return what is wrong with a text that is not valid YAML, or is nested too deeply."""
+    if isinstance(error, MaxDepthExceededError):
+        return f"nested more than {bounded_yaml().max_depth} times"
+    return f"not valid YAML: {error.problem}"
 
 
 def yaml_text(value: Any) -> str:

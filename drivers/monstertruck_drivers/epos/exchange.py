@@ -33,7 +33,6 @@ from monstertruck_runtime.errors import DeviceMismatchError, DeviceTimeoutError,
 
 T = TypeVar("T")
 
-ACKNOWLEDGE_TIMEOUT = 0.1
 QUIET = 0.55
 """Silence that makes a controller with factory settings drop half a frame with certainty (s)."""
 QUICK_ANSWER = 0.05
@@ -41,8 +40,6 @@ QUICK_ANSWER = 0.05
 late."""
 RECENT = 32
 """Exchanges whose duration is judged."""
-STRAY_LIMIT = 3
-"""Unknown bytes skipped before an acknowledge."""
 ATTEMPTS = 3
 """Attempts at an exchange outside the schedule."""
 BRIEF_SILENCES = 2
@@ -309,13 +306,22 @@ class Exchanger:
 
     def _acknowledge(self) -> Steps[int]:
         skipped = b""
-        while len(skipped) <= STRAY_LIMIT:
-            byte = yield from self._exactly(1, ACKNOWLEDGE_TIMEOUT)
-            if byte[0] in (READY, REFUSED):
-                self.acknowledged = True
-                return byte[0]
-            self.strange = skipped = skipped + byte
-        raise ProtocolError(f"{self._link.name}: {skipped.hex(' ')} instead of an acknowledge")
+        acknowledge_timeout = 0.1
+        while (byte := (yield from self._exactly(1, acknowledge_timeout)))[0] not in (READY, REFUSED):
+            skipped = self._skipped(skipped + byte, "an acknowledge")
+        self.acknowledged = True
+        return byte[0]
+
+    def _skipped(self, stray: bytes, awaited: str) -> bytes:
+        """Note unknown bytes before an awaited one.
+
+        Raises:
+            ProtocolError: there are more than three.
+        """
+        self.strange = stray
+        if len(stray) > 3:
+            raise ProtocolError(f"{self._link.name}: {stray.hex(' ')} instead of {awaited}")
+        return stray
 
     def _receive(self, lengths: frozenset[int] | None) -> Steps[Frame | None]:
         """Answer frame; None = damaged, and the controller has forgotten it: ask again."""
@@ -323,9 +329,7 @@ class Exchanger:
         skipped = b""
         answer_timeout = 0.25
         while (byte := (yield from self._exactly(1, answer_timeout)))[0] != ANSWER:
-            self.strange = skipped = skipped + byte
-            if len(skipped) > STRAY_LIMIT:
-                raise ProtocolError(f"{self._link.name}: {skipped.hex(' ')} instead of an answer")
+            skipped = self._skipped(skipped + byte, "an answer")
         self._answer_awaited = False
         self._write(bytes((READY,)))
         frame: Frame | None
@@ -351,11 +355,11 @@ class Exchanger:
             raise ProtocolError(f"{self._link.name}: repeated answer is damaged too: {error}") from error
 
     def _frame(self, lengths: frozenset[int] | None, within: float | None = None) -> Steps[Frame]:
-        begin = self._clock.now()
-        head = yield from self._exactly(1, within or ACKNOWLEDGE_TIMEOUT)
+        begin, timeout = self._clock.now(), 0.1  # seconds for each part of a frame
+        head = yield from self._exactly(1, within or timeout)
         if lengths is not None and head[0] not in lengths:
             raise FrameError(f"length byte {head[0]}")
-        left = within - (self._clock.now() - begin) / SECOND if within else ACKNOWLEDGE_TIMEOUT
+        left = within - (self._clock.now() - begin) / SECOND if within else timeout
         return decode_body(ANSWER, head + (yield from self._exactly(body_size(head[0]), left)))
 
     def _write(self, data: bytes) -> None:

@@ -13,16 +13,10 @@ from monstertruck_runtime.clock import MILLISECOND, SECOND
 
 BLOCK: Final = 10
 """Scans per block; the drift estimate uses only the promptest scan of a block."""
-BLOCKS: Final = 20
-"""Maximum number of blocks in the drift estimate."""
 RECENT: Final = 6
 """Blocks in the drift estimate at its start, and after a clock was slewed."""
-BREAK: Final = 3e-3
-"""Difference between the drifts of recent and of all blocks that only a slew explains (s/s)."""
 GREATEST_DRIFT: Final = 0.12
 """Maximum relative drift of a slewed clock: chrony and the kernel slew by at most a tenth."""
-PROMPT: Final = 8
-"""Scans among which at least one is prompt: if all lie above the envelope, the clocks run apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +58,7 @@ class ClockMap:
         self._envelope = 0.0
         self._drift = Drift()
         self._settling: list[tuple[int, int]] = []
-        self._newest: deque[tuple[int, int]] = deque(maxlen=PROMPT)
+        self._newest: deque[tuple[int, int]] = deque(maxlen=8)  # at least one of them is prompt
         self._window: deque[tuple[int, int]] = deque(maxlen=60)  # its promptest scan is the envelope
         self._stamp: int | None = None
 
@@ -111,14 +105,14 @@ class ClockMap:
     def _take(self, elapsed: int, sample: int) -> None:
         """Update the envelope with a new sample."""
         self._newest.append((elapsed, sample))
-        prompt = self._lowest(self._newest)
-        above = prompt - self._lowest(self._window) if len(self._newest) == PROMPT else 0.0
+        prompt, full = self._lowest(self._newest), len(self._newest) == self._newest.maxlen
+        above = prompt - self._lowest(self._window) if full else 0.0  # higher only if the clocks run apart
         late = 100 * MILLISECOND  # minimum height (ns) of late scans: clocks do not jump, so the scans are late
         self.late = round(above) if above > late else 0
         if not self.late:
             breaks, drift = self.slews, self.drift
             self._drift.add(elapsed, sample)
-            slewed = self.slews > breaks or (abs(self.drift - drift) > BREAK and not self._is_steady())
+            slewed = self.slews > breaks or (_differ(self.drift, drift) and not self._is_steady())
             if slewed and self._reference is not None:
                 # Samples since the slew carry no information about the latency.
                 before = self._settling[: max(len(self._settling) - RECENT * BLOCK, BLOCK)]
@@ -126,7 +120,7 @@ class ClockMap:
                 self._keep_latency()
             # Height of recent scans beyond which the envelope follows them (ns): more than the jitter of USB.
             apart = 30 * MILLISECOND
-            if above > apart or abs(self.drift - drift) > BREAK:
+            if above > apart or _differ(self.drift, drift):
                 self._window.clear()
                 self._window.extend(self._newest)
             else:
@@ -181,8 +175,9 @@ class Drift:
         self.rate = 0.0
         """Drift (ns/ns)."""
         self.breaks = 0
-        """Number of sudden changes by more than ``BREAK``."""
-        self._blocks: deque[tuple[int, int]] = deque(maxlen=BLOCKS)
+        """Number of sudden changes that only a slew explains."""
+        self._most = 20  # blocks
+        self._blocks: deque[tuple[int, int]] = deque(maxlen=self._most)
         self._block: list[tuple[int, int]] = []
 
     def add(self, elapsed: int, sample: int) -> None:
@@ -196,12 +191,12 @@ class Drift:
             return
         blocks = list(self._blocks)
         rate, recent = self._slope(blocks), self._slope(blocks[-RECENT:])
-        if abs(rate - recent) > BREAK:
+        if _differ(rate, recent):
             rate = recent
             self.breaks += 1
             while len(self._blocks) > RECENT:
                 self._blocks.popleft()
-        if len(blocks) < BLOCKS // 2 and abs(rate) < BREAK:
+        if len(blocks) < self._most // 2 and not _differ(rate, 0.0):
             rate = 0.0  # jitter alone may cause such a rate
         self.rate = min(max(rate, -GREATEST_DRIFT), GREATEST_DRIFT)
 
@@ -222,3 +217,8 @@ class Drift:
 
     def _lowest(self, samples: list[tuple[int, int]]) -> tuple[int, int]:
         return min(samples, key=lambda pair: pair[1] - self.rate * pair[0])
+
+
+def _differ(rate: float, other: float) -> bool:
+    """Whether only a slew explains the difference of two drifts (s/s)."""
+    return abs(rate - other) > 3e-3

@@ -19,8 +19,6 @@ from monstertruck_drivers.webcam.source import Mode
 from monstertruck_runtime.clock import SECOND, Clock, Schedule
 from monstertruck_runtime.threads import Offload, in_thread
 
-FONT_SIZE: Final = 20
-
 
 def jpeg(picture: NDArray[np.uint8], counter: int) -> bytes:
     """A picture, (height, width, 3), with ``counter`` in its upper left corner, as a JPEG."""
@@ -36,7 +34,7 @@ def jpeg(picture: NDArray[np.uint8], counter: int) -> bytes:
 
 @cache
 def _font() -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(FONT_SIZE)
+    return ImageFont.load_default(20)
 
 
 SIZES: Final = ((1600, 1200), (1280, 720), (800, 600), (640, 480), (320, 240), (160, 120))

@@ -12,11 +12,6 @@ from monstertruck_sim.world.camera import CameraPlace, FlatPanel, opencv
 from monstertruck_sim.world.config import HeldBoard
 from monstertruck_sim.world.noise import BOARD, generator
 
-ASIDE: float = 0.5
-"""Maximum lateral offset of the board's centre from the optical axis, as a fraction of half the image width."""
-BELOW: float = 0.4
-"""Maximum vertical offset from the axis, as a fraction of half the image width."""
-
 
 class BoardHolder:
     """A person who holds a board in front of a camera and changes its pose at intervals.
@@ -45,7 +40,8 @@ def held(board: HeldBoard, place: CameraPlace, rng: np.random.Generator, field_o
     texture = board_texture(board.columns, board.rows, board.square, board.marker)
     wide, high = (printed * board.printed_scale for printed in (board.width, board.height))
     away = rng.uniform(0.9, 1.7) * max(wide, high) / math.tan(field_of_view / 2)
-    aside, below = rng.uniform(-ASIDE, ASIDE), rng.uniform(-BELOW, BELOW)
+    # Offset of the board's centre from the optical axis, as fractions of half the image width.
+    aside, below = rng.uniform(-0.5, 0.5), rng.uniform(-0.4, 0.4)
     aside, below = (part * away * math.tan(field_of_view / 2) for part in (aside, below))
     upright = 0.35  # maximum rotation about the optical axis, rad
     spin, tilt = rng.uniform(-upright, upright), rng.uniform(-0.55, 0.55)

@@ -15,7 +15,6 @@ STEP_S = 0.02
 """Interval between checks of the path ahead (s)."""
 SIDE = 0.25
 """Lateral clearance: a person walks past obstacles further than this from the swept path (m)."""
-_TRIES = 400
 
 Free = Callable[[float, float, float], bool]
 """Return whether a disc (x, y, radius; m) is clear of the map."""
@@ -54,6 +53,7 @@ class Person:
         """Speed (m/s)."""
         self._config, self._free, self._bounds = config, free, bounds
         self._rng = generator(seed, PEOPLE, index)
+        self._tries = 400  # draws of a free place, or of a free leg
         self._given: list[Place] = [(point.x, point.y) for point in config.waypoints]
         self._next = 0
         self._require_free()
@@ -151,7 +151,7 @@ class Person:
             self._next = (self._next + 1) % len(self._given)
             self._target = self._given[self._next]
             return
-        for _ in range(_TRIES):
+        for _ in range(self._tries):
             # (1.0, 4.0): minimum and maximum length of a random leg, m
             length, heading = self._rng.uniform(1.0, 4.0), self._rng.uniform(-pi, pi)
             place = self.x + length * cos(heading), self.y + length * sin(heading)
@@ -169,7 +169,7 @@ class Person:
 
     def _drawn_place(self) -> Place:
         left, right, low, high = self._bounds
-        for _ in range(_TRIES):
+        for _ in range(self._tries):
             x, y = float(self._rng.uniform(left, right)), float(self._rng.uniform(low, high))
             if self._free(x, y, self.radius + SIDE):
                 return x, y

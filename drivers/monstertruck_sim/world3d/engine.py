@@ -31,6 +31,7 @@ from monstertruck_sim.world3d.model import (
     PARKED,
     SPARE,
     TALL,
+    UNTOUCHED,
     UPRIGHT,
     DriveLine,
     Group,
@@ -128,7 +129,7 @@ class RigidSpace(Space):
         model, data = self._plant.model, self._plant.data
         body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
         mocap, geom = model.body_mocapid[body], model.body_geomadr[body]
-        kind, affinity = (0, 0) if shown is None else UPRIGHT
+        kind, affinity = UNTOUCHED if shown is None else UPRIGHT
         model.geom_contype[geom] = model.body_contype[body] = kind
         model.geom_conaffinity[geom] = model.body_conaffinity[body] = affinity
         model.geom_rgba[geom, 3] = shown is not None and shown[1]

@@ -11,7 +11,8 @@ import numpy as np
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.outside import MEGABYTE, contents, picture, reading
+from monstertruck_runtime.outside import contents, picture, reading
+from monstertruck_runtime.small_files import MEGABYTE
 from monstertruck_sim.world.config import (
     Ditch,
     GroundFeature,

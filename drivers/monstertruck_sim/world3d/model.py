@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import ClassVar, Final
+from typing import ClassVar, Final, NamedTuple
 from xml.etree import ElementTree as ET
 from xml.etree.ElementTree import Element, SubElement
 
@@ -29,10 +29,8 @@ SPARE: Final = 24
 """Discs, and boxes, that can be put into a world while it runs; people and other robots are among them."""
 PARKED: Final = -50.0
 """Height of unused spare bodies, m."""
-SUPPORTS: Final = 4
+SUPPORTS: Final = tuple(f"support_{i}" for i in range(4))
 """Blocks that can be put under wheels."""
-SUPPORT_SIDES: Final = (0.12, 0.12, 0.4)
-"""Sides of such a block, m: the part of its height that is not needed is below the ground."""
 TALL: Final = 0.6
 """Height of objects that are put into a world, m."""
 
@@ -51,24 +49,26 @@ class Warnings:
         log.warning("MuJoCo: %s", " ".join(text.split()))
 
 
-# Two geometries touch where a bit of the type of one is in the affinity of the other.
-CARRIES: Final = (5, 2)
-"""Type and affinity of the ground."""
-_GROUND: Final = {"contype": f"{CARRIES[0]}", "conaffinity": f"{CARRIES[1]}"}
-UPRIGHT: Final = (9, 2)
-"""Type and affinity of walls and objects."""
-_UPRIGHT: Final = {"contype": f"{UPRIGHT[0]}", "conaffinity": f"{UPRIGHT[1]}"}
-_TOUCHES: Final = {
-    "all": {"contype": "2", "conaffinity": "1"},
-    "ground": {"contype": "0", "conaffinity": "4"},
-    "walls": {"contype": "0", "conaffinity": "8"},
-}
-_TAG_PIXELS: Final = 16
-"""Pixels of a tag's cell in its texture."""
+class TouchBits(NamedTuple):
+    """Bits of contact: two geometries touch where a bit of the type of one is in the affinity of the other."""
+
+    kind: int
+    affinity: int
+
+    @property
+    def attributes(self) -> dict[str, str]:
+        """Attributes of a geometry."""
+        return {"contype": f"{self.kind}", "conaffinity": f"{self.affinity}"}
+
+
+UNTOUCHED: Final = TouchBits(0, 0)
+CARRIES: Final = TouchBits(5, 2)
+"""The ground."""
+UPRIGHT: Final = TouchBits(9, 2)
+"""Walls and objects."""
+_TOUCHES: Final = {"all": TouchBits(2, 1), "ground": TouchBits(0, 4), "walls": TouchBits(0, 8)}
 _TYRE: Final = "0.01 1"
 """Time constant, s, and damping ratio of its contact: under the weight it gives 0.3 mm."""
-_FLAT: Final = 1e-3
-"""Minimum height of a height field, m."""
 
 
 class Group(IntEnum):
@@ -206,7 +206,7 @@ def mjcf(description: Description, drive: DriveLine, friction: float, scene: Sta
     SubElement(visual, "quality", shadowsize="1024", offsamples="0", numquads="1")
     SubElement(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.25 0.25 0.25", specular="0 0 0")
     default = SubElement(root, "default")
-    SubElement(default, "geom", _GROUND, friction=f"{friction} 0.005 0.0001")
+    SubElement(default, "geom", CARRIES.attributes, friction=f"{friction} 0.005 0.0001")
     asset = SubElement(root, "asset")
     _materials(asset)
     world = SubElement(root, "worldbody")
@@ -247,14 +247,15 @@ def load(description: Description, drive: DriveLine, friction: float, scene: Sta
     except ValueError as error:
         raise InputError(f"sim.world: MuJoCo refuses the model: {' '.join(str(error).split())}") from error
     if (heights := scene.heights) is not None:
-        low, high = float(heights.z.min()), float(heights.z.max())
-        model.hfield_data[:] = ((heights.z - low) / max(high - low, _FLAT)).astype(np.float32).ravel()
+        low, rise = _relief(heights)
+        model.hfield_data[:] = ((heights.z - low) / rise).astype(np.float32).ravel()
     named = {f"tag_{i}": tag.tag for i, tag in enumerate(scene.tags)}
     if scene.roof is not None:
         named["roof"] = scene.roof.tag
     for name, tag in named.items():
         texture = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXTURE, name)
-        shades = np.kron(tag_pattern(tag), np.ones((_TAG_PIXELS, _TAG_PIXELS), np.uint8))
+        pixels = model.tex_width[texture] // PAPER_CELLS
+        shades = np.kron(tag_pattern(tag), np.ones((pixels, pixels), np.uint8))
         data = np.repeat(shades[:, :, None], model.tex_nchannel[texture], axis=2).ravel()
         model.tex_data[model.tex_adr[texture] : model.tex_adr[texture] + len(data)] = data
     return model
@@ -286,6 +287,12 @@ def _materials(asset: Element) -> None:
     )
 
 
+def _relief(heights: HeightGrid) -> tuple[float, float]:
+    """Return the lowest height, and the rise from there to the highest (m); a height field is not flat."""
+    low, high = float(heights.z.min()), float(heights.z.max())
+    return low, max(high - low, 1e-3)
+
+
 def _ground(asset: Element, world: Element, heights: HeightGrid | None) -> None:
     ground = {"name": "ground", "group": f"{Group.GROUND.value}", "material": "floor"}
     if heights is None:
@@ -293,8 +300,8 @@ def _ground(asset: Element, world: Element, heights: HeightGrid | None) -> None:
         return
     rows, columns = heights.z.shape
     half_x, half_y = (columns - 1) * heights.resolution / 2, (rows - 1) * heights.resolution / 2
-    low, high = float(heights.z.min()), float(heights.z.max())
-    size = _text(half_x, half_y, max(high - low, _FLAT), 1.0)
+    low, rise = _relief(heights)
+    size = _text(half_x, half_y, rise, 1.0)
     SubElement(asset, "hfield", name="heights", nrow=f"{rows}", ncol=f"{columns}", size=size)
     place = _text(heights.origin[0] + half_x, heights.origin[1] + half_y, low)
     SubElement(world, "geom", ground, type="hfield", hfield="heights", pos=place)
@@ -307,7 +314,7 @@ def _walls(world: Element, scene: StaticScene) -> None:
         SubElement(
             world,
             "geom",
-            _UPRIGHT,
+            UPRIGHT.attributes,
             name=f"wall_{i}",
             type="box",
             group=f"{Group.WALLS.value}",
@@ -327,7 +334,7 @@ def _tags(asset: Element, world: Element, tags: Sequence[TagConfig]) -> None:
 def _paper(
     asset: Element, parent: Element, name: str, size: float, place: tuple[float, float, float], axes: Sequence[float]
 ) -> None:
-    pixels = f"{PAPER_CELLS * _TAG_PIXELS}"
+    pixels = f"{PAPER_CELLS * 16}"
     SubElement(asset, "texture", name=name, type="2d", builtin="flat", width=pixels, height=pixels, nchannel="3")
     SubElement(
         asset, "material", name=name, texture=name, texrepeat="1 1", texuniform="false", specular="0", emission="0.3"
@@ -354,7 +361,7 @@ def _scenery(asset: Element, world: Element, scenery: tuple[Sequence[Element], S
     for element in scenery[1]:
         for geom in element.iter("geom"):
             geom.set("group", f"{Group.BLOCKS.value}")
-            for key, value in _GROUND.items():
+            for key, value in CARRIES.attributes.items():
                 geom.set(key, value)
         world.append(element)
 
@@ -365,14 +372,14 @@ def _spare(world: Element) -> None:
             body = SubElement(world, "body", name=f"{kind}_{i}", mocap="true", pos=_text(0.0, 0.0, PARKED))
             shape = "cylinder" if kind == "disc" else "box"
             group = f"{Group.MOVING.value}"
-            look = {**_UPRIGHT, "type": shape, "size": size, "group": group, "rgba": "0.8 0.45 0.15 0"}
+            look = {**UPRIGHT.attributes, "type": shape, "size": size, "group": group, "rgba": "0.8 0.45 0.15 0"}
             SubElement(body, "geom", look, name=f"{kind}_{i}")
-    for i in range(SUPPORTS):
-        name = f"support_{i}"
+    sides = 0.12, 0.12, 0.4  # m; the part of its height that is not needed is below the ground
+    for name in SUPPORTS:
         body = SubElement(world, "body", name=name, mocap="true", pos=_text(0.0, 0.0, PARKED))
-        size, nothing = _text(*(side / 2 for side in SUPPORT_SIDES)), {"contype": "0", "conaffinity": "0"}
+        size = _text(*(side / 2 for side in sides))
         look = {"group": f"{Group.GROUND.value}", "rgba": "0.55 0.5 0.42 1"}
-        SubElement(body, "geom", look, **nothing, name=name, type="box", size=size)
+        SubElement(body, "geom", look, **UNTOUCHED.attributes, name=name, type="box", size=size)
 
 
 def _robot(world: Element, description: Description) -> Element:
@@ -426,7 +433,7 @@ def _shape(body: Element, shape: Shape, name: str) -> None:
     geom = SubElement(
         body,
         "geom",
-        _TOUCHES[shape.touches],
+        _TOUCHES[shape.touches].attributes,
         name=name,
         group=f"{Group.ROBOT.value}",
         pos=_text(*shape.centre),
@@ -451,11 +458,7 @@ def _shape(body: Element, shape: Shape, name: str) -> None:
     geom.set("euler", _text(math.pi / 2, shape.yaw, 0.0))
 
 
-_HEAD_STIFFNESS: Final = 15.0
-"""Stiffness between a stabiliser's shaft and its load, Nm/rad."""
-_HEAD_DAMPING: Final = 0.15
-"""Nm s/rad."""
-HEAD_LAG: Final = _HEAD_DAMPING / _HEAD_STIFFNESS
+HEAD_LAG: Final = 0.01
 """Delay of a joint behind its turning shaft, s, caused by its damper."""
 
 
@@ -478,7 +481,8 @@ def _drive(root: Element, description: Description, drive: DriveLine) -> None:
             SubElement(actuators, "position", gains, name=joint.name, joint=joint.name)
     for joint in description.joints:
         if joint.name in HEAD_JOINTS:
-            gains = {"kp": f"{_HEAD_STIFFNESS}", "kv": f"{_HEAD_DAMPING}"}
+            stiffness = 15.0  # between a stabiliser's shaft and its load, Nm/rad
+            gains = {"kp": f"{stiffness}", "kv": f"{HEAD_LAG * stiffness}"}
             SubElement(actuators, "position", gains, name=joint.name, joint=joint.name)
     for i, joints in enumerate(drive.shafts):
         mean(f"shaft_{i}", joints)

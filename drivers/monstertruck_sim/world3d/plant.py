@@ -21,9 +21,9 @@ from monstertruck_sim.world3d.model import (
     CARRIES,
     HEAD_LAG,
     PARKED,
-    SUPPORT_SIDES,
     SUPPORTS,
     TIMESTEP,
+    UNTOUCHED,
     DriveLine,
     Group,
     Warnings,
@@ -197,15 +197,15 @@ class RigidPlant(Plant):
         feet = data.geom_xpos[wheels] - np.outer(model.geom_size[wheels, 0], (0.0, 0.0, 1.0))
         base = -float(feet[:, 2].min())
         ground = self.ground(x, y)
-        for i in range(SUPPORTS):
-            body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"support_{i}")
+        for i, name in enumerate(SUPPORTS):
+            body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
             geom, mocap = model.body_geomadr[body], model.body_mocapid[body]
             ahead, aside, rise = (x, y, base) + feet[i] if i < len(feet) else np.zeros(3)
             used = rise > 0.002  # height below which a wheel gets no block, m
-            kind, affinity = CARRIES if used else (0, 0)
+            kind, affinity = CARRIES if used else UNTOUCHED
             model.geom_contype[geom] = model.body_contype[body] = kind
             model.geom_conaffinity[geom] = model.body_conaffinity[body] = affinity
-            data.mocap_pos[mocap] = ahead, aside, (ground + rise if used else PARKED) - SUPPORT_SIDES[2] / 2
+            data.mocap_pos[mocap] = ahead, aside, (ground + rise if used else PARKED) - model.geom_size[geom][2]
             data.mocap_quat[mocap] = cy, 0.0, 0.0, sy
         return ground + base
 

@@ -12,7 +12,7 @@ import numpy as np
 from ruamel.yaml.error import YAMLError
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.outside import QUOTED, reading
+from monstertruck_runtime.outside import quoted, reading
 from monstertruck_runtime.yaml_files import bounded_yaml, yaml_text
 from monstertruck_schemas.body import LensConfig
 from monstertruckd.tools.calibrate.lens_forms import LensForm
@@ -107,7 +107,7 @@ def _data(text: str, file: Path) -> Mapping[str, Any]:
         try:
             data = bounded_yaml().load(documents[0]) if documents else None
         except YAMLError as error:
-            cause = " ".join(str(error).split())[:QUOTED]
+            cause = quoted(str(error))
             raise InputError(f"{file}: expected {EXPECTED}: not valid YAML: {cause}") from error
     if not isinstance(data, dict):
         raise InputError(f"{file}: expected {EXPECTED}: a mapping")

@@ -21,15 +21,9 @@ from monstertruckd.tools.calibrate.steps import MoveRecord, MoveStep
 
 REQUEST_PERIOD: Final = 0.05
 """Request period (s)."""
-MOVE_LEASE: Final = 0.5
-"""Requested lease (s); the gate may grant less."""
-ARMING: Final = 3.0
-"""Time limit for arming (s)."""
-RESTING_TURN: Final = 0.1
-"""Motor rotation tolerated at rest (rad): an encoder may alternate between two counts."""
-RESTING_TIME: Final = 0.5
-"""Time of unchanged drive position that is rest (s)."""
-REST_LIMIT: Final = 5.0
+ANSWERED: Final = 3.0
+"""Time limit for an answer of the gate (s)."""
+RESTING: Final = 5.0
 """Time limit for coming to rest (s)."""
 LATE: Final = (
     "requests came too late: end what else keeps this computer or the link to the robot busy, or run the command on "
@@ -192,10 +186,10 @@ class _Run:
             RequestRefusedError: the truck is armed.
             NoAnswerError: the gate publishes no state.
         """
-        end = self._clock.now() + round(ARMING * SECOND)
+        end = self._clock.now() + round(ANSWERED * SECOND)
         while self.state is None:
             if self._clock.now() > end:
-                raise NoAnswerError(f"no state of the gate within {ARMING:g} s")
+                raise NoAnswerError(f"no state of the gate within {ANSWERED:g} s")
             await self._clock.sleep(REQUEST_PERIOD)
             self._take()
         if self.state.mode.active:
@@ -209,15 +203,15 @@ class _Run:
             RequestRefusedError: the gate refused.
             NoAnswerError: the gate did not answer.
         """
-        end = self._clock.now() + round(ARMING * SECOND)
+        end = self._clock.now() + round(ANSWERED * SECOND)
         requests = 0
         refusal: TruckError | None = None
         arming: asyncio.Task[TruckError | None] | None = None
         try:
             while not self._driving():
                 if self._clock.now() > end:
-                    raise refusal or NoAnswerError(f"the gate did not arm the robot within {ARMING:g} s")
-                await self._truck.drive(0.0, 0.0, 0.0, MOVE_LEASE)
+                    raise refusal or NoAnswerError(f"the gate did not arm the robot within {ANSWERED:g} s")
+                await self._request(0.0, 0.0, 0.0)
                 requests += 1
                 if arming is not None and arming.done():
                     refusal, arming = arming.result(), None
@@ -242,6 +236,10 @@ class _Run:
         state = self.state
         return state is not None and state.mode is GateMode.DRIVING and state.holder == self._truck.source
 
+    async def _request(self, speed: float, front: float, rear: float) -> None:
+        """Request a motion, with a lease of several request periods."""
+        await self._truck.drive(speed, front, rear, 10 * REQUEST_PERIOD)  # the gate may grant less
+
     async def hold(self, speed: float, front: float, rear: float, seconds: float) -> None:
         """Request one motion for ``seconds``.
 
@@ -251,26 +249,26 @@ class _Run:
         """
         end = self._clock.now() + round(seconds * SECOND)
         while self._clock.now() < end:
-            await self._truck.drive(speed, front, rear, MOVE_LEASE)
+            await self._request(speed, front, rear)
             await self._clock.sleep(min(REQUEST_PERIOD, (end - self._clock.now()) / SECOND))
             self._take()
             self._check()
 
     async def rest(self, front: float, rear: float) -> None:
         """Stop and wait for rest."""
-        end = self._clock.now() + round(REST_LIMIT * SECOND)
+        end = self._clock.now() + round(RESTING * SECOND)
         still = -1
         while self._clock.now() < end:
             await self.hold(0.0, front, rear, REQUEST_PERIOD)
             if not self.track.drive:
                 continue
             newest = self.track.drive[-1]
-            moved = [r.stamp for r in self.track.drive if abs(r.position - newest.position) > RESTING_TURN]
-            if newest.stamp - max(moved, default=newest.stamp) > RESTING_TIME * SECOND:
+            moved = [r for r in self.track.drive if _moved(r, newest)]
+            if moved and _rested(moved[-1], newest):
                 still = newest.stamp
                 break
         if still < 0:
-            raise NoAnswerError(f"the drive does not come to rest within {REST_LIMIT:g} s")
+            raise NoAnswerError(f"the drive does not come to rest within {RESTING:g} s")
         self.track.arrived = still
 
     async def coasted(self, drivetrain: DriveTrain) -> float | None:
@@ -279,15 +277,15 @@ class _Run:
         Returns:
             Distance travelled (m); None if the truck does not come to rest or the reason does not clear.
         """
-        end = self._clock.now() + round(REST_LIMIT * SECOND)
+        end = self._clock.now() + round(RESTING * SECOND)
         since: DriveFeedback | None = None
         while self._clock.now() < end:
             await self._clock.sleep(REQUEST_PERIOD)
             self._take()
             newest = self.track.drive[-1] if self.track.drive else None
-            if since is None or newest is None or abs(newest.position - since.position) > RESTING_TURN:
+            if since is None or newest is None or _moved(since, newest):
                 since = newest
-            elif newest.stamp - since.stamp > RESTING_TIME * SECOND and not self._lasting():
+            elif _rested(since, newest) and not self._lasting():
                 return abs(self.track.distance(drivetrain))
         return None
 
@@ -321,3 +319,13 @@ class _Run:
         text = in_words(reasons) or f"the robot is {state.mode}"
         advice = "".join(f"; {text}" for text in dict.fromkeys(ADVICE[r] for r in reasons if r in ADVICE))
         raise RequestRefusedError(reasons[0] if reasons else Reason.DISARMED, f"stopped by the gate: {text}{advice}")
+
+
+def _moved(since: DriveFeedback, newest: DriveFeedback) -> bool:
+    """Whether the motor has turned by more than an encoder that alternates between two counts (rad)."""
+    return abs(newest.position - since.position) > 0.1
+
+
+def _rested(since: DriveFeedback, newest: DriveFeedback) -> bool:
+    """Whether a drive that has not moved since a reading is at rest."""
+    return newest.stamp - since.stamp > SECOND // 2

@@ -15,7 +15,8 @@ from typing import Any, Final, Generic, TypeVar
 from pydantic import TypeAdapter
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.outside import MEGABYTE, contents, reading
+from monstertruck_runtime.outside import contents, reading
+from monstertruck_runtime.small_files import MEGABYTE
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 
 Outcome = TypeVar("Outcome")

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.outside import MOST_PIXELS, reading
+from monstertruck_runtime.outside import reading, require_pixels
 
 
 def pixels_of(data: bytes, where: str) -> NDArray[np.uint8]:
@@ -22,6 +21,5 @@ def pixels_of(data: bytes, where: str) -> NDArray[np.uint8]:
         InputError: it is damaged or has too many pixels.
     """
     with reading(Path(where), "a picture"), Image.open(BytesIO(data), formats=["JPEG"]) as image:
-        if image.width * image.height > MOST_PIXELS:
-            raise InputError(f"{where}: {image.width} x {image.height} pixels: expected at most {MOST_PIXELS}")
+        require_pixels(where, image.width, image.height)
         return np.asarray(image.convert("RGB"))

@@ -12,7 +12,8 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.outside import MEGABYTE, MOST_UNPACKED, reading
+from monstertruck_runtime.outside import MOST_UNPACKED, reading
+from monstertruck_runtime.small_files import MEGABYTE
 from monstertruck_runtime.yaml_files import read_yaml
 from monstertruckd.recorder.reader import open_log
 from monstertruckd.tools.logs.bags import METADATA, READERS, RawMessage, mcap_messages

@@ -17,8 +17,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from monstertruck_runtime.errors import InputError
-from monstertruck_runtime.outside import MEGABYTE, contents, reading
-from monstertruck_runtime.small_files import replace_file
+from monstertruck_runtime.outside import contents, reading
+from monstertruck_runtime.small_files import MEGABYTE, replace_file
 
 DAY: Final = 86_400
 

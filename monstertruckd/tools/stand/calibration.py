@@ -18,8 +18,8 @@ from monstertruck_estimation.vision.tags import Picture, Sighting, TagReader
 from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.fitting import least_squares
 from monstertruck_runtime.errors import ConfigError, InputError
-from monstertruck_runtime.outside import MEGABYTE, contents, reading
-from monstertruck_runtime.small_files import make_folder, replace_file
+from monstertruck_runtime.outside import contents, reading
+from monstertruck_runtime.small_files import MEGABYTE, make_folder, replace_file
 from monstertruck_schemas.base import Schema
 from monstertruckd.tools.stand.camera import PlacedCamera, meet, rotation_matrix
 from monstertruckd.tools.stand.config import MarkConfig, OverheadConfig

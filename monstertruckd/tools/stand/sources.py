@@ -18,7 +18,7 @@ from monstertruck_drivers.webcam.source import Mode
 from monstertruck_estimation.vision.tags import Picture
 from monstertruck_runtime.clock import WallClock
 from monstertruck_runtime.errors import DeviceLostError, InputError, TruckError
-from monstertruck_runtime.outside import MOST_PIXELS, picture
+from monstertruck_runtime.outside import picture, require_pixels
 from monstertruckd.tools.stand.config import FileSource, RenderedCamera, VideoDevice
 
 ENDINGS: Final = (".png", ".jpg", ".jpeg", ".pgm")
@@ -118,8 +118,7 @@ def _frames(name: Path, capture: cv2.VideoCapture, closed: Exception, *, colour:
         if not capture.isOpened():
             raise type(closed)(f"{name}: {closed}")
         width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
-        if width * height > MOST_PIXELS:
-            raise InputError(f"{name}: {width:.0f} x {height:.0f} pixels: expected at most {MOST_PIXELS}")
+        require_pixels(name, width, height)
         while True:
             there, frame = capture.read()
             if not there:

@@ -5,16 +5,9 @@ is small.
 """
 
 from collections.abc import Generator, Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-
-CALM: Final = 0.5
-"""Maximum overshoot of calm gains, as a fraction."""
-FIRST_D, RAISE_D = 0.5, 1.8
-"""First K_d, as a fraction of K_p, and its growth factor."""
-MOST_RUNS: Final = 16
-"""Runs."""
 
 
 class WallGains(NamedTuple):
@@ -58,26 +51,28 @@ def recipe(k_p: float) -> Generator[WallGains, RunVerdict, WallGains | None]:
     Returns:
         Calm gains with the smallest steady error; None if none was calm.
     """
+    calm, most = 0.5, 16  # overshoot of calm gains, as a fraction, and runs, at most
     gains, runs = WallGains(k_p, 0.0), 1
     verdict = yield gains
+    first_d, raise_d = 0.5, 1.8  # first K_d, as a fraction of K_p, and its growth factor
     raise_p = 1.5, 1.2  # factors of K_p, at first and again later
     # Minimum overshoot, as a fraction of the first error.
-    while verdict.overshoot < 0.6 and runs < MOST_RUNS and gains.k_p * raise_p[0] <= 60.0:  # k_p that is tried
+    while verdict.overshoot < 0.6 and runs < most and gains.k_p * raise_p[0] <= 60.0:  # k_p that is tried
         gains, runs = WallGains(gains.k_p * raise_p[0], 0.0), runs + 1
         verdict = yield gains
     best: tuple[float, WallGains] | None = None
-    while runs < MOST_RUNS:
-        if verdict.overshoot <= CALM:
+    while runs < most:
+        if verdict.overshoot <= calm:
             if best is None or verdict.steady < best[0]:
                 best = verdict.steady, gains
             if verdict.steady <= 0.006:  # maximum small steady error, m, as in the coursework
                 break
             gains = WallGains(gains.k_p * raise_p[1], gains.k_d)
         else:
-            gains = WallGains(gains.k_p, max(FIRST_D * gains.k_p, RAISE_D * gains.k_d))
+            gains = WallGains(gains.k_p, max(first_d * gains.k_p, raise_d * gains.k_d))
         runs += 1
         verdict = yield gains
     else:
-        if verdict.overshoot <= CALM and (best is None or verdict.steady < best[0]):
+        if verdict.overshoot <= calm and (best is None or verdict.steady < best[0]):
             best = verdict.steady, gains
     return None if best is None else best[1]

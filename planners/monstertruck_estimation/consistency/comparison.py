@@ -9,11 +9,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import combinations
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from monstertruck_estimation.consistency.config import ConsistencyConfig
 from monstertruck_kinematics.se2 import Pose2
 from monstertruck_runtime.clock import SECOND
+
+MOST_DEVIATIONS: Final = 2.0
+"""Maximum errors of a working measure, in standard deviations."""
 
 
 class Measure(StrEnum):

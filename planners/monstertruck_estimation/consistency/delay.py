@@ -14,22 +14,16 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from monstertruck_estimation.consistency.comparison import Errors
+from monstertruck_estimation.consistency.comparison import MOST_DEVIATIONS, Errors
 from monstertruck_estimation.consistency.tracks import MotionTrack
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 
 SHIFT: Final = SECOND // 10
 """Step between the lags tried (ns)."""
-LONGEST_DELAY: Final = 16
-"""Maximum lag tried, in ``SHIFT``; only shorter ones are found."""
 SIGMAS: Final = 5.0
 """Significance of a finding, in standard deviations: a false alarm in 3 million checks. Here it rejects all tolerated
 lags and the longest."""
-GREATEST: Final = 2.0
-"""Maximum errors of a working measure, in standard deviations."""
-FEWEST: Final = 12
-"""Minimum number of places that are compared."""
 
 
 class ScanStep(NamedTuple):
@@ -72,24 +66,24 @@ def lag_question(steps: list[ScanStep], others: list[tuple[Errors, MotionTrack]]
         others: other measures of the same motion.
         tolerated: maximum tolerated lag (s).
     """
-    shifts = SHIFT * np.arange(LONGEST_DELAY + 1)[:, None]
+    lags = SHIFT * np.arange(17)  # only lags shorter than the last one are found
     known = []
     for errors, track in others:
-        usable = tuple(row for row in steps if track.covers(row.since - LONGEST_DELAY * SHIFT, row.stamp))
-        if len(usable) >= FEWEST:
-            begins, ends = (np.array([row[end] for row in usable]) - shifts for end in (0, 1))
+        usable = tuple(row for row in steps if track.covers(row.since - int(lags[-1]), row.stamp))
+        if len(usable) >= 12:  # places that are compared, at least
+            begins, ends = (np.array([row[end] for row in usable]) - lags[:, None] for end in (0, 1))
             known.append((errors, usable, track.motions(begins, ends)))
     return LagQuestion(int(tolerated * SECOND / SHIFT), tuple(known))
 
 
 def scan_delay(question: LagQuestion) -> Delay | None:
     """Return the lag of the scans behind all other measures, or None unless it exceeds the tolerance beyond chance."""
-    cost, squares, places = np.zeros(LONGEST_DELAY + 1), np.zeros(LONGEST_DELAY + 1), 0
+    cost, squares, places = np.zeros(1), np.zeros(1), 0
     for errors, steps, moved in question.others:
         for axis in _axes(errors):
             mahalanobis, volume = _fit(steps, moved, axis)
-            cost += mahalanobis + volume
-            squares += mahalanobis
+            cost = cost + mahalanobis + volume
+            squares = squares + mahalanobis
             places += len(steps)
     best, allowed = int(np.argmin(cost)), question.tolerated + 1
     if not places or best < allowed:
@@ -97,7 +91,7 @@ def scan_delay(question: LagQuestion) -> Delay | None:
     # Errors that exceed the stated ones everywhere make every difference less certain.
     inflation = max(1.0, float(squares[best]) / places)
     # A change that the scans have not shown up to the longest lag may never show: the other measure may be wrong.
-    rejected = min(cost[:allowed].min(), cost[LONGEST_DELAY]) - cost[best]
+    rejected = min(cost[:allowed].min(), cost[-1]) - cost[best]
     sigmas = math.sqrt(float(rejected) / inflation)
     return Delay(best * SHIFT / SECOND, sigmas) if sigmas >= SIGMAS else None
 
@@ -135,7 +129,7 @@ def _fit(steps: tuple[ScanStep, ...], moved: Array, axis: _Axis) -> tuple[Array,
     greatest += np.square(axis.bend) * _outer(ways) + np.square(axis.drift) * _outer(seconds[None])
     greatest += np.square(axis.constant) * np.eye(len(steps))
     offset = 1.0  # standard deviation of the unknown place at the start, m or rad
-    root = np.linalg.cholesky(greatest / GREATEST**2 + np.square(offset) + np.diag(seen))
+    root = np.linalg.cholesky(greatest / MOST_DEVIATIONS**2 + np.square(offset) + np.diag(seen))
     white = np.linalg.solve(root, (shown - places)[..., None])[..., 0]
     volume = 2.0 * np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)), axis=1)
     return np.sum(np.square(white), axis=1), volume

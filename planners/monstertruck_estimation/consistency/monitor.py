@@ -13,6 +13,7 @@ from collections.abc import Collection, Iterator
 from typing import Final, NamedTuple
 
 from monstertruck_estimation.consistency.comparison import (
+    MOST_DEVIATIONS,
     Disagreement,
     Measure,
     Motions,
@@ -23,7 +24,7 @@ from monstertruck_estimation.consistency.comparison import (
     way_limit,
 )
 from monstertruck_estimation.consistency.config import ConsistencyConfig
-from monstertruck_estimation.consistency.delay import FEWEST, GREATEST, Delay, LagQuestion, ScanStep, lag_question
+from monstertruck_estimation.consistency.delay import Delay, LagQuestion, ScanStep, lag_question
 from monstertruck_estimation.consistency.exchange import IN_USE, Claim, StepOutput
 from monstertruck_estimation.consistency.repeats import RepeatDetector, WholeRepeats
 from monstertruck_estimation.consistency.rest import RestWatch
@@ -327,7 +328,7 @@ class ConsistencyMonitor:
         if Measure.SCANS not in motions:
             return way, turn
         # Among people who walk with the robot, the registration jumps from one person to the next.
-        errors, scatter = self._errors[Measure.SCANS], [GREATEST * math.sqrt(2.0) * one for one in self._scatter]
+        errors, scatter = self._errors[Measure.SCANS], [MOST_DEVIATIONS * math.sqrt(2.0) * one for one in self._scatter]
         stated = 0.0 if errors.way is None else errors.way[1]
         return way + max(0.0, scatter[0] - stated), turn + max(0.0, scatter[1] - errors.turn[1])
 
@@ -369,7 +370,8 @@ class ConsistencyMonitor:
         interval, tolerated = max(self._intervals), self._config.delay
         tolerated += interval if interval > tolerated else 0.0  # stamps of sparse scans are that uncertain
         others = [(self._errors[measure], self._tracks[measure]) for measure in self._witnesses]
-        return lag_question(steps, others, tolerated) if len(steps) >= FEWEST else None
+        question = lag_question(steps, others, tolerated)
+        return question if question.others else None
 
     def _take_delay(self, stamp: int, delay: Delay) -> None:
         lidar, (first, *_) = self._sensors[Measure.SCANS], self._witnesses

@@ -11,7 +11,6 @@ could bring the body nearer to standing than to rolling on show nothing.
 
 import math
 from collections import deque
-from typing import Final
 
 import numpy as np
 
@@ -20,17 +19,6 @@ from monstertruck_estimation.slam.scans import Scan
 from monstertruck_kinematics.elementary import Array
 from monstertruck_runtime.clock import SECOND
 from monstertruck_schemas.state import StandingBody
-
-LIKELIER: Final = 16.0
-"""Minimum of twice the logarithm of the likelihood ratio: 4 standard deviations. A false finding moves the robot 3 cm
-back while an operator watches it."""
-AFTER: Final = 2
-"""Minimum number of places after the break."""
-BEFORE: Final = 3
-"""Minimum number of places that determine the slope before the break; with fewer it is 1."""
-FREE: Final = 3
-"""Minimum number of places in addition to the coefficients of the lines; the stated variance counts as much as so many
-places show."""
 
 
 class StandingWatch:
@@ -81,19 +69,22 @@ class StandingWatch:
 
     def _judged(self) -> StandingBody | None:
         _, rolled, shown, variances = np.array(self._places).T
-        likeliest, found = LIKELIER, None
-        for start in range(len(rolled) - AFTER):
+        # Twice the logarithm of the likelihood ratio of a finding: 4 standard deviations. A false finding moves the
+        # robot 3 cm back while an operator watches it.
+        likeliest, found = 4.0**2, None
+        least = 3  # places in addition to the coefficients; the stated variance counts as much as so many places show
+        for start in range(len(rolled) - 2):  # at least two places after the break
             before, after = np.minimum(rolled - rolled[start], 0.0), np.maximum(rolled - rolled[start], 0.0)
             columns, places = np.ones((len(rolled), 1)), shown - before
-            if start >= BEFORE:
+            if start >= 3:  # places that determine the slope before the break; with fewer it is 1
                 columns, places = np.column_stack((columns, before)), shown
             free = len(rolled) - columns.shape[1] - 1
-            if free < FREE:
+            if free < least:
                 continue
             sides = np.column_stack((places, places - (1.0 - self._slip) * after))
             coefficients = np.linalg.lstsq(columns, sides, rcond=None)[0]
             stands, rolls = ((sides - columns @ coefficients) ** 2).sum(axis=0).tolist()
-            likelier = (rolls - stands) * (FREE + free) / (FREE * float(variances.mean()) + stands)
+            likelier = (rolls - stands) * (least + free) / (least * float(variances.mean()) + stands)
             if likelier > likeliest:
                 likeliest = likelier
                 way, seen = float(rolled[-1] - rolled[start]), float(shown[-1] - shown[start])

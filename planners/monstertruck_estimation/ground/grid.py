@@ -20,8 +20,6 @@ GROUND_RESOLUTION: Final = 0.1
 """Edge of a cell (m)."""
 LARGEST_GROUND_GRID: Final = 2000
 """Maximum number of cells per side; cells outside are left out."""
-KEY: Final = 1 << 24
-"""Factor that combines the two indices of a cell or square into one number."""
 
 Cells = NDArray[np.int64]
 
@@ -52,7 +50,7 @@ class GroundGrid:
             roughness: standard deviation of its height (m); one value or n.
         """
         cells = np.floor(points / GROUND_RESOLUTION).astype(np.int64)
-        _, first = np.unique(cells[:, 0] * KEY + cells[:, 1], return_index=True)
+        _, first = np.unique(_key(*cells.T), return_index=True)
         cells = cells[first]
         if not len(cells) or not self._grow(cells.min(axis=0), cells.max(axis=0)):
             return
@@ -157,7 +155,7 @@ def planes(points: Array) -> tuple[Array, Array, Array]:
         standard deviation of the heights about it, (k,) (m).
     """
     x, y = np.floor(points[:, :2] / 0.3).astype(np.int64).T  # side of the squares a plane is fitted to, m
-    _, which, counts = np.unique(x * KEY + y, return_inverse=True, return_counts=True)
+    _, which, counts = np.unique(_key(x, y), return_inverse=True, return_counts=True)
 
     def mean(values: Array) -> Array:
         return np.asarray(np.bincount(which, values, len(counts)) / counts)
@@ -173,3 +171,8 @@ def planes(points: Array) -> tuple[Array, Array, Array]:
     rough = np.sqrt(np.maximum(zz - along * xz - across * yz, 0.0))
     tilt, chosen = np.arctan(np.hypot(along, across)), good[which]
     return points[chosen, :2], tilt[which][chosen], rough[which][chosen]
+
+
+def _key(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return one number for both indices of a cell or square."""
+    return np.asarray(x * (1 << 24) + y)

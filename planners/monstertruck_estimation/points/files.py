@@ -16,8 +16,6 @@ from monstertruck_schemas.points import PointOfInterest
 
 FILE: Final = "points.json"
 LARGEST_POINTS_FILE: Final = 5_000_000
-VARIANCES: Final = (1e-12, 1e12)
-"""Minimum and maximum variance of any direction that is accepted from a file (m^2 or rad^2)."""
 _POINTS: Final = TypeAdapter(list[PointOfInterest])
 
 
@@ -66,18 +64,18 @@ def _read(file: Path) -> list[PointOfInterest]:
             raise InputError(f"{file}: {point.name}: expected every name once")
         if max(map(abs, (point.x, point.y, point.z, point.yaw))) > MAX_COORDINATE:
             raise InputError(f"{file}: {point.name}: expected at most {MAX_COORDINATE:g} m and rad")
-        if not _is_covariance(np.reshape(point.covariance, (3, 3))):
-            least, most = VARIANCES
+        least, most = 1e-12, 1e12  # variance of any direction, m^2 or rad^2
+        if not _is_covariance(np.reshape(point.covariance, (3, 3)), least, most):
             text = f"expected a symmetric matrix of variances from {least:g} to {most:g}"
             raise InputError(f"{file}: {point.name}: covariance: {text}")
     return points
 
 
-def _is_covariance(matrix: Array) -> bool:
+def _is_covariance(matrix: Array, least: float, most: float) -> bool:
     if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T):
         return False
-    least, _, most = np.linalg.eigvalsh(matrix)
-    return bool(VARIANCES[0] <= least and most <= VARIANCES[1])
+    smallest, _, largest = np.linalg.eigvalsh(matrix)
+    return bool(least <= smallest and largest <= most)
 
 
 def _picture(file: Path) -> bytes:

@@ -26,8 +26,6 @@ UNIT = 100
 """Cost of a step to the next column or row in open space."""
 
 UNREACHED = 2**30
-BUCKETS = 2048
-"""Upper bound of an estimate's growth per step: the maximum step cost plus the cost of a step in open space."""
 
 NEIGHBOURS = np.array([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]], dtype=np.int64)
 """Column and row of each neighbour, counter-clockwise."""
@@ -35,9 +33,6 @@ NEIGHBOURS = np.array([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -
 
 TABLE_REACH = 4.0
 """Half size of the Reeds-Shepp table, turning radii."""
-
-TABLE_SPACING = 0.25
-TABLE_HEADINGS = 36
 
 
 OVERRUN = 1.3
@@ -142,14 +137,16 @@ def cost_to_go(
     """
     rows, columns = cell_cost.shape
     most = 8 * rows * columns + 1
+    # Upper bound of an estimate's growth per step: the maximum step cost plus the cost of a step in open space.
+    buckets = 2048
     to_go = CostToGo(
         np.full((rows, columns), UNREACHED, np.int32), np.full((rows, columns), -1, np.int8), cell_cost, cell, start,
-        least, np.full(BUCKETS, -1, np.int32), np.empty(most, np.int32), np.empty(most, np.int32),
+        least, np.full(buckets, -1, np.int32), np.empty(most, np.int32), np.empty(most, np.int32),
         np.array([1, 1, 0, UNREACHED]),
     )  # fmt: skip
     to_go.cost[goal] = 0
     to_go.state[LEVEL] = _estimate(to_go, *goal)
-    bucket = int(to_go.state[LEVEL]) % BUCKETS
+    bucket = int(to_go.state[LEVEL]) % buckets
     to_go.cell_of[0], to_go.following[0], to_go.head[bucket] = goal[0] * columns + goal[1], -1, 0
     shortest = cost_at(to_go, *start)
     if shortest < UNREACHED and overrun < inf:
@@ -190,7 +187,8 @@ def _settle_level(to_go: CostToGo) -> None:
     rows, columns = to_go.cell_cost.shape
     cost, step, cell_cost, state = to_go.cost, to_go.step, to_go.cell_cost, to_go.state
     level = state[LEVEL]
-    bucket = level % BUCKETS
+    buckets = len(to_go.head)
+    bucket = level % buckets
     used, waiting = state[USED], state[WAITING]
     while to_go.head[bucket] >= 0:
         entry = to_go.head[bucket]
@@ -217,7 +215,7 @@ def _settle_level(to_go: CostToGo) -> None:
             if known + step_cost < cost[r, c]:
                 cost[r, c] = known + step_cost
                 step[r, c] = (k + 4) & 7
-                into = (known + step_cost + _estimate(to_go, r, c)) % BUCKETS
+                into = (known + step_cost + _estimate(to_go, r, c)) % buckets
                 to_go.cell_of[used], to_go.following[used] = r * columns + c, to_go.head[into]
                 to_go.head[into] = used
                 used += 1
@@ -265,16 +263,17 @@ def cells_to_goal(step: NDArray[np.int8], row: int, column: int) -> NDArray[np.i
 
 @njit(cache=True)
 def _fill_table(crab: float) -> NDArray[np.float32]:
-    across = round(2 * TABLE_REACH / TABLE_SPACING) + 1
-    table = np.empty((across, (across + 1) // 2, TABLE_HEADINGS), np.float32)
+    across, headings = 33, 36
+    spacing = 2 * TABLE_REACH / (across - 1)
+    table = np.empty((across, (across + 1) // 2, headings), np.float32)
     start, goal = np.zeros(3), np.zeros(3)
     segments, best, scratch = np.empty((MAX_SEGMENTS, 3)), np.full(8, inf), np.empty((4, 3))
     weights = np.array([1.0, 0.0, 1.0])
     for i in range(across):
         for j in range((across + 1) // 2):
-            for k in range(TABLE_HEADINGS):
-                goal[0], goal[1] = i * TABLE_SPACING - TABLE_REACH, j * TABLE_SPACING
-                goal[2] = 2 * pi * k / TABLE_HEADINGS
+            for k in range(headings):
+                goal[0], goal[1] = i * spacing - TABLE_REACH, j * spacing
+                goal[2] = 2 * pi * k / headings
                 connect(start, goal, 1.0, crab, weights, segments, best, scratch)
                 table[i, j, k] = best[COST]
     return table
@@ -302,8 +301,9 @@ def _reeds_shepp_length(
         return radius * sqrt(px * px + py * py)
     if py < 0.0:
         py, turn = -py, -turn
-    k = floor(turn / (2 * pi) * TABLE_HEADINGS + 0.5) % TABLE_HEADINGS
-    return radius * float(table[int((px + TABLE_REACH) / TABLE_SPACING + 0.5), int(py / TABLE_SPACING + 0.5), k])
+    spacing, headings = 2 * TABLE_REACH / (table.shape[0] - 1), table.shape[2]
+    k = floor(turn / (2 * pi) * headings + 0.5) % headings
+    return radius * float(table[int((px + TABLE_REACH) / spacing + 0.5), int(py / spacing + 0.5), k])
 
 
 @njit(cache=True)

@@ -27,12 +27,6 @@ Angles = tuple[float, float]
 
 BASE: Final = 0.25
 """Minimum time between two compared poses (s): the noise of single poses hardly matters any more."""
-FREEDOM: Final = 4.0
-"""Degrees of freedom of Student's t for the residual weights."""
-BELIEVED: Final = 5.0
-"""Weight of the assumed noise, in intervals."""
-FADE: Final = 1.0 - 1.0 / 150.0
-"""Fraction of the residual sums that remains after each interval."""
 
 DEAD_BAND: Final = 0.0012
 """Standard deviation of the servo's stop position (rad of the axle): a dead band of 2 us to either side, uniformly."""
@@ -262,14 +256,17 @@ class AxleErrorEstimator:
         by = row[1:]
         residual = measured - float(row[0] + by @ self.state)
         # Standard deviation of a turn (rad) and of a sideways motion (m) before any comparison.
-        noise = (self._squares[kind] + BELIEVED * (0.003, 0.002)[kind] ** 2) / (self._counts[kind] + BELIEVED) + known
+        assumed, believed = (0.003, 0.002)[kind], 5.0  # believed: weight of the assumed noise, in intervals
+        noise = (self._squares[kind] + believed * assumed**2) / (self._counts[kind] + believed) + known
         spread = self.covariance @ by
         predicted = float(by @ spread)
-        weight = (FREEDOM + 1.0) / (FREEDOM + residual**2 / (predicted + noise))
+        freedom = 4.0  # degrees of freedom of Student's t for the weights of residuals
+        weight = (freedom + 1.0) / (freedom + residual**2 / (predicted + noise))
         unexplained = weight * residual**2 * noise / (predicted + noise) - known
-        self._squares[kind] = FADE * self._squares[kind] + max(unexplained, 0.0)
-        self._counts[kind] = FADE * self._counts[kind] + 1.0
-        # Student's t with this scale has a variance that is larger by FREEDOM / (FREEDOM - 2).
-        gain = spread / (predicted + noise * FREEDOM / (FREEDOM - 2.0) / min(weight, 1.0))
+        fade = 1.0 - 1.0 / 150.0  # share of the sums that remains after each interval
+        self._squares[kind] = fade * self._squares[kind] + max(unexplained, 0.0)
+        self._counts[kind] = fade * self._counts[kind] + 1.0
+        # Student's t with this scale has a variance that is larger by freedom / (freedom - 2).
+        gain = spread / (predicted + noise * freedom / (freedom - 2.0) / min(weight, 1.0))
         self.state = self.state + gain * residual
         self.covariance = self.covariance - np.outer(gain, spread)

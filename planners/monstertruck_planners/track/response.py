@@ -22,10 +22,6 @@ DEAD_TIMES: Final = 31
 """Number of candidate dead times: 0 to 0.3 s."""
 LAGS: Final = np.array((0.0, 0.05, 0.1, 0.15, 0.2))
 """Candidate lags (s)."""
-KEPT_CELLS: Final = 100
-"""Required history before the latest cell, in cells: the longest dead time plus the longest pause between poses."""
-EARLY: Final = 1e-6
-"""Maximum rounding error of an instant, in cells early."""
 TURN_NOISE: Final = 0.003
 """Standard deviation of a measured turn before any comparison (rad)."""
 
@@ -95,7 +91,8 @@ class ResponseEstimator:
         """Maximum change within one cell (rad/m)."""
         self._curvatures = [0.0] * len(self._keep)
         self._turns = [0.0] * len(self._keep)
-        self._history = np.zeros((len(self._keep), 4 * KEPT_CELLS))
+        # At least a second before the latest cell is kept: the longest dead time plus the longest pause between poses.
+        self._history = np.zeros((len(self._keep), 400))
         """Time integral of the turn per metre at the end of each cell (rad s/m)."""
         self._end = 1
         """Number of cells written."""
@@ -141,15 +138,16 @@ class ResponseEstimator:
 
     def _fill(self, t: float) -> None:
         """Write all cells that end by ``t``."""
-        count = math.floor((t - self._begin) / LAG_CELL + EARLY) + 1 - self._end
-        if count > 2 * KEPT_CELLS:
+        count = math.floor(self._cells(t)) + 1 - self._end
+        half = self._history.shape[1] // 2
+        if count > half:
             self.forget_requests()
             return
         for _ in range(count):
             if self._end == len(self._history[0]):
-                self._history[:, : 2 * KEPT_CELLS] = self._history[:, 2 * KEPT_CELLS :]
-                self._end -= 2 * KEPT_CELLS
-                self._begin += 2 * KEPT_CELLS * LAG_CELL
+                self._history[:, :half] = self._history[:, half:]
+                self._end -= half
+                self._begin += half * LAG_CELL
             for i, keep in enumerate(self._keep):
                 change = (1.0 - keep) * (self._bend - self._curvatures[i])
                 self._curvatures[i] += min(max(change, -self._most), self._most)
@@ -157,9 +155,13 @@ class ResponseEstimator:
             self._history[:, self._end] = self._turns
             self._end += 1
 
+    def _cells(self, t: float) -> float:
+        """Return the cells before an instant; one that ends then counts in spite of rounding."""
+        return (t - self._begin) / LAG_CELL + 1e-6
+
     def _at(self, t: float) -> Array | None:
         """Return the sums at ``t`` minus each dead time, by candidate; None if that precedes the history."""
-        cells = (t - self._begin) / LAG_CELL + EARLY
+        cells = self._cells(t)
         i = math.floor(cells)
         if i < DEAD_TIMES or i >= self._end:
             return None

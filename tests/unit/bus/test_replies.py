@@ -11,7 +11,6 @@ import zenoh
 from monstertruck_runtime.client import TruckClient
 from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import MAP, Writer
-from monstertruckd.bus import replies as replies_module
 from monstertruckd.bus.replies import THREADS, Replies
 from tests.bus_kit import gate_state, running_robot
 from tests.unit.bus.test_zenoh_frozen import other_station
@@ -80,8 +79,8 @@ def test_an_owner_has_one_reply_under_way_and_holds_up_no_other():
 
 
 def test_where_too_many_wait_no_more_are_taken_until_one_has_left(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(replies_module, "REPLY_QUEUE", 20)
     replies, taken = Replies(), threading.Event()
+    monkeypatch.setattr(replies, "_most", 20)
     for _ in range(19):
         replies.end(Question(taken))
     replies.wait_for_room()

@@ -11,7 +11,6 @@ from monstertruck_kinematics.elementary import KinematicsError
 from monstertruck_kinematics.polynomials import (
     F_CORRECTED,
     F_PRINTED,
-    G_PRINTED,
     AxlePolynomials,
     SteeringPolynomials,
     mirrored,
@@ -57,8 +56,8 @@ def test_round_trip_from_the_wheel_as_tabled(limit, printed):
 
 
 def test_single_values_as_tabled():
-    assert in_degrees(polynomial(G_PRINTED, math.radians(25)), 2) == 24.22
-    assert in_degrees(polynomial(G_PRINTED, 0.0), 2) == 0.20
+    assert in_degrees(polynomial(SteeringPolynomials().front.right_from_left, math.radians(25)), 2) == 24.22
+    assert in_degrees(polynomial(SteeringPolynomials().front.right_from_left, 0.0), 2) == 0.20
     ends = [in_degrees(polynomial(f, s * math.pi / 4), 1) for f in (F_PRINTED, F_CORRECTED) for s in (-1, 1)]
     assert ends == [-30.8, 28.8, -29.3, 27.3]
 

@@ -32,7 +32,7 @@ from monstertruckd.station.feed import SHOWN, MapStore, RobotFeed
 from monstertruckd.station.pilot import MOST_ASKED, DelayWatch, Pilot
 from monstertruckd.station.server import PAGE, Place
 from monstertruckd.station.users import StationUsers, add_user
-from monstertruckd.station.viewer import MOST_ANSWERS, MOST_TILES, Viewer
+from monstertruckd.station.viewer import MOST_TILES, Viewer
 
 MEMORY = 200
 OLDEST = 1.5
@@ -118,19 +118,19 @@ async def test_a_map_is_announced_fetched_and_changed_by_tiles():
 
 
 async def test_a_browser_that_does_not_read_gets_the_newest_only_and_bounded_events():
-    viewer = Viewer()
-    for number in range(3 * MOST_ANSWERS):
+    viewer, most = Viewer(), 256
+    for number in range(3 * most):
         viewer.show("scan", str(number))
         viewer.show("camera", b"picture")
         viewer.send(f"event {number}")
         viewer.patch((number % 2, 0.0), str(-number))
-    received = [await viewer.next() for _ in range(MOST_ANSWERS + 4)]
-    assert received[0] == f"event {2 * MOST_ANSWERS}"
-    last = 3 * MOST_ANSWERS - 1
+    received = [await viewer.next() for _ in range(most + 4)]
+    assert received[0] == f"event {2 * most}"
+    last = 3 * most - 1
     assert received[-4:] == [str(last), str(1 - last), str(-last), b"picture"], (
         "the newest; pictures of the camera last"
     )
-    assert viewer.lost == 2 * MOST_ANSWERS
+    assert viewer.lost == 2 * most
     waiting = asyncio.create_task(viewer.next())
     await asyncio.sleep(0)
     assert not waiting.done()

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageDraw, ImageFont
 
 from monstertruck_drivers.webcam.driver import TABLES_SEGMENT, complete
-from monstertruck_drivers.webcam.emulator import FONT_SIZE, jpeg
+from monstertruck_drivers.webcam.emulator import jpeg
 from tests.unit.drivers.webcam.pictures import bare, picture, pixels
 
 
@@ -68,7 +68,7 @@ def test_the_counter_can_be_read():
 
     def likeness(number: int) -> float:
         template = Image.new("L", (640, 480))
-        ImageDraw.Draw(template).text((8, 8), f"{number:06d}", fill="white", font=ImageFont.load_default(FONT_SIZE))
+        ImageDraw.Draw(template).text((8, 8), f"{number:06d}", fill="white", font=ImageFont.load_default(20))
         crop = np.s_[8:32, 8:90]
         return float(np.abs(np.asarray(template).astype(int)[crop] - image[crop]).mean())
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from monstertruck_kinematics.chassis import Dimensions, TruckChassis, truck_chassis
-from monstertruck_kinematics.polynomials import F_CORRECTED, G_PRINTED, AxlePolynomials, SteeringPolynomials, mirrored
+from monstertruck_kinematics.polynomials import AxlePolynomials, SteeringPolynomials
 from monstertruck_kinematics.truck import DriveTrain
 from monstertruck_runtime.errors import InputError
 from monstertruck_schemas.body import TurnDeficitConfig
@@ -216,7 +216,10 @@ def another_linkage(rng: np.random.Generator) -> SteeringModel:
 
     front, rear = (
         AxlePolynomials(other(f), other(g))
-        for f, g in ((F_CORRECTED, G_PRINTED), (mirrored(F_CORRECTED), mirrored(G_PRINTED)))
+        for f, g in (
+            (axle.left_from_servo, axle.right_from_left)
+            for axle in (SteeringPolynomials().front, SteeringPolynomials().rear)
+        )
     )
     chassis = truck_chassis(Dimensions(DriveTrain(), polynomials=SteeringPolynomials(front, rear)))
     assert isinstance(chassis, TruckChassis)

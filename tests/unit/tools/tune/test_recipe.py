@@ -19,7 +19,7 @@ from monstertruck_schemas.reasons import Reason
 from monstertruck_schemas.req import BehaviourOrder
 from monstertruck_schemas.topics import BEHAVIOUR, GATE
 from monstertruckd.tools.cli.main import app
-from monstertruckd.tools.tune.recipe import CALM, MOST_RUNS, RunVerdict, judged, recipe
+from monstertruckd.tools.tune.recipe import RunVerdict, judged, recipe
 from monstertruckd.tools.tune.runs import draw, tune
 from tests.bus_kit import gate_state
 from tests.unit.planners.behave.wall_kit import Robot, drive
@@ -97,8 +97,8 @@ def test_it_raises_p_until_it_overshoots_and_d_until_it_is_calm(tmp_path):
     assert best is not None
     assert best.k_d > 0.0
     chosen = next(run for run in runs if run.gains == best)
-    assert chosen.verdict.overshoot <= CALM
-    assert chosen.verdict.steady == min(run.verdict.steady for run in runs if run.verdict.overshoot <= CALM)
+    assert chosen.verdict.overshoot <= 0.5
+    assert chosen.verdict.steady == min(run.verdict.steady for run in runs if run.verdict.overshoot <= 0.5)
     draw(runs, tmp_path / "runs.png")
     assert (tmp_path / "runs.png").stat().st_size > 5000
 
@@ -180,7 +180,7 @@ def test_it_gives_up_after_some_runs_without_calm_gains():
             tried.append(trials.send(RunVerdict(1.0, 0.02)))
     except StopIteration as end:
         best = end.value
-    assert len(tried) == MOST_RUNS
+    assert len(tried) == 16
     assert tried[-1].k_d > 0.0
     assert best is None
 
