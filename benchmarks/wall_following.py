@@ -33,7 +33,6 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import matplotlib.pyplot as plt
 import numpy as np
 from wall_parts.arena import Arena, drawn, start_rule, study
 from wall_parts.simulation import Fault, FaultKind, WallRun, drive_along
@@ -46,6 +45,7 @@ from monstertruck_planners.behave.wall.published import WallPd, WallSwitching
 from monstertruck_runtime.small_files import replace_file
 from monstertruck_schemas.reasons import Reason
 from monstertruck_sim.world.config import FIVE_SONARS
+from monstertruckd.tools.figures import new_figure, write_figure
 
 AFTER: Final = 1.0
 """Metres after a corner, and after the approach, from which on a straight counts."""
@@ -286,7 +286,8 @@ def _figure(figures: dict[str, dict[str, Any]], key: str) -> Any:
 
 
 def _draw(first: dict[str, Result], file: str) -> None:
-    figure, axes = plt.subplots(3, len(first), figsize=(5 * len(first), 11), squeeze=False)
+    figure = new_figure(5 * len(first), 11)
+    axes = figure.subplots(3, len(first), squeeze=False)
     arena = study()
     for column, (name, result) in enumerate(first.items()):
         track, asked = result.run.track, result.run.asked
@@ -303,8 +304,7 @@ def _draw(first: dict[str, Result], file: str) -> None:
         axes[2, column].plot(times, asked[:, 1], label="yaw rate, rad/s", linewidth=0.7)
         axes[2, column].set(xlabel="time, s", ylim=(-1.2, 1.2))
         axes[2, column].legend()
-    figure.tight_layout()
-    figure.savefig(file, dpi=60)
+    write_figure(figure, Path(file))
 
 
 if __name__ == "__main__":

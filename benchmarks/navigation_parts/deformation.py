@@ -18,6 +18,7 @@ from monstertruck_planners.local.catalog import make_local_planner
 from monstertruck_planners.local.config import LocalPlannerConfig, PublishedConfig, RsbandConfig, TebConfig
 from monstertruck_planners.route.api import Vehicle
 from monstertruck_planners.route.motion import MotionPath
+from monstertruckd.tools.figures import new_figure, write_figure
 from navigation_parts import Options, Part
 from navigation_parts.deformation_world import (
     PERIOD,
@@ -162,12 +163,8 @@ def sum_up(part: Part, rows: list[dict]) -> None:
 
 def draw(options: Options, rows: list[dict], scenarios: tuple[Scenario, ...]) -> None:
     """Traces of all runs, ours in colour, published grey."""
-    import matplotlib as mpl  # noqa: PLC0415
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt  # noqa: PLC0415
-
-    figure, axes = plt.subplots(len(scenarios), 2, figsize=(13, 3.6 * len(scenarios)), squeeze=False)
+    figure = new_figure(13, 3.6 * len(scenarios))
+    axes = figure.subplots(len(scenarios), 2, squeeze=False)
     for line, scenario in zip(axes, scenarios, strict=True):
         for ax, car in zip(line, CARS, strict=True):
             world = World(scenario)
@@ -187,6 +184,4 @@ def draw(options: Options, rows: list[dict], scenarios: tuple[Scenario, ...]) ->
             )
             ax.set_aspect("equal")
     axes[0][0].legend(fontsize=7, loc="lower right")
-    figure.tight_layout()
-    figure.savefig(options.out / "deformation.png", dpi=70)
-    plt.close(figure)
+    write_figure(figure, options.out / "deformation.png")

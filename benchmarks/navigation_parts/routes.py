@@ -24,6 +24,7 @@ from monstertruck_planners.route.api import RouteMap, Vehicle
 from monstertruck_planners.route.hybrid import HybridPlanner
 from monstertruck_runtime.map_files import load_map
 from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.figures import new_figure, write_figure
 from navigation_parts import Options, Part, strict
 
 TRUCK = Vehicle.truck("4ws")
@@ -261,15 +262,11 @@ def turns(space, path) -> int:  # noqa: ANN001
 
 def draw(options: Options, rows: list[dict]) -> None:
     """The routes on their maps."""
-    import matplotlib as mpl  # noqa: PLC0415
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt  # noqa: PLC0415
-
     for name in dict.fromkeys(row["map"] for row in rows):
         occupied, resolution = read(options.data / "maps" / f"{name}.yaml")
         extent = (0, occupied.shape[1] * resolution, 0, occupied.shape[0] * resolution)
-        figure, axis = plt.subplots(figsize=(10, 10 * extent[3] / extent[1] + 0.6))
+        figure = new_figure(10, 10 * extent[3] / extent[1] + 0.6)
+        axis = figure.subplots()
         axis.imshow(occupied, origin="lower", cmap="gray_r", extent=extent, alpha=0.7)
         for row in (row for row in rows if row["map"] == name):
             for kind, style in (("2ws", "-"), ("4ws", "--")):
@@ -278,6 +275,4 @@ def draw(options: Options, rows: list[dict]) -> None:
                               label=f"{row['query']} {kind}: {row[f'length_{kind}']:.2f} m")  # fmt: skip
         axis.set(title=f"{name}: routes after {SECONDS:g} s", xlabel="x, m", ylabel="y, m")
         axis.legend(fontsize=7, loc="upper right")
-        figure.tight_layout()
-        figure.savefig(options.out / f"routes_{name}.png", dpi=110)
-        plt.close(figure)
+        write_figure(figure, options.out / f"routes_{name}.png")

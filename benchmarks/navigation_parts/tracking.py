@@ -28,6 +28,7 @@ from monstertruck_planners.track.path_tracker import PathTracker, TruckState
 from monstertruck_planners.track.segments import SegmentedPath
 from monstertruck_schemas.plan import Path
 from monstertruck_schemas.reasons import Reason
+from monstertruckd.tools.figures import new_figure, write_figure
 from navigation_parts import Options, Part
 
 YARDSTICK = FourWheelSteering(wheelbase=0.30, cg_split=1.0)
@@ -344,12 +345,8 @@ def four_wheels(part: Part, arcs: np.ndarray) -> None:
 
 
 def draw(options: Options, table: dict, courses: dict) -> None:
-    import matplotlib as mpl  # noqa: PLC0415
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt  # noqa: PLC0415
-
-    figure, axes = plt.subplots(len(courses), 3, figsize=(18, 6 * len(courses)), squeeze=False)
+    figure = new_figure(18, 6 * len(courses))
+    axes = figure.subplots(len(courses), 3, squeeze=False)
     for row, (course, points) in zip(axes, courses.items(), strict=True):
         for axis, version in zip(row, VERSIONS, strict=True):
             axis.plot(*points.T, color="0.7", linewidth=5)
@@ -359,5 +356,4 @@ def draw(options: Options, table: dict, courses: dict) -> None:
             axis.set_title(f"{course}, 1.0 m/s, lag, {version}")
             axis.set_aspect("equal")
             axis.legend(fontsize=7)
-    figure.tight_layout()
-    figure.savefig(options.out / "tracking.png", dpi=80)
+    write_figure(figure, options.out / "tracking.png")

@@ -16,6 +16,7 @@ from monstertruck_estimation.slam.mapping import Mapper, MappingEvent
 from monstertruck_estimation.slam.scan_matcher import PlanarMatcher, ScanMatcher
 from monstertruck_estimation.slam.scans import prepare
 from monstertruck_kinematics.se2 import between, compose, transform
+from monstertruckd.tools.figures import new_figure, write_figure
 from slam_parts.kiss_alone import KissOdometry
 from slam_parts.logs import Log, load, scored
 
@@ -199,9 +200,7 @@ def _tell(log: Log, done: Run, score: dict[str, float]) -> None:
 
 def draw(log: Log, runs: list[Run], file: Path) -> None:
     """Trajectories, and our map under ours."""
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(15, 5.4), layout="constrained")
+    figure = new_figure(15, 5.4)
     for axes, done in zip(figure.subplots(1, len(runs)), runs, strict=True):
         axes.plot(*done.points.T, "k,", alpha=0.4)
         axes.plot(done.poses[:, 0], done.poses[:, 1], lw=0.7, color="tab:red" if done.method == "ours" else "tab:blue")
@@ -209,4 +208,4 @@ def draw(log: Log, runs: list[Run], file: Path) -> None:
         axes.set_aspect("equal", "datalim")
         axes.grid(alpha=0.3)
     file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=110)
+    write_figure(figure, file)

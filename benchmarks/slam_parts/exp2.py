@@ -43,6 +43,7 @@ from monstertruck_runtime.mailbox import fifo
 from monstertruck_schemas import topics
 from monstertruck_schemas.sensor import LaserScan
 from monstertruckd.config.load import load_config
+from monstertruckd.tools.figures import new_figure, write_figure
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
 
@@ -218,16 +219,14 @@ def against_wheels(recording: Path, poses: np.ndarray) -> tuple[float, float, fl
 
 def draw(maps: dict[str, np.ndarray], file: Path) -> None:
     """The maps side by side."""
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(11, 5.2), layout="constrained")
+    figure = new_figure(11, 5.2)
     for axes, (name, cells) in zip(figure.subplots(1, len(maps)), maps.items(), strict=True):
         shades = np.where(cells < 0, 0.8, 1 - cells / 100)
         axes.imshow(shades, cmap="gray", vmin=0, vmax=1, origin="lower", interpolation="nearest")
         axes.set_title(name, fontsize=10)
         axes.set_axis_off()
     file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=110)
+    write_figure(figure, file)
 
 
 def run(picture: Path | None = None) -> tuple[dict[str, float], dict[str, float], bool]:

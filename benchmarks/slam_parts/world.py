@@ -33,6 +33,7 @@ from monstertruck_schemas.health import MATCHED, LocalisationStatus
 from monstertruck_schemas.sensor import Attitude, DriveFeedback, SteeringFeedback
 from monstertruck_schemas.state import ScanMotion
 from monstertruck_sim.world.config import SimTruckConfig
+from monstertruckd.tools.figures import new_figure, write_figure
 from slam_parts.world_drives import BEAM, SCENARIOS, SWEEP, Drive, draw_corridor, driven
 
 SEEDS, QUICK_SEEDS = 10, 2
@@ -323,9 +324,7 @@ def _slips(runs: list[tuple[Drive, Run]]) -> tuple[int, int]:
 
 def _draw(robots: dict[str, list[tuple[Drive, Run]]], file: Path) -> None:
     """Truth and odometry of the first drive of every kind."""
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(16, 8), layout="constrained")
+    figure = new_figure(16, 8)
     for axes, (name, runs) in zip(figure.subplots(2, 4).flat, robots.items(), strict=False):
         drive, done = runs[0]
         truth, poses = np.array(drive.truth), np.array(done.poses)
@@ -335,4 +334,4 @@ def _draw(robots: dict[str, list[tuple[Drive, Run]]], file: Path) -> None:
         axes.set_aspect("equal", "datalim")
         axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    figure.savefig(file, dpi=110)
+    write_figure(figure, file)

@@ -25,6 +25,7 @@ from monstertruck_runtime.slowness import BOARDS
 from monstertruck_schemas import topics
 from monstertruck_schemas.state import GateMode
 from monstertruckd.config.load import load_config
+from monstertruckd.tools.figures import new_figure, write_figure
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
@@ -127,9 +128,7 @@ def drive(overlay: dict[str, Any], factor: float, seconds: float) -> dict[str, A
 
 
 def draw(options: Options, rows: dict[str, list[dict[str, Any]]]) -> None:
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(12, 5), layout="constrained")
+    figure = new_figure(12, 5)
     misses, cpu = figure.subplots(1, 2)
     for name, found in rows.items():
         for what, style in (("control", "-o"), ("mapping", "--s")):
@@ -147,4 +146,4 @@ def draw(options: Options, rows: dict[str, list[dict[str, Any]]]) -> None:
     shares = sorted((100 * sum(turns) / row["seconds"], module) for module, turns in row["turns"].items())
     cpu.barh([module for _, module in shares], [share for share, _ in shares])
     cpu.set_xlabel("% of a core, ours, this computer")
-    figure.savefig(options.out / "computer.png", dpi=80)
+    write_figure(figure, options.out / "computer.png")

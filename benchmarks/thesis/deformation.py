@@ -12,6 +12,7 @@ from navigation_parts.deformation import CARS, LIMIT, drive
 from navigation_parts.deformation_world import SCENARIOS, SIZE
 
 from monstertruck_planners.local.config import PublishedConfig, RsbandConfig, TebConfig
+from monstertruckd.tools.figures import new_figure, write_figure
 
 METHODS = {
     "ours": RsbandConfig(strategy="start_to_next"),
@@ -55,11 +56,10 @@ def add(part: Part, prefix: str, rows: Iterable[dict]) -> None:
 
 
 def draw(options: Options, rows: list[dict]) -> None:
-    from matplotlib.figure import Figure  # noqa: PLC0415
     from matplotlib.patches import Rectangle  # noqa: PLC0415
 
     scenarios = [scenario for scenario in SCENARIOS if any(row["scenario"] == scenario.name for row in rows)]
-    figure = Figure(figsize=(11, 3.6 * len(scenarios)), layout="constrained")
+    figure = new_figure(11, 3.6 * len(scenarios))
     for line, scenario in zip(figure.subplots(len(scenarios), 2, squeeze=False), scenarios, strict=True):
         for axes, car in zip(line, CARS, strict=True):
             for boxes, colour in ((scenario.known, "0.6"), (scenario.hidden(LIMIT), "tab:red")):
@@ -80,4 +80,4 @@ def draw(options: Options, rows: list[dict]) -> None:
             axes.set(xlim=(0.0, SIZE[0]), ylim=(0.0, SIZE[1]), aspect="equal")
             axes.legend(fontsize=7, title="least clearance", title_fontsize=7, loc="upper left")
     figure.suptitle("grey: in the map; red: not in the map", fontsize=9)
-    figure.savefig(options.out / "deformation.png", dpi=70)
+    write_figure(figure, options.out / "deformation.png")

@@ -12,6 +12,7 @@ from navigation_parts.harness import WORLDS
 
 from monstertruck_planners.explore.catalog import EXPLORERS
 from monstertruck_planners.explore.explore_step import warm_up
+from monstertruckd.tools.figures import new_figure, write_figure
 
 KINDS = ("information", "author")
 REACH = 4.0
@@ -58,9 +59,7 @@ def one(arena: Arena, kind: str, car: str, seed: int) -> tuple[dict[str, float],
 
 
 def draw(options: Options, arena: Arena, tracks: dict[str, np.ndarray]) -> None:
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(12, 5), layout="constrained")
+    figure = new_figure(12, 5)
     ways, shares = figure.subplots(1, 2)
     rows, columns = arena.blocked.shape
     x, y = arena.origin
@@ -72,4 +71,4 @@ def draw(options: Options, arena: Arena, tracks: dict[str, np.ndarray]) -> None:
     shares.set_xlabel("metres")
     shares.set_ylabel("share of the reachable area known")
     shares.legend()
-    figure.savefig(options.out / "exploration.png", dpi=80)
+    write_figure(figure, options.out / "exploration.png")

@@ -20,6 +20,7 @@ from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_schemas import topics
 from monstertruck_schemas.req import DriveRequest
 from monstertruckd.config.load import load_config
+from monstertruckd.tools.figures import new_figure, write_figure
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
@@ -135,13 +136,11 @@ def drive(legs: list[tuple[float, float, float]]) -> dict[str, Any]:
 
 
 def draw(options: Options, rows: dict[str, dict[str, Any]]) -> None:
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(11, 7), layout="constrained")
+    figure = new_figure(11, 7)
     for axes, (name, row) in zip(figure.subplots(2, 3).flat, rows.items(), strict=False):
         axes.plot(*row["truth"][:, :2].T, color="0.6", lw=3, label="truth")
         axes.plot(*row["odometry"][:, :2].T, color="tab:red", lw=1, label="odometry")
         axes.set_title(name)
         axes.set_aspect("equal", "datalim")
     axes.legend()
-    figure.savefig(options.out / "kinematics.png", dpi=80)
+    write_figure(figure, options.out / "kinematics.png")

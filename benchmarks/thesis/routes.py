@@ -14,6 +14,7 @@ from navigation_parts.harness import WORLDS
 
 from monstertruck_planners.route.api import RouteMap, Vehicle, make_planner
 from monstertruck_planners.route.config import GridAstarConfig, HybridConfig, LatticeConfig
+from monstertruckd.tools.figures import new_figure, write_figure
 
 PLANNERS = {"hybrid": HybridConfig(), "lattice": LatticeConfig(), "grid_astar": GridAstarConfig()}
 QUERIES = 20
@@ -67,9 +68,7 @@ def one(planner, vehicle, arena: Arena, ground: RouteMap, start, goal) -> dict |
 
 
 def draw(options: Options, arena: Arena, shown: list) -> None:
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(9, 7), layout="constrained")
+    figure = new_figure(9, 7)
     axes = figure.subplots()
     rows, columns = arena.blocked.shape
     x, y = arena.origin
@@ -78,4 +77,4 @@ def draw(options: Options, arena: Arena, shown: list) -> None:
     for name, poses in shown:
         axes.plot(*poses[:, :2].T, lw=1.2, label=name)
     axes.legend()
-    figure.savefig(options.out / "routes.png", dpi=80)
+    write_figure(figure, options.out / "routes.png")

@@ -15,6 +15,7 @@ from navigation_parts.daemon import CONFIGS
 from monstertruck_runtime.clock import SECOND, VirtualClock, run_virtual
 from monstertruck_schemas import topics
 from monstertruckd.config.load import load_config
+from monstertruckd.tools.figures import new_figure, write_figure
 from monstertruckd.tools.simulation.config import SimulatedTruckConfig, with_overlay
 from monstertruckd.tools.simulation.operator import LocalOperator
 from monstertruckd.tools.simulation.virtual_rig import VirtualRig
@@ -79,10 +80,8 @@ def lap(seconds: float) -> dict[str, Any]:
 
 
 def draw(options: Options, found: dict[str, Any], cells: np.ndarray, arena: Arena) -> None:
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     grid = found["grid"]
-    figure = Figure(figsize=(8, 7), layout="constrained")
+    figure = new_figure(8, 7)
     axes = figure.subplots()
     x, y, step = grid.origin.x, grid.origin.y, grid.resolution
     box = (x, x + grid.width * step, y, y + grid.height * step)
@@ -97,4 +96,4 @@ def draw(options: Options, found: dict[str, Any], cells: np.ndarray, arena: Aren
     for name, colour in (("reckoning", "tab:orange"), ("slam", "tab:red")):
         axes.plot(*found[name][:, 1:3].T, color=colour, lw=1, label=name)
     axes.legend(loc="center")
-    figure.savefig(options.out / "slam.png", dpi=80)
+    write_figure(figure, options.out / "slam.png")

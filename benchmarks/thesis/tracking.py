@@ -10,6 +10,8 @@ import numpy as np
 from navigation_parts import Options, Part
 from navigation_parts.tracking import TRUCK, Result, built_in, drive
 
+from monstertruckd.tools.figures import new_figure, write_figure
+
 MODES = ("front", "counter", "crab", "hybrid")
 SHIFTS = "shifts"
 """To the side and back twice, by 0.36 m over 2 m, at most 0.28 rad from straight on."""
@@ -55,10 +57,8 @@ def shifts() -> np.ndarray:
 
 
 def draw(options: Options, found: dict, courses: dict[str, np.ndarray]) -> None:
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     names = list(dict.fromkeys(key[0] for key in found))
-    figure = Figure(figsize=(14, 4 * len(names)), layout="constrained")
+    figure = new_figure(14, 4 * len(names))
     for line, course in zip(figure.subplots(len(names), 4, squeeze=False), names, strict=True):
         for axes, mode in zip(line, MODES, strict=True):
             if mode not in modes(course):
@@ -72,4 +72,4 @@ def draw(options: Options, found: dict, courses: dict[str, np.ndarray]) -> None:
             axes.set_aspect("equal", "datalim")
             if mode == MODES[0]:
                 axes.legend(fontsize=7)
-    figure.savefig(options.out / "tracking.png", dpi=70)
+    write_figure(figure, options.out / "tracking.png")

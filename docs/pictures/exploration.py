@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -23,6 +22,7 @@ from monstertruck_planners.collision import OCCUPIED
 from monstertruck_planners.explore.catalog import EXPLORERS
 from monstertruck_planners.explore.exchange import Viewpoint
 from monstertruck_planners.explore.explore_step import warm_up
+from monstertruckd.tools.figures import new_figure, write_figure
 
 WORLD, KIND, SEED, PICTURES = "rooms", "information", 3, 6
 
@@ -64,11 +64,11 @@ def main() -> None:
     rover.take_stock()
     rover.note(None)
     track = np.array(done.track)
-    figure = Figure(figsize=(12, 7), layout="constrained")
+    figure = new_figure(12, 7)
     axes = figure.subplots(2, PICTURES // 2).ravel()
     for ax, k in zip(axes, np.linspace(0, len(rover.series) - 1, PICTURES).round().astype(int), strict=True):
         draw(ax, arena, rover.series[k], track)
-    figure.savefig(Path(__file__).parent / "exploration.png", dpi=70)
+    write_figure(figure, Path(__file__).parent / "exploration.png")
 
 
 def draw(ax: Axes, arena: Arena, moment: Moment, track: np.ndarray) -> None:

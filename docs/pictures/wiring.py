@@ -6,15 +6,11 @@ python docs/pictures/wiring.py
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-
-mpl.use("Agg")
-
-from matplotlib import pyplot as plt
 from matplotlib.patches import FancyBboxPatch
 
 from monstertruckd.config.load import load_config
 from monstertruckd.config.truck import TruckConfig
+from monstertruckd.tools.figures import new_figure, write_figure
 from monstertruckd.tools.shipped import shipped
 
 PICTURES = Path(__file__).resolve().parent
@@ -48,7 +44,8 @@ def line(axes: Any, begin: tuple[float, float], end: tuple[float, float], text: 
 
 def sheet(title: str, width: float, height: float) -> tuple[Any, Any]:
     """An empty drawing."""
-    figure, axes = plt.subplots(figsize=(width, height))
+    figure = new_figure(width, height)
+    axes = figure.subplots()
     axes.set_axis_off()
     axes.set_title(title, loc="left", fontsize=11)
     return figure, axes
@@ -75,7 +72,7 @@ def data(config: TruckConfig) -> None:
         line(axes, (5.55, sum(ys) / len(ys)), (7.25, y), f"port {port}")
     axes.set_xlim(-1.6, 11.0)
     axes.set_ylim(-0.7, top - 0.2)
-    figure.savefig(PICTURES / "wiring-data.png", dpi=110, bbox_inches="tight")
+    write_figure(figure, PICTURES / "wiring-data.png")
 
 
 def power() -> None:
@@ -107,7 +104,7 @@ def power() -> None:
     line(axes, (11.8, -1.2), (11.8, 0.4), "", "#333")
     axes.set_xlim(-1.6, 13.2)
     axes.set_ylim(-1.7, 5.1)
-    figure.savefig(PICTURES / "wiring-power.png", dpi=110, bbox_inches="tight")
+    write_figure(figure, PICTURES / "wiring-power.png")
 
 
 if __name__ == "__main__":
