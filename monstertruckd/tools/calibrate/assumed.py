@@ -4,6 +4,7 @@ Each is a standard deviation, unless it says otherwise. A number here is a prope
 a glass board or another tape has its own.
 """
 
+import math
 from typing import Annotated, Final
 
 from pydantic import Field
@@ -24,10 +25,16 @@ class AssumedErrors(Schema):
     """Excess of the lidar's range on a board's surface (m)."""
     board_size: Share = 0.003
     """Relative error of a board's size: a ruler, and paper."""
+    tape_reading: Positive = 0.002
+    """A reading of a tape (m)."""
     tape_scale: Share = 0.0005
     """Relative error of a class II tape, including its sag."""
     tape_floor: Share = 0.5
     """Unevenness of the floor, as a share of the tape's standard deviation."""
+    string_direction: Positive = 0.0035
+    """Direction of a string along the truck (rad): 1.4 mm on 0.4 m."""
+    compass_tilt: Positive = math.radians(0.2)
+    """Tilt at rest by the compass (rad)."""
     floor_slip: Share = 0.003
     """Relative change of a distance driven on another floor; half a 95 % interval."""
     leg_direction: Positive = 0.005
@@ -70,6 +77,24 @@ class AssumedErrors(Schema):
     servo_wait: Positive = 0.010
     """Half the period of the servo pulses (s), half a uniform interval. How long a command waits for the next pulse is
     constant while the daemon runs, and another time after each start: nothing in the period can be excluded."""
+
+    def beam_angle(self, tape: float, apart: float) -> float:
+        """Return the error of a beam's angle to the body (rad), by two heights and the compass.
+
+        Args:
+            tape: error of a taped height (m).
+            apart: distance of the heights along the beam (m).
+        """
+        heights = math.hypot(tape * math.sqrt(2), self.tape_floor * tape)
+        return math.hypot(heights / apart, self.compass_tilt)
+
+    def turn_of_leg(self, sigma: float, distance: float) -> float:
+        """Return the error of a turn (rad) that is measured to ``sigma`` (rad) over a distance (m)."""
+        return math.hypot(sigma, self.turn_slip * math.sqrt(distance))
+
+    def place_of_leg(self, sigma: float, distance: float) -> float:
+        """Return the error of a leg's end (m) that is measured to ``sigma`` (m) over a distance (m)."""
+        return math.hypot(sigma, self.leg_distance * distance, self.leg_direction * distance)
 
 
 ASSUMED: Final = AssumedErrors()

@@ -49,8 +49,6 @@ LEAST_OVERLAP: Final = 0.5
 """Minimum overlap of two registered scans."""
 LEAST_SCANS: Final = 3
 """Minimum scans at each rest."""
-TILT: Final = math.radians(0.2)
-"""Standard deviation of the compass's tilt, rad."""
 MOST_TILT: Final = math.sin(math.radians(20.0))
 """Rise of the beam per metre, at most: more is a wrong number."""
 HEIGHTS: Final = (
@@ -127,7 +125,7 @@ class LidarWizard:
     """Full circles to each side, in quarters"""
     heights: bool = False
     """Ask for the height of the beam, for pitch and roll"""
-    tape_error: float = 0.002
+    tape_error: float = ASSUMED.tape_reading
     """Standard deviation of a height, m"""
 
     async def __call__(self, context: WizardContext) -> Result:
@@ -183,7 +181,6 @@ class LidarWizard:
         heights = [(await context.ask(step)) / 100 for step in HEIGHTS]
         pitch, roll = beam_tilt(heights, (ahead, left))
         body = tuple(float(np.mean([getattr(a, name) for a in tilt])) for name in ("pitch", "roll"))
-        error = math.hypot(self.tape_error * math.sqrt(2), ASSUMED.tape_floor * self.tape_error)
         found = (
             ("pitch", pitch - body[0] - joints[0], ahead, "nose down positive"),
             ("roll", roll - body[1] - joints[1], left, "right side down positive"),
@@ -191,7 +188,7 @@ class LidarWizard:
         return tuple(
             estimated(
                 name,
-                Interval(angle, NORMAL * math.hypot(error / distance, TILT)),
+                Interval(angle, NORMAL * ASSUMED.beam_angle(self.tape_error, distance)),
                 "rad",
                 2,
                 f"{sign}; 95 % of two heights {distance:.1f} m apart, and of the compass's tilt",
@@ -288,12 +285,7 @@ def fit_mount(legs: Sequence[LidarLeg], mount: tuple[float, float, float], crab:
     """Fit the lidar's translations by least squares; parameters x, y (m), yaw (rad), scale, crab (rad)."""
     distances, seen = np.array([leg.distance for leg in legs]), np.array([leg.seen for leg in legs])
     travels = np.array([leg.travel for leg in legs])
-    sigmas = np.array(
-        [
-            math.hypot(leg.sigma, ASSUMED.leg_distance * leg.distance, ASSUMED.leg_direction * leg.distance)
-            for leg in legs
-        ]
-    )
+    sigmas = np.array([ASSUMED.place_of_leg(leg.sigma, leg.distance) for leg in legs])
     start = np.array((*mount, 1.0, 0.0))
     reach = np.array((0.5, 0.5, math.pi, 0.3, 0.3))
 
@@ -326,12 +318,7 @@ def _arc(distance: float, crab: float, turn: float) -> Array:
 
 
 def _unexplained(fit: FitResult, legs: Sequence[LidarLeg]) -> float:
-    sigmas = np.array(
-        [
-            math.hypot(leg.sigma, ASSUMED.leg_distance * leg.distance, ASSUMED.leg_direction * leg.distance)
-            for leg in legs
-        ]
-    )
+    sigmas = np.array([ASSUMED.place_of_leg(leg.sigma, leg.distance) for leg in legs])
     off = fit.residuals[: 2 * len(legs)].reshape(-1, 2) * sigmas[:, None]
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 

@@ -72,9 +72,9 @@ class OdometryWizard:
     """Squares to each side"""
     side: float = 1.5
     """Length of its straight parts, m; corners add 0.7 m each"""
-    tape_error: float = 0.002
+    tape_error: float = ASSUMED.tape_reading
     """Standard deviation of a tape reading, m"""
-    string_error: float = 0.0035
+    string_error: float = ASSUMED.string_direction
     """Standard deviation of the string's direction along the truck, rad"""
 
     async def __call__(self, context: WizardContext) -> Result:
@@ -246,9 +246,7 @@ class SquareModel:
         """Solve by least squares; residuals in standard deviations, the priors last."""
         legs = [leg for square in squares for leg in square.legs]
         turned = np.array([leg.turn for leg in legs])
-        sigmas = np.array(
-            [math.hypot(leg.sigma, ASSUMED.turn_slip * math.sqrt(self._model.distance(leg))) for leg in legs]
-        )
+        sigmas = np.array([ASSUMED.turn_of_leg(leg.sigma, self._model.distance(leg)) for leg in legs])
         sides = np.array([square.side for square in squares])
         rolled = np.array([self._model.distance(square.legs[0]) for square in squares])
         chords = np.array([sinc(square.legs[0].turn / 2) for square in squares])

@@ -36,8 +36,6 @@ ROOM: Final = (
     "a level floor, a wall 2.5 to 3.5 m ahead of the robot and one to its left, nothing within 2.5 m ahead and to the "
     "right; two blocks, 4 to 6 cm high"
 )
-TILT: Final = math.radians(0.2)
-"""Standard deviation of the compass tilt (rad)."""
 BLOCKS: Final = (math.radians(4.0), math.radians(15.0))
 """Tilt range of a body on blocks (rad)."""
 FOLLOWS: Final = math.radians(2.0)
@@ -105,7 +103,7 @@ class StabiliserWizard:
     name: ClassVar[WizardName] = "stabiliser"
     doc: ClassVar[str] = "zero and direction of both servos, from the height of the beam and blocks under wheels"
     room: ClassVar[str] = ROOM
-    tape_error: float = 0.002
+    tape_error: float = ASSUMED.tape_reading
     """Standard deviation of a height, m"""
 
     async def __call__(self, context: WizardContext) -> Result:
@@ -165,7 +163,6 @@ def result_of(
         InputError: heights that no lidar has; the blocks are missing, a joint does not follow, or the scans fit neither
             direction.
     """
-    error = math.hypot(tape_error * math.sqrt(2), ASSUMED.tape_floor * tape_error)
     lies = RollPitch(*beam_tilt((heights.centre, heights.ahead, heights.left), walls))
     really = RollPitch(lies.pitch - flat.body.pitch, lies.roll - flat.body.roll)
     joints = (settings.pitch, settings.roll)
@@ -177,7 +174,7 @@ def result_of(
         # 0.3: standard deviation of a unit's position reading, steps: uniform over a step
         zero = Interval(
             position - direction * really[axis] / STEP,
-            NORMAL * math.hypot(math.hypot(error / walls[axis], TILT) / STEP, 0.3),
+            NORMAL * math.hypot(ASSUMED.beam_angle(tape_error, walls[axis]) / STEP, 0.3),
         )
         _check_range(name, joint, zero.value)
         estimates += [

@@ -68,7 +68,7 @@ class SteeringWizard:
     """Directions and a first centre only: before the compass is calibrated"""
     strings: int = 3
     """Straight runs along a string; 0 without a string"""
-    string_error: float = 0.0035
+    string_error: float = ASSUMED.string_direction
     """Standard deviation of the string's direction along the truck, rad: 1.4 mm on 0.4 m"""
     weaves: int = 3
     """Times the truck weaves ahead and back, for dead time and lag"""
@@ -291,9 +291,7 @@ class AxleTravel:
         stopped = sign * (meant - reached) > SHORT
         servo = reached if stopped else meant
         angle = model.axle_angle(axle, servo, maps)
-        noise = max(
-            math.hypot(leg.sigma, ASSUMED.turn_slip * math.sqrt(model.distance(leg))) / abs(leg.turn) for leg in legs
-        )
+        noise = max(ASSUMED.turn_of_leg(leg.sigma, model.distance(leg)) / abs(leg.turn) for leg in legs)
         # 0.02: relative error of the scale from short arcs
         half = abs(angle) * (NORMAL * noise / math.sqrt(len(legs)) + 0.02)
         return cls(axle, sign, servo, angle, stopped, half, tuple(legs))

@@ -169,7 +169,7 @@ class SteeringModel:
             gain: share within which the scales are known beforehand.
         """
         guess = start.parameters
-        sigmas = np.array([math.hypot(leg.sigma, ASSUMED.turn_slip * math.sqrt(self.distance(leg))) for leg in legs])
+        sigmas = np.array([ASSUMED.turn_of_leg(leg.sigma, self.distance(leg)) for leg in legs])
         turns = np.array([leg.turn for leg in legs])
         strings = [(k, leg.offset, leg.offset_sigma) for k, leg in enumerate(legs) if leg.offset is not None]
 
