@@ -28,6 +28,7 @@ from monstertruck_kinematics.elementary import Array
 from monstertruck_kinematics.se2 import Pose2, between, compose
 from monstertruck_runtime.clock import SECOND
 
+LEVELS: Final = 7
 QUERY_KEYS: Final = 6
 """Number of keyframes in the query: more would include the drift of a search without odometry."""
 MIN_SEARCH_OVERLAP: Final = (0.85, 0.7)
@@ -82,7 +83,7 @@ class GlobalLocaliser:
         """Whether the last search found no place."""
         self.outside = False
         """Whether no search has found a place for 10 s."""
-        self._grid = submap.grid(7)  # levels of the whole map; takes longer than a scan may
+        submap.grid(LEVELS)  # takes longer than a scan may
         low, high = submap.cloud.points.min(axis=0), submap.cloud.points.max(axis=0)
         self._middle = np.array((*((low + high) / 2), 0.0))
         self._half = float((high - low).max() / 2) + 1.0
@@ -190,7 +191,7 @@ class GlobalLocaliser:
         if len(points) < min_points:
             return None
         anywhere = (1e6, 1e6)
-        grid, window = self._grid, (self._half, math.pi)
+        grid, window = self._submap.grid(LEVELS), (self._half, math.pi)
         unique_ratio = 0.85  # a place is unique if the next best scores less than this share of its score
         ambiguous_ratio = 0.97  # a place is ambiguous if another scores more than this share of its score
         rivals = RivalSearch(1.0, unique_ratio, ambiguous_ratio)  # minimum distance between different places, m
