@@ -437,7 +437,10 @@ def mounted(
     found = []
     for pitch, roll in ((0.01, -0.005), (0.155, 0.0), (0.0, 0.185)):
         body = stabiliser.RollPitch(pitch, roll)
-        seen = stabiliser.RollPitch(pitch + stabiliser.TILT * rng.normal(), roll + stabiliser.TILT * rng.normal())
+        seen = stabiliser.RollPitch(
+            pitch + stabiliser.ASSUMED.compass_tilt * rng.normal(),
+            roll + stabiliser.ASSUMED.compass_tilt * rng.normal(),
+        )
         said = stabiliser.RollPitch(round(-pitch / STEP) * STEP, round(-roll / STEP) * STEP)
         really = true_joints(settings, said, zeros, directions)
         up = stabiliser.beams_up(body, really, angles)
