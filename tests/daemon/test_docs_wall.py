@@ -4,6 +4,7 @@ import asyncio
 import os
 import pty
 import re
+import signal
 import sys
 from collections.abc import Callable, Coroutine
 from pathlib import Path
@@ -15,10 +16,14 @@ import pytest
 from monstertruck_runtime.mailbox import Mailbox, latest
 from monstertruck_schemas.base import Message
 from monstertruck_schemas.reasons import Reason
+from monstertruck_schemas.roles import AccessRole
 from monstertruck_schemas.topics import GOAL, ODOMETRY
+from monstertruckd.station.users import add_user
+from monstertruckd.tools.demo.runs import free_endpoint
 from monstertruckd.tools.simulation.config import load_simulated
 from tests.daemon.wall_kit import ROOT, Robot, command, planner_ready, robot
-from tests.unit.docs.command_lines import INSTEAD, Line, needs_truck, ours, starts_truck
+from tests.unit.docs.command_lines import INSTEAD, SERVING, Line, needs_truck, ours, starts_truck
+from tests.unit.station.certificate import self_signed
 
 M = TypeVar("M", bound=Message)
 
@@ -50,6 +55,30 @@ async def test_every_line_on_a_running_truck(tmp_path: Path):
         for line in ours():
             if needs_truck(line):
                 await _follow(line, made)
+
+
+@pytest.mark.parametrize("line", SERVING)
+async def test_a_line_that_serves_is_ready_and_ends_by_ctrl_c(line: str, tmp_path: Path):
+    self_signed(tmp_path)
+    add_user(tmp_path / "users.yaml", "ann", AccessRole.PILOT, "the password of ann")
+    words = [*Line("", line).arguments, "--port", free_endpoint().rpartition(":")[2]]
+    if "--foxglove" in words:
+        words += ["--foxglove-port", free_endpoint().rpartition(":")[2]]
+    with (tmp_path / "output.txt").open("w") as file:
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "monstertruckd", *words), cwd=tmp_path, stdout=file, stderr=file
+        )
+    try:
+        async with asyncio.timeout(60):
+            while "station: http" not in (tmp_path / "output.txt").read_text():
+                assert process.returncode is None, (tmp_path / "output.txt").read_text()
+                await asyncio.sleep(0.1)
+            process.send_signal(signal.SIGINT)
+            assert await process.wait() == 0
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
 
 
 async def test_samples_of_clients_drive(tmp_path: Path):

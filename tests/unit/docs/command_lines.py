@@ -81,19 +81,9 @@ INSTEAD = {
     "monstertruckd drive --mapping pad.yaml": Instead(
         None, "needs the file; tests/unit/tools/driving/test_gamepad.py reads mappings"
     ),
-    "monstertruckd station --robot truck@tcp/127.0.0.1:7447": Instead(
-        None, "serves until it is stopped; tests/daemon/test_station_wall.py opens its page"
-    ),
-    "monstertruckd station --robot ann@tcp/192.168.1.7:7447 --robot bob@tcp/192.168.1.8:7447": Instead(
-        None, "serves until it is stopped"
-    ),
     "monstertruckd try": Instead(None, "serves until it is stopped; tests/daemon/test_tryout_wall.py opens its page"),
-    "monstertruckd station --foxglove": Instead(None, "serves until it is stopped; test_foxglove.py connects to it"),
     "monstertruckd ros2": Instead(None, "serves until it is stopped; tests/unit/ros2/test_face.py runs it"),
     "monstertruckd station --rerun": Instead(None, "serves until it is stopped; test_live.py draws without a viewer"),
-    "monstertruckd station --router tcp/192.168.1.2:7447": Instead(
-        None, "serves until it is stopped; tests/unit/station/test_server.py has a router"
-    ),
     "monstertruckd goto 8.5 6 0 --arm": Instead(
         None, "needs a robot that plans; tests/daemon/test_goals_virtual.py has one"
     ),
@@ -103,8 +93,6 @@ INSTEAD = {
     "monstertruckd behave start line_left --robot sonar --arm": Instead(
         None, "needs the robot with sonars; tests/daemon/test_sonar_robot_virtual.py has it"
     ),
-    "monstertruckd station --host 0.0.0.0 --certificate station.pem --key station.key --users users.yaml "
-    "--name station.local": Instead(None, "serves until it is stopped; tests/unit/station/test_login.py logs in"),
     "monstertruckd map save hall.yaml": Instead(None, "needs a robot that maps"),
     "monstertruckd stand print runs/stand/print --tags 0-3,100-125": Instead(
         "monstertruckd stand print print --tags 0-3", "fewer prints"
@@ -151,6 +139,15 @@ INSTEAD = {
     "monstertruckd emulate ranger --link /tmp/ranger": Instead(None, OWN_DEVICE),
     "monstertruckd probe ranger --port /tmp/ranger": Instead(None, OWN_DEVICE),
 }
+SERVING = (
+    "monstertruckd station --robot truck@tcp/127.0.0.1:7447",
+    "monstertruckd station --robot ann@tcp/192.168.1.7:7447 --robot bob@tcp/192.168.1.8:7447",
+    "monstertruckd station --router tcp/192.168.1.2:7447",
+    "monstertruckd station --host 0.0.0.0 --certificate station.pem --key station.key --users users.yaml "
+    "--name station.local",
+    "monstertruckd station --foxglove",
+)
+"""Lines that serve until they are stopped; test_docs_wall.py starts each."""
 FIRST_DAY = "tests/daemon/test_first_day_virtual.py runs it on the twin"
 DEVICES = ("drive", "steering", "compass", "stabiliser", "camera")
 INSTEAD |= {

@@ -47,17 +47,20 @@ def test_all_commands_of_the_page_run(page: str, tmp_path: Path):
         *lines, emulate, probe = lines
         link = emulate.split()[-1]
         # The page has the emulator run in another terminal until Ctrl-C.
-        lines += [f"{emulate} & trap 'kill -INT -- -'$! EXIT", f"until [ -e {link} ]; do sleep 0.1; done", probe]
+        lines += [f"{emulate} & trap 'kill '$! EXIT", f"until [ -e {link} ]; do sleep 0.1; done", probe]
     assert "Traceback" not in followed(lines, project(page, tmp_path))
 
 
 def followed(lines: list[str], folder: Path) -> str:
     """Run lines in a shell whose ``monstertruckd`` is this tree's, and return their output."""
-    program = f'monstertruckd() {{ PYTHONPATH="$PYTHONPATH:{":".join(PLACES)}" python -m monstertruckd "$@"; }}'
+    program = folder / "bin" / "monstertruckd"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nPYTHONPATH="$PYTHONPATH:{":".join(PLACES)}" exec python -m monstertruckd "$@"\n')
+    program.chmod(0o755)
     ended = subprocess.run(
-        ["bash", "-emc", "\n".join((program, *lines))],
+        ["bash", "-ec", "\n".join(lines)],
         cwd=folder,
-        env=os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
+        env=os.environ | {"PATH": f"{program.parent}:{Path(sys.executable).parent}:{os.environ['PATH']}"},
         capture_output=True,
         text=True,
         check=False,
