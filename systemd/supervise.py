@@ -11,6 +11,7 @@ standard library.
 
 import contextlib
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -111,13 +112,25 @@ def _words(news: socket.socket) -> set[bytes]:
 def main(words: list[str]) -> int:
     """Entry point; returns the exit code."""
     watchdog = WATCHDOG
+    if words[:1] == ["--help"]:
+        print(__doc__)
+        return 0
     if words[:1] == ["--watchdog"]:
-        watchdog, words = float(words[1]), words[2:]
+        try:
+            watchdog, words = float(words[1]), words[2:]
+        except (IndexError, ValueError):
+            print("supervise: --watchdog: expected seconds, such as 3", file=sys.stderr)
+            return 2
     at = words.index("--") if "--" in words else len(words)
     if not words[:at]:
         print(__doc__, file=sys.stderr)
         return 2
-    supervisor = Supervisor(words[:at], words[at + 1 :], watchdog)
+    command, stop = words[:at], words[at + 1 :]
+    for program in (command[0], *stop[:1]):
+        if shutil.which(program) is None:
+            print(f"supervise: {program}: no such program, or it is not executable", file=sys.stderr)
+            return 2
+    supervisor = Supervisor(command, stop, watchdog)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, supervisor.end)
     return supervisor.run()

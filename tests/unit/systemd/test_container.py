@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from monstertruck_runtime.endpoints import DEFAULT_ENDPOINT
 from monstertruckd import bootstrap
+from monstertruckd.station.server import Place
 
 ROOT = Path(__file__).resolve().parents[3]
 FILE = ROOT / "systemd" / "container" / "Dockerfile"
@@ -46,3 +48,8 @@ def test_the_development_container_sets_up_what_the_tests_need():
     command = settings["postCreateCommand"].split()
     assert command[:3] == ["python3", "-m", "monstertruckd.bootstrap"]
     assert command[3] in bootstrap.EXTRAS
+
+
+def test_the_development_container_forwards_the_ports_of_robot_and_page():
+    settings = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text(encoding="utf-8"))
+    assert settings["forwardPorts"] == [int(DEFAULT_ENDPOINT.rpartition(":")[2]), Place().port]

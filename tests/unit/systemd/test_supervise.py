@@ -71,3 +71,23 @@ def test_without_a_command_it_explains_itself():
     done = subprocess.run([sys.executable, str(SCRIPT)], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "supervise.py [--watchdog SECONDS] COMMAND" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["no-such-daemon"], "supervise: no-such-daemon: no such program, or it is not executable"),
+        (["true", "--", "no-such-stop"], "supervise: no-such-stop: no such program, or it is not executable"),
+        (["--watchdog", "soon", "true"], "supervise: --watchdog: expected seconds, such as 3"),
+        (["--watchdog"], "supervise: --watchdog: expected seconds, such as 3"),
+    ],
+)
+def test_a_wrong_command_line_is_refused_before_anything_starts(words: list[str], text: str):
+    done = subprocess.run([sys.executable, str(SCRIPT), *words], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.strip()) == (2, text)
+
+
+def test_help_explains_it():
+    done = subprocess.run([sys.executable, str(SCRIPT), "--help"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert "COMMAND... [-- STOP...]" in done.stdout
